@@ -1,0 +1,125 @@
+"""The command line: ``climatenerf VERB ...``.
+
+Each verb is a module of this package with a torch-free options dataclass and a function ``run``.
+Only the module of the verb that was asked for is imported, so that help is quick.
+"""
+
+import difflib
+import errno
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import climatenerf
+from climatenerf.errors import UserError
+
+# Before torch and Numba are imported, unless the user has chosen otherwise. Both bring an OpenMP
+# run time of their own, and by default the idle threads of the one spin for a while after each
+# parallel region and so take the cores from the other. Numba's OpenMP layer is asked for because
+# it may be entered from several threads at once, which its fallback may not.
+THREADING = {
+    "OMP_WAIT_POLICY": "PASSIVE",
+    "GOMP_SPINCOUNT": "0",
+    "KMP_BLOCKTIME": "0",
+    "NUMBA_THREADING_LAYER": "omp",
+}
+
+
+@dataclass(frozen=True)
+class Verb:
+    """One verb.
+
+    Attributes:
+        module: Module that has the options dataclass and ``run``.
+        options: Name of the dataclass.
+        summary: One line for the help.
+    """
+
+    module: str
+    options: str
+    summary: str
+
+
+VERBS = {
+    "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
+    "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
+    "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the street that comes along"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line.
+
+    Args:
+        arguments: words after the program's name; None takes those of this process.
+
+    Returns:
+        Exit status: 0, 2 after a mistake that the user can mend, 130 after Ctrl-C.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        status = _run(words)
+        sys.stdout.flush()  # here, where a reader that has gone is dealt with
+        return status
+    except UserError as error:
+        return _complain(str(error))
+    except KeyboardInterrupt:
+        sys.stderr.write("\nclimatenerf: interrupted\n")
+        return 130
+    except BrokenPipeError:
+        # The reader (`| head`) has gone; a second complaint at exit is avoided by closing.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            where = f" while writing {error.filename}" if error.filename else ""
+            return _complain(f"the disk is full{where}; free some space and run it again")
+        raise
+
+
+def _run(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help", "help"):
+        sys.stdout.write(usage())
+        return 0 if words else 2
+    if words[0] in ("-V", "--version"):
+        sys.stdout.write(f"climatenerf {climatenerf.__version__}\n")
+        return 0
+    name = words[0]
+    if name not in VERBS:
+        near = difflib.get_close_matches(name, VERBS, n=1, cutoff=0.4)
+        hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(VERBS)}."
+        raise UserError(f"there is no verb {name!r}; {hint}")
+    for variable, value in THREADING.items():
+        os.environ.setdefault(variable, value)
+    import tyro
+
+    verb = VERBS[name]
+    module = importlib.import_module(verb.module)
+    # tyro prints its own help and complaints, and leaves by SystemExit with status 0 or 2.
+    options = tyro.cli(getattr(module, verb.options), prog=f"climatenerf {name}", args=words[1:])
+    return module.run(options) or 0
+
+
+def usage() -> str:
+    """The help text that lists the verbs."""
+    lines = [f"  {name:<8} {verb.summary}" for name, verb in VERBS.items()]
+    return "\n".join(
+        [
+            "usage: climatenerf VERB [options]",
+            "",
+            "Photos of a real place in; the same place in smog, flooded and under snow out.",
+            "",
+            *lines,
+            "",
+            "  climatenerf VERB --help   options of a verb",
+            "  climatenerf --version     version",
+            "",
+        ]
+    )
+
+
+def _complain(message: str) -> int:
+    sys.stderr.write(f"climatenerf: {message}\n")
+    return 2

@@ -1,0 +1,80 @@
+"""``climatenerf demo``: the whole job on the street that comes with the package."""
+
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from climatenerf.cli import progress
+from climatenerf.cli.fit import Fit, fit_with_bars, summary
+from climatenerf.cli.render import parse_size, prepare_stage, render_movie
+from climatenerf.errors import UserError
+from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
+
+WEATHERS = {
+    "clean": Weather(),
+    "flood": Weather(flood=Flood(level=0.5)),
+    "smog": Weather(smog=Smog(visibility=40.0)),
+    "snow": Weather(snow=Snow(depth=0.15)),
+}
+SHEET_COLUMNS = 4
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Fit the street that comes with the package and render it clean, flooded, in smog, snowed."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("climatenerf-demo")
+    """Folder for the run, the movies and the contact sheet."""
+    minutes: float = 3.0
+    """Time for fitting."""
+    frames: int = 24
+    """Frames of each movie."""
+    size: str = "320x180"
+    """Size of the frames."""
+
+
+def run(options: Demo) -> int:
+    """Fits, renders four movies and a contact sheet, and says where they are."""
+    if options.minutes <= 0 or options.frames < 1:
+        raise UserError("--minutes and --frames must be above 0")
+    size = parse_size(options.size)
+    run_folder = options.out / "run"
+    if (run_folder / "config.json").exists():
+        raise UserError(
+            f"{options.out} already holds a demo; choose another folder with -o, or remove it"
+        )
+    with as_file(files("climatenerf") / "assets" / "street") as street:
+        from climatenerf.scene import read_scene
+
+        scene = read_scene(street)
+        metrics = fit_with_bars(scene, Fit(street, run_folder, options.minutes))
+
+    from climatenerf.field.checkpoint import load_field
+    from climatenerf.render.camera_path import camera_path
+    from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
+
+    field = load_field(run_folder)
+    fps = 12.0
+    path = camera_path("training", scene, options.frames, size)
+    movies, rows = [], []
+    for name, weather in WEATHERS.items():
+        stage = prepare_stage(field, scene, KeyframedWeather(weather, {}), path, fps)
+        movies.append(render_movie(stage, path, fps, options.out / name, title=name))
+        rows.append((name, _frames(options.out / name / "frames")))
+    write_jpeg(options.out / "contact-sheet.jpg", contact_sheet(rows, SHEET_COLUMNS))
+    progress.result(summary(metrics))
+    for movie in movies:
+        progress.result(f"movie: {movie}")
+    progress.result(f"contact sheet: {options.out / 'contact-sheet.jpg'}")
+    return 0
+
+
+def _frames(folder: Path) -> list:
+    import numpy as np
+    from PIL import Image
+
+    return [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]

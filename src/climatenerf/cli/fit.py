@@ -1,0 +1,111 @@
+"""``climatenerf fit SCENE -o RUN``: a radiance field from posed photographs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from climatenerf.cli import progress
+from climatenerf.errors import UserError
+from climatenerf.scene import read_scene
+from climatenerf.weather.units import OptionalLength
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit a radiance field to posed photographs."""
+
+    scene: tyro.conf.Positional[Path]
+    """Folder of the capture: COLMAP, transforms.json or a scene folder."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Run folder to make."""
+    minutes: float = 5.0
+    """Time for fitting; reading and measuring come on top."""
+    steps: int | None = None
+    """Stop after this many steps, if that is sooner."""
+    downscale: int = 1
+    """Reduce the photos this many times in width and height."""
+    holdout: str | None = None
+    """Photos kept for measuring: names with commas between, or 0 for none. Default: the capture's
+    own split, else every 8th by name."""
+    resume: bool = False
+    """Continue the run in the folder; --minutes then counts from its beginning."""
+    preset: Literal["cpu", "paper"] = "cpu"
+    """Size of the field."""
+    camera_height: OptionalLength = None
+    """Height of the cameras above the ground, which sets the scale."""
+    metric_input: bool = False
+    """The capture is in metres with z up already."""
+    seed: int = 0
+    """Of all randomness."""
+
+
+def run(options: Fit) -> int:
+    """Reads the capture, fits, and says where the run is and how good."""
+    if options.minutes <= 0 or (options.steps is not None and options.steps < 1):
+        raise UserError("--minutes and --steps must be above 0; try --minutes 5")
+    if options.downscale < 1:
+        raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
+    scene = read_scene(
+        options.scene,
+        holdout=options.holdout,
+        camera_height=options.camera_height,
+        metric_input=options.metric_input,
+    )
+    for warning in scene.warnings:
+        progress.warn(warning)
+    metrics = fit_with_bars(scene, options)
+    if metrics["interrupted"]:
+        progress.say(
+            f"Stopped early; continue with: climatenerf fit {options.scene}"
+            f" -o {options.out} --resume"
+        )
+    progress.result(summary(metrics))
+    progress.result(f"run: {options.out}")
+    return 0
+
+
+def fit_with_bars(scene, options: Fit) -> dict:
+    """Fits with progress bars; returns the metrics."""
+    # torch comes in here, so that help and errors in the input do not wait for it.
+    progress.say("Preparing (the first run on a machine compiles kernels, about half a minute)")
+    from climatenerf.training.fit import FitSettings, Report
+    from climatenerf.training.run import fit_scene
+
+    settings = FitSettings(
+        preset=options.preset,
+        minutes=options.minutes,
+        steps=options.steps,
+        seed=options.seed,
+    )
+    with progress.Bar("fit", 1.0) as bar:
+
+        def report(state: Report) -> None:
+            bar.update(
+                state.progress,
+                {
+                    "step": str(state.step),
+                    "rays/s": progress.rate(state.rays_per_second),
+                    "samples/ray": f"{state.samples_per_ray:.0f}",
+                    "PSNR": f"{state.psnr:.1f}",
+                },
+            )
+
+        def evaluated(done: int, total: int) -> None:
+            bar.update(1.0, {"held-out": f"{done}/{total}"})
+
+        return fit_scene(
+            scene, options.out, settings, options.downscale, options.resume, report, evaluated
+        )
+
+
+def summary(metrics: dict) -> str:
+    """One line: quality and cost."""
+    cost = f"{metrics['steps']} steps, {metrics['seconds']:.0f} s of fitting"
+    if metrics["psnr"] is None:
+        return f"no held-out photos to measure; {cost}"
+    return (
+        f"held-out PSNR {metrics['psnr']:.2f} dB (colour-corrected {metrics['psnr_cc']:.2f}),"
+        f" SSIM {metrics['ssim']:.3f}; {cost}"
+    )

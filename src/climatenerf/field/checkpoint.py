@@ -1,0 +1,58 @@
+"""The field on disk: `field.safetensors`, with its sizes in the file's metadata."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from climatenerf.errors import UserError
+from climatenerf.field.field import Field
+from climatenerf.field.occupancy import Occupancy
+from climatenerf.field.presets import FieldSize
+from climatenerf.storage import check_schema, read_safetensors, write_safetensors
+
+SCHEMA_VERSION = 1
+FILE_NAME = "field.safetensors"
+
+
+def save_field(field: Field, run: Path) -> None:
+    """Writes the field into a run folder, atomically."""
+    about = {
+        "schema_version": SCHEMA_VERSION,
+        "size": dataclasses.asdict(field.size),
+        "unit": field.unit,
+        "near": field.near,
+    }
+    tensors = {k: v.detach().contiguous() for k, v in field.state_dict().items()}
+    write_safetensors(run / FILE_NAME, tensors, {"climatenerf": json.dumps(about)})
+
+
+def load_field(run: Path) -> Field:
+    """Reads the field of a run folder.
+
+    Raises:
+        UserError: there is none, it is damaged, or a newer version wrote it.
+    """
+    path = run / FILE_NAME
+    if not path.is_file():
+        raise UserError(
+            f"{run} holds no {FILE_NAME}, so it is no finished run; make one with"
+            " `climatenerf fit SCENE -o RUN`"
+        )
+    arrays, metadata = read_safetensors(path, "the field")
+    try:
+        about = json.loads(metadata["climatenerf"])
+        check_schema(about["schema_version"], SCHEMA_VERSION, f"the field in {run}")
+        size = FieldSize(**about["size"])
+        field = Field(
+            size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
+        )
+        field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
+        field.load_state_dict({k: torch.from_numpy(v) for k, v in arrays.items()})
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise UserError(
+            f"{path} is damaged ({type(error).__name__}: {error}); fit the scene again"
+        ) from error
+    return field.eval().requires_grad_(False)

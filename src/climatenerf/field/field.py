@@ -1,0 +1,323 @@
+"""The radiance field: two hash grids, a colour network, a directional sky, an occupancy grid.
+
+Geometry depends on the geometry grid alone; the appearance grid, the view direction and a
+per-image vector give colour (paper §3.1). Callers speak world metres; inside, lengths are in grid
+units: (x - centre) / unit, where the ball of radius 1 holds the core of the scene.
+"""
+
+import copy
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from climatenerf.field.colour_space import decode_srgb
+from climatenerf.field.directions import spherical_harmonics
+from climatenerf.field.occupancy import Occupancy
+from climatenerf.field.presets import FieldSize
+from climatenerf.ops import cpu, dispatch
+from climatenerf.render.samples import Samples
+
+STEP_MIN = 1.0 / 256  # smallest marching step, grid units
+STEP_CONE = 1.0 / 160  # marching step per length travelled
+CAPACITY = 1024  # samples a ray may have; a ray across all cascades takes 850 whole steps
+
+
+def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
+    growth = math.log(finest / coarsest) / max(levels - 1, 1)
+    return torch.tensor([int(coarsest * math.exp(growth * i) + 1e-6) for i in range(levels)])
+
+
+def _layers(*widths: int) -> nn.ParameterList:
+    """Weights [in, out] and biases [out] in turn; He initialisation."""
+    parameters = []
+    for i, o in zip(widths[:-1], widths[1:], strict=True):
+        bound = math.sqrt(6.0 / i)
+        parameters += [nn.Parameter(torch.empty(i, o).uniform_(-bound, bound))]
+        parameters += [nn.Parameter(torch.zeros(o))]
+    return nn.ParameterList(parameters)
+
+
+def _pairs(parameters: nn.ParameterList) -> list[tuple[Tensor, Tensor]]:
+    return list(zip(parameters[::2], parameters[1::2], strict=True))
+
+
+class Field(nn.Module):
+    """A radiance field in world metres; see the module's docstring."""
+
+    centre: Tensor
+    geometry_resolutions: Tensor
+    appearance_resolutions: Tensor
+
+    def __init__(
+        self,
+        size: FieldSize,
+        images: int,
+        centre: Float[np.ndarray, "3"],
+        unit: float,
+        near: float = 0.0,
+    ):
+        """Makes an untrained field.
+
+        Args:
+            size: sizes of grids and networks.
+            images: number of training images, each with an appearance vector.
+            centre: middle of the scene, world metres.
+            unit: metres per grid unit.
+            near: no matter is believed nearer to a camera than this, m.
+        """
+        super().__init__()
+        self.size = size
+        self.unit = unit
+        self.near = near
+        self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
+        self.register_buffer(
+            "geometry_resolutions",
+            _resolutions(size.coarsest, size.geometry_finest, size.geometry_levels),
+        )
+        self.register_buffer(
+            "appearance_resolutions",
+            _resolutions(size.coarsest, size.appearance_finest, size.appearance_levels),
+        )
+        self.geometry_grid = nn.Parameter(
+            torch.empty(size.geometry_levels, 2**size.geometry_log2_rows, 2).uniform_(-1e-4, 1e-4)
+        )
+        self.appearance_grid = nn.Parameter(
+            torch.empty(size.appearance_levels, 2**size.appearance_log2_rows, 2).uniform_(
+                -1e-4, 1e-4
+            )
+        )
+        self.geometry_net = _layers(2 * size.geometry_levels, size.geometry_hidden, 1)
+        # Thin haze everywhere to begin with: dense enough to learn from, thin enough to prune.
+        nn.init.constant_(self.geometry_net[-1], -1.5)
+        self.colour_net = _layers(2 * size.appearance_levels, size.colour_hidden, 3)
+        self.view_net = _layers(16 + size.embedding, size.colour_hidden)
+        self.sky_net = _layers(16 + size.embedding, size.sky_hidden, size.sky_hidden, 3)
+        self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
+        # Coarse to begin with; `Occupancy.refine` halves the cells later.
+        self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
+
+    # --- coordinates -------------------------------------------------------------------------
+
+    def to_grid(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """World metres to grid units."""
+        return (x - self.centre) / self.unit
+
+    @property
+    def bounds(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Lower and upper corner (m) of the cube that holds all density."""
+        half = 2.0 ** (self.size.cascades - 1) * self.unit
+        return self.centre - half, self.centre + half
+
+    @property
+    def mean_embedding(self) -> Float[Tensor, "1 e"]:
+        """The appearance in which frames are rendered: the training images' mean."""
+        return self.embeddings.mean(0, keepdim=True)
+
+    # --- geometry ----------------------------------------------------------------------------
+
+    def _net(self) -> tuple:
+        """The geometry network as the kernels take it."""
+        w1, b1, w2, b2 = (p.detach().numpy() for p in self.geometry_net)
+        return (
+            self.geometry_grid.detach().numpy(),
+            self.geometry_resolutions.numpy(),
+            w1,
+            b1,
+            np.ascontiguousarray(w2[:, 0]),
+            np.float32(b2[0]),
+        )
+
+    def grid_density(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Density (1/grid unit) at positions in grid units, without gradient."""
+        out = torch.empty(q.shape[0])
+        cpu.density_at(q.contiguous().numpy(), *self._net(), out.numpy())
+        return out
+
+    @torch.no_grad()
+    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Extinction (1/m) at world positions, zero in cells known to be empty."""
+        q = self.to_grid(x)
+        return self.grid_density(q) * self.occupancy_at(q) / self.unit
+
+    def _cells(self, q: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n"], Tensor]:
+        """Flat index of each position's occupancy cell, and whether it is inside all cascades."""
+        reach = q.abs().amax(-1)
+        cascade = reach.clamp_min(1.0).log2().ceil().long()
+        inside = cascade < self.size.cascades
+        cascade = cascade.clamp_max(self.size.cascades - 1)
+        half = (2.0**cascade)[:, None]
+        side = self.occupancy.side
+        index = ((q + half) / (2 * half) * side).long().clamp(0, side - 1)
+        flat = ((cascade * side + index[:, 0]) * side + index[:, 1]) * side + index[:, 2]
+        return flat, inside
+
+    def occupancy_at(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """1 where the cell of a position (grid units) is occupied, else 0; 0 outside all cells."""
+        cells, inside = self._cells(q)
+        return self.occupancy.occupied.view(-1)[cells].float() * inside
+
+    def march(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        t_max: Float[Tensor, "n"],
+        step_scale: float = 1.0,
+        jitter: Float[Tensor, "n"] | None = None,
+        stop: float = 1e-3,
+    ) -> Samples:
+        """Samples of rays where matter is, without gradient.
+
+        Args:
+            rays_o: origins, m.
+            rays_d: unit directions.
+            t_min: ray length at which to begin, m.
+            t_max: ray length at which to end (may be infinite), m.
+            step_scale: factor on the step length.
+            jitter: share of the first step by which each ray's comb is shifted; default 0.
+            stop: transmittance at which a ray ends.
+        """
+        n = rays_o.shape[0]
+        if jitter is None:
+            jitter = torch.zeros(n)
+        padded = [np.empty((n, CAPACITY), np.float32) for _ in range(3)]
+        counts = cpu.march(
+            self.to_grid(rays_o).contiguous().numpy(),
+            rays_d.contiguous().numpy(),
+            (t_min / self.unit).contiguous().numpy(),
+            (t_max / self.unit).contiguous().numpy(),
+            jitter.numpy(),
+            self.occupancy.occupied.numpy(),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale),
+            stop,
+            self._net(),
+            *padded,
+        )
+        offsets = np.zeros(n + 1, np.int64)
+        np.cumsum(counts, out=offsets[1:])
+        packed = [np.empty(offsets[-1], np.float32) for _ in range(3)]
+        for source, target in zip(padded, packed, strict=True):
+            cpu.pack(source, counts, offsets, target)
+        t, dt, sigma = (torch.from_numpy(p) for p in packed)
+        return Samples(torch.from_numpy(offsets), t * self.unit, dt * self.unit, sigma / self.unit)
+
+    def sample_positions(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], samples: Samples
+    ) -> Float[Tensor, "s 3"]:
+        """Unit-cube coordinates of samples."""
+        u = torch.empty(samples.t.shape[0], 3)
+        cpu.grid_positions(
+            self.to_grid(rays_o).contiguous().numpy(),
+            rays_d.contiguous().numpy(),
+            samples.offsets.numpy(),
+            (samples.t / self.unit).contiguous().numpy(),
+            u.numpy(),
+        )
+        return u
+
+    def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
+        """Density (1/grid unit) at unit-cube coordinates, with gradients to the parameters."""
+        features = dispatch.hash_encode(u, self.geometry_grid, self.geometry_resolutions)
+        raw = dispatch.mlp(features, _pairs(self.geometry_net))[:, 0]
+        # 1/|q|^2 outside the core (see `reference.density`), from the contracted radius 2 - 1/|q|.
+        shell = (2.0 - (4.0 * u - 2.0).norm(dim=-1)).clamp(1e-4, 1.0)
+        return raw.clamp_max(15.0).exp() * shell.square()
+
+    @torch.no_grad()
+    def mark_seen(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], least: float = 0.02
+    ) -> None:
+        """Notes the cells that these rays (of training pixels) see: weight above `least`."""
+        n = rays_o.shape[0]
+        samples = self.march(rays_o, rays_d, torch.full((n,), self.near), torch.full((n,), 1e9))
+        weights, _ = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        keep = (weights > least).nonzero()[:, 0]
+        ray = samples.ray_index()[keep]
+        x = rays_o[ray] + samples.t[keep, None] * rays_d[ray]
+        cells, inside = self._cells(self.to_grid(x))
+        self.occupancy.seen.view(-1)[cells[inside]] = 1
+
+    def trusted(self) -> "Field":
+        """The same field without what no training image has seen (shares all parameters).
+
+        Photos say nothing about space that they do not show; haze left there would shelter the
+        ground from snow and sun.
+        """
+        twin = copy.copy(self)
+        twin.__dict__["_modules"] = dict(self._modules)
+        twin.occupancy = Occupancy(self.size.cascades, self.occupancy.side)
+        near_seen = nn.functional.max_pool3d(
+            self.occupancy.seen[:, None].float(), 3, stride=1, padding=1
+        )[:, 0]
+        twin.occupancy.occupied = self.occupancy.occupied * near_seen.to(torch.uint8)
+        return twin
+
+    # --- colour ------------------------------------------------------------------------------
+
+    def colour_at(
+        self,
+        u: Float[Tensor, "s 3"],
+        ray: Int[Tensor, "s"],
+        rays_d: Float[Tensor, "n 3"],
+        embedding: Float[Tensor, "n e"],
+    ) -> Float[Tensor, "s 3"]:
+        """Linear radiance of samples at unit-cube coordinates u, seen along their rays.
+
+        Args:
+            u: unit-cube coordinates.
+            ray: the ray of each sample.
+            rays_d: unit directions of the rays.
+            embedding: appearance of each ray.
+        """
+        features = dispatch.hash_encode(u, self.appearance_grid, self.appearance_resolutions)
+        view = torch.cat([spherical_harmonics(rays_d), embedding], dim=-1)
+        # One layer on what a ray's samples share, added to the first layer of the samples' own.
+        weight, bias = self.view_net
+        return _to_radiance(
+            dispatch.mlp(features, _pairs(self.colour_net), view @ weight + bias, ray)
+        )
+
+    def sky_colour(
+        self, d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]
+    ) -> Float[Tensor, "n 3"]:
+        """Linear radiance of the sky in direction d, in the appearance given."""
+        x = torch.cat([spherical_harmonics(d), embedding], dim=-1)
+        return _to_radiance(dispatch.mlp(x, _pairs(self.sky_net)))
+
+    @torch.no_grad()
+    def colour(
+        self,
+        x: Float[Tensor, "s 3"],
+        d: Float[Tensor, "n 3"],
+        ray: Int[Tensor, "s"] | None = None,
+    ) -> Float[Tensor, "s 3"]:
+        """Linear radiance of matter at world positions, in the mean appearance.
+
+        Args:
+            x: positions, m.
+            d: unit directions from the eye, one a position or (with `ray`) one a ray.
+            ray: the row of d for each position.
+        """
+        u = torch.empty(x.shape[0], 3)
+        one_each = np.arange(x.shape[0] + 1)
+        zero = np.zeros(x.shape[0], np.float32)
+        q = self.to_grid(x).contiguous().numpy()
+        cpu.grid_positions(q, q, one_each, zero, u.numpy())
+        rows = torch.arange(x.shape[0]) if ray is None else ray
+        return self.colour_at(u, rows, d, self.mean_embedding.expand(d.shape[0], -1))
+
+    @torch.no_grad()
+    def sky(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Linear radiance of the sky, in the mean appearance."""
+        return self.sky_colour(d, self.mean_embedding.expand(d.shape[0], -1))
+
+
+def _to_radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Network output to linear radiance: a display value ≥ 0 and unbounded, decoded.
+
+    Softplus with sharpness 8 is nearly the identity from 0.3 up and keeps a gradient at black.
+    """
+    return decode_srgb(nn.functional.softplus(raw + 0.5, beta=8.0))

@@ -1,0 +1,40 @@
+"""Sizes of the field, as plain values. Imports no torch."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FieldSize:
+    """Sizes of the two hash grids and of their networks."""
+
+    geometry_levels: int = 10
+    geometry_log2_rows: int = 17
+    geometry_finest: int = 2048
+    """Cells across the contracted cube (4 grid units) at the finest level."""
+    geometry_hidden: int = 32
+    appearance_levels: int = 12
+    appearance_log2_rows: int = 18
+    appearance_finest: int = 4096
+    colour_hidden: int = 64
+    coarsest: int = 16
+    embedding: int = 8
+    """Length of the appearance vector of each training image."""
+    sky_hidden: int = 32
+    occupancy_side: int = 128
+    """Cells along an edge of each occupancy cascade."""
+    cascades: int = 7
+    """Cascade k covers the cube of half side 2^k grid units."""
+
+
+PRESETS = {
+    "cpu": FieldSize(),
+    # Supplement, "Training Details": 16 levels of 2^19 for density, 32 of 2^21 for the rest.
+    "paper": FieldSize(
+        geometry_levels=16,
+        geometry_log2_rows=19,
+        geometry_hidden=128,
+        appearance_levels=32,
+        appearance_log2_rows=21,
+        colour_hidden=128,
+    ),
+}

@@ -1,0 +1,385 @@
+"""CPU kernels in Numba: hash encoding, ray marching with density, compositing.
+
+Each kernel has its slow, obvious twin in `reference.py`, which is the specification. Lengths are
+in grid units (see `reference.contract`); rays are packed: the samples of ray r are
+`offsets[r]:offsets[r + 1]`, front to back. Arrays are float32, C-contiguous.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+PRIME_Y = np.uint32(2654435761)
+PRIME_Z = np.uint32(805459861)
+BLOCK = 256  # points per block: a level's working set for them stays in the first-level cache
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _contract_scale(m):
+    """Factor that takes a point at distance m from the centre into the ball of radius 2."""
+    return 1.0 if m <= 1.0 else (2.0 - 1.0 / m) / m
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _corner(x, y, z, resolution, dense, mask):
+    """Table row of a lattice corner: direct where the level fits its table, else hashed."""
+    if dense:
+        side = np.uint32(resolution + 1)
+        return np.int64(np.uint32(np.uint32(x + np.uint32(side * y)) + np.uint32(side * side * z)))
+    hashed = np.uint32(x ^ np.uint32(y * PRIME_Y)) ^ np.uint32(z * PRIME_Z)
+    return np.int64(np.uint32(hashed) & mask)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _lookup(ux, uy, uz, level, resolution, dense, mask):
+    """Trilinear interpolation of one level's two features at a point of the unit cube."""
+    px, py, pz = ux * resolution, uy * resolution, uz * resolution
+    ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
+    fx, fy, fz = px - ix, py - iy, pz - iz
+    one = np.uint32(1)
+    jx, jy, jz = np.uint32(ix + one), np.uint32(iy + one), np.uint32(iz + one)
+    gx, gy, gz = np.float32(1.0) - fx, np.float32(1.0) - fy, np.float32(1.0) - fz
+    a = _corner(ix, iy, iz, resolution, dense, mask)
+    b = _corner(jx, iy, iz, resolution, dense, mask)
+    c = _corner(ix, jy, iz, resolution, dense, mask)
+    d = _corner(jx, jy, iz, resolution, dense, mask)
+    e = _corner(ix, iy, jz, resolution, dense, mask)
+    f = _corner(jx, iy, jz, resolution, dense, mask)
+    g = _corner(ix, jy, jz, resolution, dense, mask)
+    h = _corner(jx, jy, jz, resolution, dense, mask)
+    w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
+    first = (
+        w00 * (gx * level[a, 0] + fx * level[b, 0])
+        + w10 * (gx * level[c, 0] + fx * level[d, 0])
+        + w01 * (gx * level[e, 0] + fx * level[f, 0])
+        + w11 * (gx * level[g, 0] + fx * level[h, 0])
+    )
+    second = (
+        w00 * (gx * level[a, 1] + fx * level[b, 1])
+        + w10 * (gx * level[c, 1] + fx * level[d, 1])
+        + w01 * (gx * level[e, 1] + fx * level[f, 1])
+        + w11 * (gx * level[g, 1] + fx * level[h, 1])
+    )
+    return first, second
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _is_dense(resolution, table_size):
+    return (resolution + 1) ** 3 <= table_size
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def hash_encode(u, table, resolutions, out):
+    """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n] (feature-major)."""
+    n = u.shape[0]
+    levels, size = table.shape[0], table.shape[1]
+    mask = np.uint32(size - 1)
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        start = block * BLOCK
+        stop = min(n, start + BLOCK)
+        for level in range(levels):
+            resolution = resolutions[level]
+            dense = _is_dense(resolution, size)
+            rows = table[level]
+            for p in range(start, stop):
+                a, b = _lookup(u[p, 0], u[p, 1], u[p, 2], rows, resolution, dense, mask)
+                out[2 * level, p] = a
+                out[2 * level + 1, p] = b
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def hash_encode_backward(u, grad_out, resolutions, grad_table):
+    """Adds the gradient of `hash_encode` to grad_table [L,T,2].
+
+    One thread owns a level, so no two threads write to one row and the sum's order is fixed.
+    """
+    n = u.shape[0]
+    levels, size = grad_table.shape[0], grad_table.shape[1]
+    mask = np.uint32(size - 1)
+    one = np.uint32(1)
+    for level in prange(levels):
+        resolution = resolutions[level]
+        dense = _is_dense(resolution, size)
+        rows = grad_table[level]
+        for p in range(n):
+            ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
+            if ga == 0.0 and gb == 0.0:
+                continue
+            px, py, pz = u[p, 0] * resolution, u[p, 1] * resolution, u[p, 2] * resolution
+            ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
+            fx, fy, fz = px - ix, py - iy, pz - iz
+            for corner in range(8):
+                dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
+                wx = fx if dx else np.float32(1.0) - fx
+                wy = fy if dy else np.float32(1.0) - fy
+                wz = fz if dz else np.float32(1.0) - fz
+                row = _corner(
+                    np.uint32(ix + one) if dx else ix,
+                    np.uint32(iy + one) if dy else iy,
+                    np.uint32(iz + one) if dz else iz,
+                    resolution,
+                    dense,
+                    mask,
+                )
+                w = wx * wy * wz
+                rows[row, 0] += w * ga
+                rows[row, 1] += w * gb
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden):
+    """Density (1/grid unit) at one point: contraction, encoding, one hidden layer, exp."""
+    m = np.sqrt(qx * qx + qy * qy + qz * qz)
+    s = np.float32(_contract_scale(m)) * np.float32(0.25)
+    ux = min(max(qx * s + np.float32(0.5), np.float32(0.0)), np.float32(0.999999))
+    uy = min(max(qy * s + np.float32(0.5), np.float32(0.0)), np.float32(0.999999))
+    uz = min(max(qz * s + np.float32(0.5), np.float32(0.0)), np.float32(0.999999))
+    size = table.shape[1]
+    mask = np.uint32(size - 1)
+    width = w1.shape[1]
+    for j in range(width):
+        hidden[j] = b1[j]
+    for level in range(table.shape[0]):
+        resolution = resolutions[level]
+        a, b = _lookup(ux, uy, uz, table[level], resolution, _is_dense(resolution, size), mask)
+        for j in range(width):
+            hidden[j] += a * w1[2 * level, j] + b * w1[2 * level + 1, j]
+    raw = b2
+    for j in range(width):
+        raw += max(hidden[j], np.float32(0.0)) * w2[j]
+    # Per contracted length: distance squared thins it, so far space starts out nearly empty.
+    thin = np.float32(1.0) / max(m * m, np.float32(1.0))
+    return np.exp(min(raw, np.float32(15.0))) * thin
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def density_at(q, table, resolutions, w1, b1, w2, b2, out):
+    """Density (1/grid unit) at q [n,3] in grid units → out [n]."""
+    n = q.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        hidden = np.empty(w1.shape[1], np.float32)
+        for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
+            out[p] = _density(q[p, 0], q[p, 1], q[p, 2], table, resolutions, w1, b1, w2, b2, hidden)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _cell_exit(o, inv, q, cell):
+    """Ray length at which the ray leaves the lattice cell of side `cell` holding q, one axis."""
+    if inv > 1e29 or inv < -1e29:  # the ray runs parallel to this pair of faces
+        return np.float32(1e30)
+    edge = np.floor(q / cell) * cell + (cell if inv > 0 else np.float32(0.0))
+    return (edge - o) * inv
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def march(
+    rays_o, rays_d, t_min, t_max, jitter, occupied, steps, stop, net, out_t, out_dt, out_sigma
+):
+    """Marches rays front to back through occupied space, evaluating density on the way.
+
+    Args: rays [n,3] in grid units, t_min, t_max, jitter [n]; occupied [K,G,G,G] uint8, cascade k
+    covers the cube of half side 2^k; steps = (smallest step, step per length, near scale);
+    stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
+    out_* [n, capacity]. Returns counts [n], the samples written per ray.
+    """
+    table, resolutions, w1, b1, w2, b2 = net
+    n = rays_o.shape[0]
+    cascades, side = occupied.shape[0], occupied.shape[1]
+    capacity = out_t.shape[1]
+    counts = np.zeros(n, np.int64)
+    far = np.float32(2.0 ** (cascades - 1))
+    dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
+    log_stop = np.float32(-np.log(stop))
+    chunk = 64
+    for block in prange((n + chunk - 1) // chunk):
+        hidden = np.empty(w1.shape[1], np.float32)
+        for r in range(block * chunk, min(n, block * chunk + chunk)):
+            ox, oy, oz = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
+            dx, dy, dz = rays_d[r, 0], rays_d[r, 1], rays_d[r, 2]
+            big = np.float32(1e30)
+            ivx = np.float32(1.0) / dx if dx != 0 else big
+            ivy = np.float32(1.0) / dy if dy != 0 else big
+            ivz = np.float32(1.0) / dz if dz != 0 else big
+            # Clip to the outermost cube.
+            t, end = t_min[r], t_max[r]
+            for o, d, iv in ((ox, dx, ivx), (oy, dy, ivy), (oz, dz, ivz)):
+                if d == 0:
+                    if o < -far or o > far:
+                        end = np.float32(-1.0)
+                else:
+                    ta, tb = (-far - o) * iv, (far - o) * iv
+                    t = max(t, min(ta, tb))
+                    end = min(end, max(ta, tb))
+            tau = np.float32(0.0)
+            k = 0
+            t += jitter[r] * max(dt_min, cone * t)
+            while t < end and k < capacity and tau < log_stop:
+                dt = min(max(dt_min, cone * t), end - t)
+                tm = t + np.float32(0.5) * dt
+                qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz
+                m = max(abs(qx), abs(qy), abs(qz))
+                cascade = 0
+                half = np.float32(1.0)
+                while m > half and cascade < cascades - 1:
+                    half *= np.float32(2.0)
+                    cascade += 1
+                cell = np.float32(2.0) * half / side
+                ix = min(max(int((qx + half) / cell), 0), side - 1)
+                iy = min(max(int((qy + half) / cell), 0), side - 1)
+                iz = min(max(int((qz + half) / cell), 0), side - 1)
+                if occupied[cascade, ix, iy, iz]:
+                    sigma = _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden)
+                    if sigma * dt > np.float32(1e-5):
+                        out_t[r, k] = tm
+                        out_dt[r, k] = dt
+                        out_sigma[r, k] = sigma
+                        tau += sigma * dt
+                        k += 1
+                    t += dt
+                else:
+                    leave = min(
+                        _cell_exit(ox, ivx, qx, cell),
+                        _cell_exit(oy, ivy, qy, cell),
+                        _cell_exit(oz, ivz, qz, cell),
+                    )
+                    # Whole steps, so that the sampling comb does not depend on the cells crossed.
+                    skip = np.ceil((leave - tm) / dt)
+                    t += dt * max(skip, np.float32(1.0))
+            counts[r] = k
+    return counts
+
+
+@njit(cache=True, parallel=True)
+def pack(padded, counts, offsets, out):
+    """Packs padded [n, capacity] rows into out [sum(counts)]."""
+    for r in prange(counts.shape[0]):
+        for k in range(counts[r]):
+            out[offsets[r] + k] = padded[r, k]
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def grid_positions(rays_o, rays_d, offsets, t, u):
+    """Unit-cube coordinates (after contraction) of packed samples: → u [samples,3]."""
+    for r in prange(rays_o.shape[0]):
+        for i in range(offsets[r], offsets[r + 1]):
+            qx = rays_o[r, 0] + t[i] * rays_d[r, 0]
+            qy = rays_o[r, 1] + t[i] * rays_d[r, 1]
+            qz = rays_o[r, 2] + t[i] * rays_d[r, 2]
+            m = np.sqrt(qx * qx + qy * qy + qz * qz)
+            s = np.float32(_contract_scale(m)) * np.float32(0.25)
+            half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
+            u[i, 0] = min(max(qx * s + half, low), high)
+            u[i, 1] = min(max(qy * s + half, low), high)
+            u[i, 2] = min(max(qz * s + half, low), high)
+
+
+@njit(cache=True, parallel=True)
+def weights_forward(tau, offsets, weights, transmittance):
+    """Rendering weights of packed samples with optical depths tau; transmittance left per ray."""
+    for r in prange(offsets.shape[0] - 1):
+        total = 0.0
+        for i in range(offsets[r], offsets[r + 1]):
+            before = np.exp(-total)
+            total += tau[i]
+            weights[i] = before * -np.expm1(-tau[i])
+        transmittance[r] = np.exp(-total)
+
+
+@njit(cache=True, parallel=True)
+def weights_backward(tau, offsets, grad_w, grad_t, grad_tau):
+    """Gradient of `weights_forward`: dw_i/dtau_i = T_{i+1}, dw_j/dtau_i = -w_j for j > i."""
+    for r in prange(offsets.shape[0] - 1):
+        total = 0.0
+        for i in range(offsets[r], offsets[r + 1]):
+            total += tau[i]
+        behind = grad_t[r] * np.exp(-total)
+        for i in range(offsets[r + 1] - 1, offsets[r] - 1, -1):
+            after = np.exp(-total)
+            total -= tau[i]
+            grad_tau[i] = grad_w[i] * after - behind
+            behind += grad_w[i] * np.exp(-total) * -np.expm1(-tau[i])
+
+
+@njit(cache=True, parallel=True)
+def accumulate_forward(weights, values, offsets, out):
+    """Sum over each ray of weights [s] · values [s,c] → out [rays,c]."""
+    for r in prange(offsets.shape[0] - 1):
+        for c in range(values.shape[1]):
+            total = 0.0
+            for i in range(offsets[r], offsets[r + 1]):
+                total += weights[i] * values[i, c]
+            out[r, c] = total
+
+
+@njit(cache=True, parallel=True)
+def accumulate_backward(weights, values, offsets, grad_out, grad_w, grad_v):
+    """Gradient of `accumulate_forward`."""
+    for r in prange(offsets.shape[0] - 1):
+        for i in range(offsets[r], offsets[r + 1]):
+            total = 0.0
+            for c in range(values.shape[1]):
+                total += grad_out[r, c] * values[i, c]
+                grad_v[i, c] = grad_out[r, c] * weights[i]
+            grad_w[i] = total
+
+
+@njit(cache=True, parallel=True)
+def distortion_forward(weights, s, ds, offsets, out):
+    """Distortion loss per ray, in linear time (DVGOv2); see `reference.distortion`."""
+    for r in prange(offsets.shape[0] - 1):
+        total, w_sum, ws_sum = 0.0, 0.0, 0.0
+        for i in range(offsets[r], offsets[r + 1]):
+            total += 2.0 * weights[i] * (s[i] * w_sum - ws_sum)
+            total += weights[i] * weights[i] * ds[i] / 3.0
+            w_sum += weights[i]
+            ws_sum += weights[i] * s[i]
+        out[r] = total
+
+
+@njit(cache=True, parallel=True)
+def distortion_backward(weights, s, ds, offsets, grad_out, grad_w):
+    """Gradient of `distortion_forward` to the weights."""
+    for r in prange(offsets.shape[0] - 1):
+        w_all, ws_all = 0.0, 0.0
+        for i in range(offsets[r], offsets[r + 1]):
+            w_all += weights[i]
+            ws_all += weights[i] * s[i]
+        w_sum, ws_sum = 0.0, 0.0
+        for i in range(offsets[r], offsets[r + 1]):
+            w, p = weights[i], s[i]
+            before = p * w_sum - ws_sum
+            w_sum += w
+            ws_sum += w * p
+            after = (ws_all - ws_sum) - p * (w_all - w_sum)
+            grad_w[i] = grad_out[r] * (2.0 * (before + after) + 2.0 * w * ds[i] / 3.0)
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correction1, correction2):
+    """One Adam step over flat arrays that leaves entries without gradient untouched."""
+    n = parameter.shape[0]
+    block = 4096
+    for b in prange((n + block - 1) // block):
+        for i in range(b * block, min(n, b * block + block)):
+            g = gradient[i]
+            if g != 0.0:
+                m = beta1 * first[i] + (1.0 - beta1) * g
+                v = beta2 * second[i] + (1.0 - beta2) * g * g
+                first[i] = m
+                second[i] = v
+                parameter[i] -= rate * (m / correction1) / (np.sqrt(v / correction2) + epsilon)
+                gradient[i] = 0.0
+
+
+@njit(cache=True, parallel=True)
+def merge_order(t_a, offsets_a, t_b, offsets_b, offsets, order):
+    """Order that merges two packed sample lists by t; indices ≥ len(t_a) mean list b."""
+    shift = t_a.shape[0]
+    for r in prange(offsets.shape[0] - 1):
+        i, j = offsets_a[r], offsets_b[r]
+        for k in range(offsets[r], offsets[r + 1]):
+            if j >= offsets_b[r + 1] or (i < offsets_a[r + 1] and t_a[i] <= t_b[j]):
+                order[k] = i
+                i += 1
+            else:
+                order[k] = shift + j
+                j += 1

@@ -1,0 +1,214 @@
+"""The operations as the rest of the program calls them: one function each, with gradients.
+
+The device of the tensors decides the kernel. CPU tensors of 32 bits go to Numba (`cpu.py`);
+everything else goes to the reference, which is slow and always right.
+"""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from climatenerf.ops import cpu, reference
+
+
+def _fast(*tensors: Tensor) -> bool:
+    return all(t.device.type == "cpu" and t.dtype in (torch.float32, torch.int64) for t in tensors)
+
+
+def _np(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+class _HashEncode(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, u, table, resolutions):
+        out = torch.empty(2 * table.shape[0], u.shape[0])
+        cpu.hash_encode(_np(u), _np(table), _np(resolutions), out.numpy())
+        ctx.save_for_backward(u, resolutions)
+        ctx.table = table
+        return out.T
+
+    @staticmethod
+    def backward(ctx, grad):
+        u, resolutions = ctx.saved_tensors
+        table = ctx.table
+        # A buffer kept on the table saves zeroing and copying megabytes each step: the optimiser
+        # clears what it has used (training/optimiser.py).
+        buffer = getattr(table, "grad_buffer", None)
+        target = torch.zeros_like(table) if buffer is None else buffer
+        cpu.hash_encode_backward(_np(u), _np(grad.T), _np(resolutions), target.numpy())
+        return None, (target if buffer is None else None), None
+
+
+def hash_encode(
+    u: Float[Tensor, "n 3"],
+    table: Float[Tensor, "levels rows 2"],
+    resolutions: Int[Tensor, "levels"],
+) -> Float[Tensor, "n features"]:
+    """See `reference.hash_encode`; gradients to the table only."""
+    if _fast(u, table):
+        return _HashEncode.apply(u, table, resolutions)
+    return reference.hash_encode(u, table, resolutions)
+
+
+class _RenderWeights(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, tau, offsets):
+        weights, left = torch.empty_like(tau), torch.empty(offsets.shape[0] - 1)
+        cpu.weights_forward(_np(tau), _np(offsets), weights.numpy(), left.numpy())
+        ctx.save_for_backward(tau, offsets)
+        return weights, left
+
+    @staticmethod
+    def backward(ctx, grad_w, grad_t):
+        tau, offsets = ctx.saved_tensors
+        grad = torch.empty_like(tau)
+        cpu.weights_backward(_np(tau), _np(offsets), _np(grad_w), _np(grad_t), grad.numpy())
+        return grad, None
+
+
+def render_weights(
+    tau: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]
+) -> tuple[Float[Tensor, "s"], Float[Tensor, "rays"]]:
+    """See `reference.render_weights`."""
+    if _fast(tau, offsets):
+        return _RenderWeights.apply(tau, offsets)
+    return reference.render_weights(tau, offsets)
+
+
+class _Accumulate(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, weights, values, offsets):
+        out = torch.empty(offsets.shape[0] - 1, values.shape[1])
+        cpu.accumulate_forward(_np(weights), _np(values), _np(offsets), out.numpy())
+        ctx.save_for_backward(weights, values, offsets)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):
+        weights, values, offsets = ctx.saved_tensors
+        grad_w, grad_v = torch.empty_like(weights), torch.empty(values.shape)
+        cpu.accumulate_backward(
+            _np(weights), _np(values), _np(offsets), _np(grad), grad_w.numpy(), grad_v.numpy()
+        )
+        return grad_w, grad_v, None
+
+
+def accumulate(
+    weights: Float[Tensor, "s"], values: Float[Tensor, "s c"], offsets: Int[Tensor, "rays+1"]
+) -> Float[Tensor, "rays c"]:
+    """See `reference.accumulate`."""
+    if _fast(weights, values, offsets):
+        return _Accumulate.apply(weights, values, offsets)
+    return reference.accumulate(weights, values, offsets)
+
+
+class _Distortion(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, weights, s, ds, offsets):
+        out = torch.empty(offsets.shape[0] - 1)
+        cpu.distortion_forward(_np(weights), _np(s), _np(ds), _np(offsets), out.numpy())
+        ctx.save_for_backward(weights, s, ds, offsets)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):
+        weights, s, ds, offsets = ctx.saved_tensors
+        grad_w = torch.empty_like(weights)
+        cpu.distortion_backward(
+            _np(weights), _np(s), _np(ds), _np(offsets), _np(grad), grad_w.numpy()
+        )
+        return grad_w, None, None, None
+
+
+def distortion(
+    weights: Float[Tensor, "s"],
+    s: Float[Tensor, "s"],
+    ds: Float[Tensor, "s"],
+    offsets: Int[Tensor, "rays+1"],
+) -> Float[Tensor, "rays"]:
+    """See `reference.distortion`; gradients to the weights only."""
+    if _fast(weights, s, ds, offsets):
+        return _Distortion.apply(weights, s, ds, offsets)
+    return reference.distortion(weights, s, ds, offsets)
+
+
+CHUNK = 4096  # rows of a matrix product that stay in cache: half the time of whole-batch products
+
+
+class _Mlp(torch.autograd.Function):
+    """Keeps no hidden layer: the backward pass computes it again, chunk by chunk."""
+
+    @staticmethod
+    def forward(ctx, x, shared, row, *parameters):
+        weights, biases = parameters[::2], parameters[1::2]
+        out = x.new_empty(x.shape[0], weights[-1].shape[1])
+        for start in range(0, x.shape[0], CHUNK):
+            part = slice(start, start + CHUNK)
+            out[part] = torch.addmm(
+                biases[-1], _Mlp.hidden(x, shared, row, part, weights, biases)[-1], weights[-1]
+            )
+        ctx.save_for_backward(x, shared, row, *parameters)
+        return out
+
+    @staticmethod
+    def hidden(x, shared, row, part, weights, biases):
+        """Inputs of every layer for some rows."""
+        inputs = [x[part]]
+        for i, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
+            h = torch.addmm(bias, inputs[-1], weight)
+            if i == 0 and shared is not None:
+                h += shared.index_select(0, row[part])
+            inputs.append(h.relu_())
+        return inputs
+
+    @staticmethod
+    def backward(ctx, grad):
+        x, shared, row, *parameters = ctx.saved_tensors
+        weights, biases = parameters[::2], parameters[1::2]
+        grads = [torch.zeros_like(p) for p in parameters]
+        grad_shared = None if shared is None else torch.zeros_like(shared)
+        # Feature-major like the encoding's output, so that its backward pass reads rows.
+        grad_x = x.new_empty(x.shape[1], x.shape[0]) if ctx.needs_input_grad[0] else None
+        for start in range(0, x.shape[0], CHUNK):
+            part = slice(start, start + CHUNK)
+            inputs = _Mlp.hidden(x, shared, row, part, weights, biases)
+            g = grad[part]
+            for i in range(len(weights) - 1, -1, -1):
+                grads[2 * i].addmm_(inputs[i].T, g)
+                grads[2 * i + 1].add_(g.sum(0))
+                if i:
+                    g = (g @ weights[i].T).mul_(inputs[i] > 0)
+            if grad_shared is not None:
+                grad_shared.index_add_(0, row[part], g)
+            if grad_x is not None:
+                torch.mm(weights[0], g.T, out=grad_x[:, part])
+        return (None if grad_x is None else grad_x.T), grad_shared, None, *grads
+
+
+def mlp(
+    x: Float[Tensor, "n i"],
+    layers: list[tuple[Tensor, Tensor]],
+    shared: Float[Tensor, "m h"] | None = None,
+    row: Int[Tensor, "n"] | None = None,
+) -> Float[Tensor, "n o"]:
+    """See `reference.mlp`."""
+    if _fast(x):
+        return _Mlp.apply(x, shared, row, *[p for layer in layers for p in layer])
+    return reference.mlp(x, layers, shared, row)
+
+
+def merge_order(
+    t_a: Float[Tensor, "a"],
+    offsets_a: Int[Tensor, "rays+1"],
+    t_b: Float[Tensor, "b"],
+    offsets_b: Int[Tensor, "rays+1"],
+) -> tuple[Int[Tensor, "a+b"], Int[Tensor, "rays+1"]]:
+    """See `reference.merge_order`."""
+    if not _fast(t_a, t_b, offsets_a, offsets_b):
+        return reference.merge_order(t_a, offsets_a, t_b, offsets_b)
+    offsets = offsets_a + offsets_b
+    order = torch.empty(t_a.shape[0] + t_b.shape[0], dtype=torch.long)
+    cpu.merge_order(_np(t_a), _np(offsets_a), _np(t_b), _np(offsets_b), _np(offsets), order.numpy())
+    return order, offsets

@@ -1,0 +1,26 @@
+"""Samples along rays, packed."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass
+class Samples:
+    """Samples of n rays, packed by ray, front to back."""
+
+    offsets: Int[Tensor, "rays+1"]
+    """Samples of ray r are offsets[r]:offsets[r + 1]."""
+    t: Float[Tensor, "s"]
+    """Ray length of the sample's middle, m."""
+    dt: Float[Tensor, "s"]
+    """Extent along the ray, m."""
+    sigma: Float[Tensor, "s"]
+    """Extinction, 1/m."""
+
+    def ray_index(self) -> Int[Tensor, "s"]:
+        """The ray each sample belongs to."""
+        counts = self.offsets[1:] - self.offsets[:-1]
+        return torch.repeat_interleave(torch.arange(counts.shape[0]), counts)

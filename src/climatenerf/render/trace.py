@@ -1,0 +1,422 @@
+"""One renderer for all weather: what a ray sees of the world, by recursion.
+
+A ray collects samples of the field and of matter lying on it, merged front to back. Air acts
+between them in closed form. Since a sample absorbs at one place, each sample's light crosses the
+air (or water) in front of it only, so c_i becomes T(t_i) c_i + (1 - T(t_i)) c_air: by Abel
+summation this is the paper's sum over sigma_scene + sigma_air, with no samples in empty space.
+Where the ray meets the water, the part of its light that comes from beyond the surface is replaced
+by what the surface shows: reflected rays traced by the same function, and the bed seen through
+water.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from climatenerf.ops import dispatch
+from climatenerf.render.samples import Samples
+from climatenerf.render.world import SKY_OPACITY, TINY, Seen, Water, World
+from climatenerf.weather import flood as water_physics
+from climatenerf.weather import smog, waves
+
+LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
+LEAST_SHARE = 1.0 / 2048  # of a pixel that water must have to be traced: below an 8-bit step
+RAYS_AT_ONCE = 16384  # bounds memory
+SKIN = 2e-3  # secondary rays begin this far from the water, m
+
+
+@torch.no_grad()
+def trace(
+    world: World,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    pixel_angle: Float[Tensor, "n"],
+    roll: Float[Tensor, "n"] | None = None,
+    normals: bool = False,
+) -> Seen:
+    """What camera rays see. Independent of how rays are grouped.
+
+    Args:
+        world: field and weather.
+        rays_o: origins, m.
+        rays_d: unit directions.
+        pixel_angle: angle a pixel spans, rad.
+        roll: turn of each ray's glossy reflection, rad; see `flood.pixel_roll`.
+        normals: also find the normals (six more densities a ray).
+    """
+    parts = []
+    for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
+        some = slice(start, start + RAYS_AT_ONCE)
+        parts.append(
+            _trace(
+                world,
+                rays_o[some],
+                rays_d[some],
+                pixel_angle[some],
+                None if roll is None else roll[some],
+                torch.full_like(pixel_angle[some], world.near),
+                bounces=2,
+                normals=normals,
+            )
+        )
+    return Seen(
+        **{key: torch.cat([getattr(p, key) for p in parts]) for key in Seen.__annotations__}
+    )
+
+
+def _trace(
+    world: World,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    pixel_angle: Float[Tensor, "n"],
+    roll: Float[Tensor, "n"] | None,
+    t_min: Float[Tensor, "n"],
+    bounces: int,
+    normals: bool = False,
+) -> Seen:
+    """See `trace`; at most `bounces` more meetings with the water, then the plain field."""
+    n = rays_o.shape[0]
+    water = world.water if bounces > 0 else None
+    samples, is_matter = _all_samples(world, rays_o, rays_d, t_min)
+    ray = samples.ray_index()
+    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+
+    # --- Which share of the light comes from beyond the water? -----------------------------------
+    if water is None:
+        t_plane = torch.full((n,), torch.inf)
+        beyond = torch.zeros_like(weights)
+        below = torch.zeros(n, dtype=torch.bool)
+    else:
+        t_plane = water_physics.plane_distance(rays_o, rays_d, water.level)
+        below = rays_o[:, 2] < water.level
+        beyond = _beyond(world, samples, ray, weights, rays_o, rays_d, t_plane, pixel_angle)
+    front = weights * (1 - beyond)
+    water_share = _sum(weights * beyond, samples.offsets) + left * torch.isfinite(t_plane)
+    sky_share = left * torch.isinf(t_plane)
+
+    # --- Light of the matter this side of the water, through the air -----------------------------
+    keep = (front > LEAST_WEIGHT).nonzero()[:, 0]
+    colour = _sample_colour(world, samples, ray, is_matter, keep, rays_o, rays_d)
+    own_t = samples.t[keep]
+    colour = _through(world, water, below[ray[keep]], colour, rays_o, rays_d, ray[keep], own_t)
+    offsets = _offsets(ray[keep], n)
+    rgb = dispatch.accumulate(front[keep], colour, offsets)
+
+    # --- Sky ---------------------------------------------------------------------------------
+    everyone = torch.arange(n)
+    endless = torch.full((n,), torch.inf)
+    sky = _through(world, water, below, world.field.sky(rays_d), rays_o, rays_d, everyone, endless)
+    rgb = rgb + sky_share[:, None] * sky
+
+    # --- Water ---------------------------------------------------------------------------------
+    water_depth = torch.zeros(n)
+    wave_normal = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
+    wet = (water_share > LEAST_SHARE).nonzero()[:, 0]
+    if water is not None and wet.numel():
+        bed_t = _sum(weights * beyond * samples.t, samples.offsets) / _sum(
+            weights * beyond, samples.offsets
+        ).clamp_min(1e-6)  # water without a bed: 0/0
+        drop = (bed_t - t_plane).clamp_min(0) * rays_d[:, 2].abs()
+        water_depth = torch.where(torch.isfinite(drop) & ~below, drop, torch.zeros(n))
+        shown, wave_normal_wet = _water_light(
+            world,
+            water,
+            rays_o[wet],
+            rays_d[wet],
+            t_plane[wet],
+            pixel_angle[wet],
+            None if roll is None else roll[wet],
+            below[wet],
+            water_depth[wet],
+            bounces,
+        )
+        wave_normal = wave_normal.index_copy(0, wet, wave_normal_wet)
+        shown = _through(world, water, below[wet], shown, rays_o, rays_d, wet, t_plane[wet])
+        rgb = rgb.index_add(0, wet, water_share[wet, None] * shown)
+
+    # --- Layers --------------------------------------------------------------------------------
+    matter_share = _sum(front, samples.offsets)
+    # Of the nearer kind alone: a trace of far water must not move the depth of what is near.
+    depth = _sum(front * samples.t, samples.offsets) / matter_share.clamp_min(TINY)
+    depth = torch.where(water_share > matter_share, t_plane, depth)
+    depth = torch.where(sky_share < SKY_OPACITY, depth, endless)
+    air = (
+        torch.ones(n) if world.air is None else smog.transmittance(world.air, rays_o, rays_d, depth)
+    )
+    snow_share = _sum(front * is_matter, samples.offsets)
+    thickness = torch.zeros(n)
+    if world.matter is not None:
+        mine = keep[is_matter[keep]]
+        x = rays_o[ray[mine]] + samples.t[mine, None] * rays_d[ray[mine]]
+        height = world.matter.thickness(x)
+        thickness = dispatch.accumulate(front[mine], height[:, None], _offsets(ray[mine], n))[:, 0]
+        thickness = thickness / snow_share.clamp_min(TINY) * (snow_share > LEAST_SHARE)
+    normal = torch.zeros(n, 3)
+    if normals:
+        normal = _normals(world, rays_o, rays_d, depth, snow_share)
+        normal = torch.where((water_share > 0.5)[:, None], wave_normal, normal)
+        normal = normal * torch.isfinite(depth)[:, None]
+    return Seen(
+        rgb=rgb,
+        depth=depth,
+        normal=normal,
+        transmittance=air,
+        water_depth=water_depth * (water_share > LEAST_SHARE),
+        snow_thickness=thickness,
+        mask_water=water_share,
+        mask_snow=snow_share,
+        mask_smog=1 - air,
+    )
+
+
+def _all_samples(
+    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor
+) -> tuple[Samples, Bool[Tensor, "s"]]:
+    """Samples of field and matter, merged, and which of them are matter's."""
+    endless = torch.full_like(t_min, 1e9)
+    field = world.field.march(rays_o, rays_d, t_min, endless)
+    if world.matter is None:
+        return field, torch.zeros(field.t.shape[0], dtype=torch.bool)
+    own = world.matter.march(rays_o, rays_d, t_min, endless)
+    order, offsets = dispatch.merge_order(field.t, field.offsets, own.t, own.offsets)
+    both = {
+        key: torch.cat([getattr(field, key), getattr(own, key)])[order]
+        for key in ("t", "dt", "sigma")
+    }
+    return Samples(offsets, **both), order >= field.t.shape[0]
+
+
+def _beyond(
+    world: World,
+    samples: Samples,
+    ray: Int[Tensor, "s"],
+    weights: Float[Tensor, "s"],
+    rays_o: Tensor,
+    rays_d: Tensor,
+    t_plane: Float[Tensor, "n"],
+    pixel_angle: Float[Tensor, "n"],
+) -> Float[Tensor, "s"]:
+    """Share of each sample that lies beyond the water plane: 0 or 1 but for the waterline's pixel.
+
+    The waterline's softness depends on how the ground slopes, so the ground's normal is found for
+    the rays that have matter within a pixel of the plane.
+    """
+    arguments = (t_plane[ray], samples.t, rays_d[ray], pixel_angle[ray])
+    soft = water_physics.shore_coverage(*arguments)
+    unsure = (soft > 0) & (soft < 1) & (weights > LEAST_WEIGHT)
+    rays = torch.unique(ray[unsure])
+    if not rays.numel():
+        return (samples.t > t_plane[ray]).float()
+    x = rays_o[rays] + t_plane[rays, None] * rays_d[rays]
+    step = (2 * pixel_angle[rays] * t_plane[rays]).clamp_min(0.02)
+    normal = torch.zeros_like(rays_d)
+    normal[:, 2] = 1.0
+    normal[rays] = _field_normal(world, x, step, rays_d[rays])
+    return water_physics.shore_coverage(*arguments, normal[ray])
+
+
+def _sample_colour(
+    world: World,
+    samples: Samples,
+    ray: Int[Tensor, "s"],
+    is_matter: Bool[Tensor, "s"],
+    keep: Int[Tensor, "k"],
+    rays_o: Tensor,
+    rays_d: Tensor,
+) -> Float[Tensor, "k 3"]:
+    """Linear radiance of some samples."""
+    x = rays_o[ray[keep]] + samples.t[keep, None] * rays_d[ray[keep]]
+    if world.matter is None:
+        return world.field.colour(x, rays_d, ray[keep])
+    colour = torch.empty(keep.shape[0], 3)
+    mine = is_matter[keep]
+    colour[mine] = world.matter.colour(x[mine])
+    colour[~mine] = world.field.colour(x[~mine], rays_d, ray[keep][~mine])
+    return colour
+
+
+def _through(
+    world: World,
+    water: Water | None,
+    below: Bool[Tensor, "k"],
+    colour: Float[Tensor, "k 3"],
+    rays_o: Tensor,
+    rays_d: Tensor,
+    ray: Int[Tensor, "k"],
+    t: Float[Tensor, "k"],
+) -> Float[Tensor, "k 3"]:
+    """Light from ray length t as it arrives at the eye: through air, or through water below."""
+    if world.air is not None:
+        passed = smog.transmittance(world.air, rays_o[ray], rays_d[ray], t)
+        hazy = smog.apply(world.air, colour, passed)
+        colour = torch.where(below[:, None], colour, hazy)
+    if water is not None and bool(below.any()):
+        beta = torch.tensor(water_physics.attenuation(water.flood))
+        deep = water.level - rays_o[ray, 2] - t.clamp_max(1e6) * rays_d[ray, 2]
+        passed = water_physics.water_transmittance(
+            beta, t, deep, water_physics.light_cosine(water.flood, water.sun_elevation)
+        )
+        body = water_physics.body_colour(water.flood, water.irradiance)
+        colour = torch.where(below[:, None], colour * passed + body * (1 - passed), colour)
+    return colour
+
+
+def _water_light(
+    world: World,
+    water: Water,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    t: Float[Tensor, "n"],
+    pixel_angle: Float[Tensor, "n"],
+    roll: Float[Tensor, "n"] | None,
+    below: Bool[Tensor, "n"],
+    depth: Float[Tensor, "n"],
+    bounces: int,
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Radiance that the surface sends towards the eye at ray length t, and its normal there."""
+    n = rays_o.shape[0]
+    x = rays_o + t[:, None] * rays_d
+    x[:, 2] = water.level
+    footprint = water_physics.footprint(t, rays_d, pixel_angle)
+    slope, variance = waves.slopes(water.waves, x[:, :2], footprint)
+    normal = water_physics.normal_of(slope)
+    directions, parts, share = water_physics.reflection(
+        rays_d, slope, variance, water.flood, below, roll
+    )
+    if water.mirror_only:
+        directions, parts = directions[:, :1], torch.ones(1)
+        share = torch.ones_like(share)
+
+    # --- Reflected rays, traced like any other ----------------------------------------------------
+    count = directions.shape[1]
+    side = torch.where(below, -SKIN, SKIN)
+    start = x + torch.stack([torch.zeros(n), torch.zeros(n), side], dim=-1)
+    seen = _trace(
+        world,
+        start.repeat_interleave(count, 0),
+        directions.reshape(-1, 3),
+        pixel_angle.repeat_interleave(count, 0) * 2,
+        None,
+        torch.zeros(n * count),
+        bounces - 1,
+    )
+    reflected = (seen.rgb.view(n, count, 3) * parts[:, None]).sum(1)
+
+    # --- What is on the other side ------------------------------------------------------------
+    behind, through = _other_side(
+        world,
+        water,
+        start - 2 * side[:, None] * torch.tensor([0.0, 0.0, 1.0]),
+        rays_d,
+        normal,
+        below,
+        pixel_angle,
+        depth,
+        bounces,
+    )
+    body = water_physics.body_colour(water.flood, water.irradiance)
+    return water_physics.shade(reflected, share, behind, through, body), normal
+
+
+def _other_side(
+    world: World,
+    water: Water,
+    start: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    normal: Float[Tensor, "n 3"],
+    below: Bool[Tensor, "n"],
+    pixel_angle: Float[Tensor, "n"],
+    depth: Float[Tensor, "n"],
+    bounces: int,
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Radiance beyond the surface, and how much of it the water lets through.
+
+    From above: the bed along the refracted ray, converted to a wet bed, and the water's
+    transmittance. From below: the air's light, and 1.
+    """
+    n = start.shape[0]
+    behind, through = torch.zeros(n, 3), torch.zeros(n, 3)
+    direction, total = water_physics.refract(rays_d, normal, water.flood.ior, below)
+    beta = torch.tensor(water_physics.attenuation(water.flood))
+    # Under the straight ray's depth of opaque water no bed shows: no ray is spent on it. Half that
+    # depth is assumed, for a bed that rises.
+    shows = torch.exp(-beta.min() * depth) > LEAST_SHARE
+    down = (~below & shows & (direction[:, 2] < 0)).nonzero()[:, 0]
+    if down.numel():
+        o, d = start[down], direction[down]
+        samples = world.field.march(o, d, torch.zeros(down.shape[0]), torch.full_like(o[:, 0], 1e9))
+        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        ray = samples.ray_index()
+        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+        x = o[ray[keep]] + samples.t[keep, None] * d[ray[keep]]
+        opacity = (1 - left).clamp_min(TINY)
+        dry = (
+            dispatch.accumulate(
+                weights[keep],
+                world.field.colour(x, d, ray[keep]),
+                _offsets(ray[keep], down.shape[0]),
+            )
+            / opacity[:, None]
+        )
+        path = _sum(weights * samples.t, samples.offsets) / opacity
+        light = water_physics.light_cosine(water.flood, water.sun_elevation)
+        passed = water_physics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
+        behind[down] = water_physics.bed_radiance(dry, water.irradiance, water.flood.ior)
+        through[down] = passed * (1 - left)[:, None]
+    up = (below & ~total & (direction[:, 2] > 0)).nonzero()[:, 0]
+    if up.numel():
+        zero = torch.zeros(up.shape[0])
+        seen = _trace(world, start[up], direction[up], pixel_angle[up], None, zero, bounces - 1)
+        behind[up], through[up] = seen.rgb, 1.0
+    return behind, through
+
+
+def _normals(
+    world: World,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    depth: Float[Tensor, "n"],
+    snow_share: Float[Tensor, "n"],
+) -> Float[Tensor, "n 3"]:
+    """Unit normals where rays end: of matter if it shows, else down the field's density."""
+    x = (
+        rays_o
+        + torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))[:, None] * rays_d
+    )
+    step = (0.004 * depth).clamp(0.005, 10.0)  # about two pixels: finer is the field's noise
+    normal = _field_normal(world, x, step, rays_d)
+    if world.matter is not None:
+        mine = (snow_share > 0.5).nonzero()[:, 0]
+        normal[mine] = world.matter.normal(x[mine])
+    return normal
+
+
+def _field_normal(
+    world: World, x: Float[Tensor, "n 3"], step: Float[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Unit normal of the field near x, by central differences, turned towards the eye."""
+    gradient = torch.zeros_like(x)
+    for axis in range(3):
+        offset = torch.zeros_like(x)
+        offset[:, axis] = step
+        gradient[:, axis] = _squashed(world, x + offset, step) - _squashed(world, x - offset, step)
+    length = gradient.norm(dim=-1, keepdim=True)
+    # Where density is flat the surface is taken to face the eye.
+    normal = torch.where(length > 1e-9, -gradient / length.clamp_min(1e-9), -rays_d)
+    return torch.where((normal * rays_d).sum(-1, keepdim=True) > 0, -rays_d, normal)
+
+
+def _squashed(world: World, x: Tensor, step: Tensor) -> Float[Tensor, "n"]:
+    """Opacity of a step's length: unlike density it does not jump by orders of magnitude."""
+    return 1 - torch.exp(-world.field.density(x) * step)
+
+
+def _sum(values: Float[Tensor, "s"], offsets: Int[Tensor, "n+1"]) -> Float[Tensor, "n"]:
+    return dispatch.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]
+
+
+def _offsets(ray: Int[Tensor, "s"], n: int) -> Int[Tensor, "n+1"]:
+    """Packed offsets of samples whose rays are given in order."""
+    offsets = torch.zeros(n + 1, dtype=torch.long)
+    offsets[1:] = torch.bincount(ray, minlength=n).cumsum(0)
+    return offsets

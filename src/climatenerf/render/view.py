@@ -1,0 +1,55 @@
+"""The clean view: what cameras see of the field, with nothing added. No gradients."""
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from climatenerf.field.colour_space import encode_srgb
+from climatenerf.field.field import Field
+from climatenerf.ops import dispatch
+from climatenerf.scene.cameras import Camera
+
+RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
+LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
+
+
+def camera_rays(
+    camera: Camera, c2w: Float[np.ndarray, "4 4"]
+) -> tuple[Float[Tensor, "hw 3"], Float[Tensor, "hw 3"]]:
+    """Origins (world m) and unit directions of all pixels, row by row."""
+    directions = torch.from_numpy(camera.directions().reshape(-1, 3).astype(np.float32))
+    pose = torch.from_numpy(np.asarray(c2w, np.float32))
+    rays_d = directions @ pose[:3, :3].T
+    return pose[:3, 3].expand(rays_d.shape[0], 3).contiguous(), rays_d.contiguous()
+
+
+@torch.no_grad()
+def field_radiance(
+    field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Linear radiance along rays, in the mean appearance."""
+    out = []
+    for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
+        o, d = rays_o[start : start + RAYS_AT_ONCE], rays_d[start : start + RAYS_AT_ONCE]
+        n = o.shape[0]
+        samples = field.march(o, d, torch.full((n,), field.near), torch.full((n,), 1e9))
+        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+        ray = samples.ray_index()[keep]
+        offsets = torch.zeros(n + 1, dtype=torch.long)
+        offsets[1:] = torch.bincount(ray, minlength=n).cumsum(0)
+        u = field.sample_positions(o, d, samples)[keep]
+        appearance = field.mean_embedding.expand(n, -1)
+        colour = field.colour_at(u, ray, d, appearance)
+        radiance = dispatch.accumulate(weights[keep], colour, offsets)
+        out.append(radiance + left[:, None] * field.sky_colour(d, appearance))
+    return torch.cat(out)
+
+
+def render_view(
+    field: Field, camera: Camera, c2w: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "h w 3"]:
+    """Display picture in [0,1] of the clean scene from one camera (c2w in world metres)."""
+    linear = field_radiance(field, *camera_rays(camera, c2w))
+    return encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3).numpy()

@@ -1,0 +1,212 @@
+"""Reading pictures, labels and masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+
+from climatenerf.errors import UserError
+from climatenerf.scene.cameras import Camera
+from climatenerf.scene.scene import Scene, View
+
+UNKNOWN_LABEL = 255
+_ORIENTATION_TAG = 0x0112
+_TRANSPOSED = {
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+# Where the shown picture's top is in stored pixels, (x, y) with y down, by EXIF orientation.
+_SHOWN_UP = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+_ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
+_BAD_IMAGE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+
+
+def _srgb_to_linear(display: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """IEC 61966-2-1, display values 0 to 1."""
+    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+_LINEAR = _srgb_to_linear(np.arange(256) / 255).astype(np.float32)
+_LINEAR_EDGES = _srgb_to_linear((np.arange(255) + 0.5) / 255).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a picture's header says.
+
+    Attributes:
+        width: Stored width, pixels.
+        height: Stored height, pixels.
+        alpha: Whether it has an alpha channel or a transparent colour.
+        orientation: EXIF orientation, 1 to 8; 1 if there is none.
+    """
+
+    width: int
+    height: int
+    alpha: bool
+    orientation: int
+
+    def turned_for(self, camera: Camera) -> bool:
+        """Whether loading turns the picture by 90 degrees to fit the camera.
+
+        Poses refer to the stored pixels unless only the turned picture has the camera's size, so
+        the EXIF orientation is honoured in that one case.
+        """
+        stored, wanted = (self.width, self.height), (camera.width, camera.height)
+        return stored != wanted and stored[::-1] == wanted and self.orientation in _TRANSPOSED
+
+    def up_in_picture(self, camera: Camera) -> tuple[int, int]:
+        """(x, y), y down: where the top of the picture as shown is, seen in the loaded pixels."""
+        return (0, -1) if self.turned_for(camera) else _SHOWN_UP.get(self.orientation, (0, -1))
+
+
+def picture_header(path: Path) -> Header:
+    """Read a picture's header, not its pixels.
+
+    Raises:
+        UserError: The file is missing or not a picture that Pillow can read.
+    """
+    try:
+        with Image.open(path) as image:
+            return _header(image)
+    except _BAD_IMAGE as error:
+        raise _unreadable(path, error) from None
+
+
+def _header(image: Image.Image) -> Header:
+    orientation = image.getexif().get(_ORIENTATION_TAG, 1)
+    return Header(
+        *image.size,
+        alpha=image.mode in _ALPHA_MODES or "transparency" in image.info,
+        orientation=orientation if isinstance(orientation, int) else 1,
+    )
+
+
+def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray, "h w 3"]:
+    """A view's picture as 8-bit sRGB, area-averaged over `downscale` x `downscale` pixels.
+
+    The average is of linear light. Alpha is dropped (use a mask for what is to be ignored), grey
+    becomes RGB and 16-bit pictures are brought to 8 bits. EXIF orientation is ignored unless only
+    the turned picture has the camera's size. The result matches `downscaled_camera(camera,
+    downscale)`.
+
+    Raises:
+        UserError: The picture is missing, truncated, or has another size than its camera.
+    """
+    camera = scene.cameras[view.camera]
+    values = _to_rgb(_decode(view.path, camera))
+    if downscale == 1:
+        return values
+    # A larger pixel gathers light, so the mean is taken of linear values.
+    linear = _area_average(_LINEAR[values], downscale)
+    return np.searchsorted(_LINEAR_EDGES, linear).astype(np.uint8)
+
+
+def load_labels(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray, "h w"] | None:
+    """Cityscapes train ids (255 unknown) of a view, nearest neighbours; None if absent."""
+    if view.label_path is None:
+        return None
+    labels = np.asarray(_decode(view.label_path, scene.cameras[view.camera], resize=True))
+    if labels.ndim != 2 or labels.dtype != np.uint8:
+        raise UserError(f"The labels {view.label_path} are not an 8-bit grey picture of class ids.")
+    return _nearest(labels, downscale)
+
+
+def load_mask(view: View, scene: Scene, downscale: int = 1) -> Bool[np.ndarray, "h w"] | None:
+    """True where a view's pixels may be used (mask not black); None if it has no mask.
+
+    A downscaled pixel may be used only if all pixels that it averages may be.
+    """
+    if view.mask_path is None:
+        return None
+    mask = np.asarray(_decode(view.mask_path, scene.cameras[view.camera], resize=True))
+    usable = (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
+    if downscale == 1:
+        return usable
+    return _area_average(usable[..., None].astype(np.float32), downscale)[..., 0] > 0.999
+
+
+def downscaled_camera(camera: Camera, downscale: int) -> Camera:
+    """The camera of a picture downscaled by a whole number; odd rows and columns are cut off."""
+    if downscale < 1 or downscale > min(camera.width, camera.height):
+        raise UserError(
+            f"Pictures of {camera.width}x{camera.height} pixels cannot be downscaled by "
+            f"{downscale}; choose a number from 1 to {min(camera.width, camera.height)}."
+        )
+    width, height = camera.width // downscale, camera.height // downscale
+    cut = Camera(**{**camera.__dict__, "width": width * downscale, "height": height * downscale})
+    return cut.resized(width, height)
+
+
+def _unreadable(path: Path, error: Exception) -> UserError:
+    if isinstance(error, FileNotFoundError):
+        return UserError(f"The picture {path} is missing; restore it or remove its pose.")
+    return UserError(
+        f"The picture {path} cannot be read (truncated, damaged or of an unknown kind); replace "
+        "it or remove it."
+    )
+
+
+def _decode(path: Path, camera: Camera, resize: bool = False) -> Image.Image:
+    """The whole picture in memory, turned by EXIF only if that gives the camera's size.
+
+    Another size of the same shape is an error, or is mended with `resize` by taking nearest pixels
+    (labels and masks may have been made from larger or smaller pictures).
+    """
+    try:
+        with Image.open(path) as image:
+            image.load()
+            header = _header(image)
+            if header.turned_for(camera):
+                return image.transpose(_TRANSPOSED[header.orientation])
+            decoded = image.copy()
+    except _BAD_IMAGE as error:
+        raise _unreadable(path, error) from None
+    wanted = (camera.width, camera.height)
+    stretch = decoded.width * wanted[1] / (decoded.height * wanted[0])
+    if resize and decoded.size != wanted and abs(stretch - 1) < 0.02:
+        return decoded.resize(wanted, Image.Resampling.NEAREST)
+    if decoded.size != wanted:
+        raise UserError(
+            f"The picture {path} has {decoded.width}x{decoded.height} pixels but its camera "
+            f"{camera.width}x{camera.height}; make them agree."
+        )
+    return decoded
+
+
+def _to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    if image.mode in _ALPHA_MODES or "transparency" in image.info:
+        # Going through RGBA, Pillow's conversion to RGB keeps the stored colours as they are.
+        image = image.convert("RGBA")
+    if image.mode.startswith("I") or image.mode == "F":
+        values = np.asarray(image, dtype=np.float64)
+        top = 255.0 if values.max(initial=0.0) <= 255 and image.mode != "I;16" else 65535.0
+        grey = np.rint(np.clip(values / top, 0, 1) * 255).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=-1)
+    return np.array(image.convert("RGB"))
+
+
+def _cut(values: np.ndarray, downscale: int) -> np.ndarray:
+    height, width = values.shape[0] // downscale, values.shape[1] // downscale
+    if downscale < 1 or not height or not width:
+        raise UserError(f"A picture cannot be downscaled by {downscale}; choose a smaller number.")
+    return values[: height * downscale, : width * downscale]
+
+
+def _area_average(
+    values: Float[np.ndarray, "h w c"], downscale: int
+) -> Float[np.ndarray, "hs ws c"]:
+    cut = _cut(values, downscale)
+    h, w, c = cut.shape
+    return cut.reshape(h // downscale, downscale, w // downscale, downscale, c).mean(axis=(1, 3))
+
+
+def _nearest(values: UInt8[np.ndarray, "h w"], downscale: int) -> UInt8[np.ndarray, "hs ws"]:
+    half = downscale // 2
+    return np.ascontiguousarray(_cut(values, downscale)[half::downscale, half::downscale])

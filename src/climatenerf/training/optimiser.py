@@ -1,0 +1,56 @@
+"""Adam for hash grids: most rows get no gradient in a step, and those are left alone."""
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+
+from climatenerf.ops import cpu
+
+
+class GridAdam:
+    """Adam (Kingma & Ba 2015) over large tables whose gradients are mostly zero.
+
+    Each table gets a gradient buffer that the encoding's backward pass adds to and `step` clears.
+    """
+
+    def __init__(self, tables: Iterable[torch.nn.Parameter], epsilon: float = 1e-15):
+        """Epsilon only avoids 0/0; it is small because a hash row's gradients are."""
+        self.tables = list(tables)
+        self.epsilon = epsilon
+        self.steps = 0
+        self.first = [torch.zeros(t.numel()) for t in self.tables]
+        self.second = [torch.zeros(t.numel()) for t in self.tables]
+        for table in self.tables:
+            table.grad_buffer = torch.zeros_like(table.data)  # type: ignore[attr-defined]
+
+    def step(self, rate: float, beta1: float = 0.9, beta2: float = 0.99) -> None:
+        """One update with learning rate `rate`."""
+        self.steps += 1
+        correction1 = 1.0 - beta1**self.steps
+        correction2 = 1.0 - beta2**self.steps
+        scalars = [
+            np.float32(v) for v in (rate, beta1, beta2, self.epsilon, correction1, correction2)
+        ]
+        for table, first, second in zip(self.tables, self.first, self.second, strict=True):
+            cpu.adam(
+                table.data.view(-1).numpy(),
+                table.grad_buffer.view(-1).numpy(),  # type: ignore[attr-defined]
+                first.numpy(),
+                second.numpy(),
+                *scalars,
+            )
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Tensors that continue the optimisation elsewhere."""
+        state = {"steps": torch.tensor(self.steps)}
+        for i, (first, second) in enumerate(zip(self.first, self.second, strict=True)):
+            state |= {f"{i}.first": first, f"{i}.second": second}
+        return state
+
+    def load(self, state: dict[str, torch.Tensor]) -> None:
+        """Continues from `state()`."""
+        self.steps = int(state["steps"])
+        for i in range(len(self.tables)):
+            self.first[i].copy_(state[f"{i}.first"])
+            self.second[i].copy_(state[f"{i}.second"])

@@ -1,0 +1,232 @@
+"""From a scene to a run folder: reading photos, fitting, previews, checkpoints, measuring."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image
+
+import climatenerf
+from climatenerf.errors import UserError
+from climatenerf.evaluation.metrics import psnr, psnr_cc, ssim
+from climatenerf.field.checkpoint import load_field, save_field
+from climatenerf.field.extent import find_extent
+from climatenerf.field.field import Field
+from climatenerf.render.view import render_view
+from climatenerf.scene.cameras import Camera
+from climatenerf.scene.images import downscaled_camera, load_image, load_labels, load_mask
+from climatenerf.scene.scene import Scene, View, save_scene
+from climatenerf.storage import (
+    atomic_path,
+    check_schema,
+    make_folder,
+    read_json,
+    read_safetensors,
+    write_json,
+    write_safetensors,
+)
+from climatenerf.training.fit import FitSettings, Fitting, Report
+from climatenerf.training.pixels import TrainingPixels
+
+SCHEMA_VERSION = 1
+CHECKPOINT_EVERY = 60.0  # seconds
+PREVIEW_EVERY = 20.0
+PREVIEW_WIDTH = 240
+
+
+def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
+    """All training pixels of a scene, reduced `downscale` times."""
+    views = scene.of_split("train")
+    cameras = [downscaled_camera(camera, downscale) for camera in scene.cameras]
+    return TrainingPixels(
+        cameras,
+        [view.camera for view in views],
+        np.stack([scene.c2w_world(view) for view in views]),
+        [load_image(view, scene, downscale) for view in views],
+        [load_labels(view, scene, downscale) for view in views],
+        [load_mask(view, scene, downscale) for view in views],
+    )
+
+
+def fit_scene(
+    scene: Scene,
+    run: Path,
+    settings: FitSettings,
+    downscale: int,
+    resume: bool,
+    report: Callable[[Report], None],
+    evaluated: Callable[[int, int], None],
+) -> dict:
+    """Fits a field to a scene and leaves a run folder; returns the metrics.
+
+    Ctrl-C ends the fit early; what was learned is kept and measured.
+
+    Args:
+        scene: the capture.
+        run: the run folder, made if absent.
+        settings: how to fit.
+        downscale: photos are reduced this many times.
+        resume: go on from the folder's checkpoint.
+        report: told after each step.
+        evaluated: told (views done, views) while measuring.
+
+    Raises:
+        UserError: the folder already holds a run (without resume) or none (with it).
+    """
+    if not resume and (run / "config.json").exists():
+        raise UserError(
+            f"{run} already holds a run; choose another -o, or continue it with --resume"
+        )
+    pixels = load_pixels(scene, downscale)
+    views = scene.of_split("train")
+    poses = np.stack([scene.c2w_world(view) for view in views])
+    fitting = Fitting(pixels, len(views), find_extent(poses, scene.points_world()), settings)
+    if resume:
+        restore(fitting, run)
+    make_folder(run / "previews")
+    save_scene(scene, run)
+    write_json(run / "config.json", _config(settings, downscale, fitting.field))
+
+    watch = views[len(views) // 2]
+    last = {"checkpoint": time.monotonic(), "preview": time.monotonic()}
+
+    def after_step(state: Report) -> None:
+        report(state)
+        now = time.monotonic()
+        if now - last["preview"] > PREVIEW_EVERY:
+            save_preview(fitting.field, scene, watch, run / "previews", state.step)
+            last["preview"] = time.monotonic()
+        if now - last["checkpoint"] > CHECKPOINT_EVERY:
+            checkpoint(fitting, run)
+            last["checkpoint"] = time.monotonic()
+
+    interrupted = False
+    try:
+        fitting.run(after_step)
+    except KeyboardInterrupt:
+        interrupted = True
+    fitting.field.occupancy.seen.zero_()
+    for _ in range(16):
+        batch = pixels.draw(16384, fitting.generator)
+        fitting.field.mark_seen(batch.rays_o, batch.rays_d)
+    checkpoint(fitting, run)
+    save_preview(fitting.field, scene, watch, run / "previews", fitting.steps)
+    metrics = {
+        "seconds": round(fitting.seconds, 1),
+        "steps": fitting.steps,
+        "samples": fitting.samples,
+        "interrupted": interrupted,
+        "downscale": downscale,
+        "train_views": len(views),
+    }
+    write_json(run / "metrics.json", metrics)
+    metrics |= evaluate(fitting.field, scene, downscale, evaluated)
+    write_json(run / "metrics.json", metrics)
+    return metrics
+
+
+def evaluate(
+    field: Field, scene: Scene, downscale: int, evaluated: Callable[[int, int], None]
+) -> dict:
+    """PSNR, SSIM and colour-corrected PSNR of the held-out views, in the mean appearance."""
+    rows = {}
+    views = scene.of_split("heldout")
+    for index, view in enumerate(views):
+        truth = load_image(view, scene, downscale).astype(np.float32) / 255
+        camera = downscaled_camera(scene.cameras[view.camera], downscale)
+        picture = render_view(field, camera, scene.c2w_world(view))
+        rows[view.name] = {
+            "psnr": psnr(picture, truth),
+            "ssim": ssim(picture, truth),
+            "psnr_cc": psnr_cc(picture, truth),
+        }
+        evaluated(index + 1, len(views))
+    if not rows:
+        return {"psnr": None, "ssim": None, "psnr_cc": None, "views": {}}
+    means = {
+        key: float(np.mean([row[key] for row in rows.values()]))
+        for key in ("psnr", "ssim", "psnr_cc")
+    }
+    return means | {"views": rows}
+
+
+def checkpoint(fitting: Fitting, run: Path) -> None:
+    """Saves the field and all that continues the fit, each file atomically."""
+    save_field(fitting.field, run)
+    state = {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
+    for index, moments in fitting.net_adam.state_dict()["state"].items():
+        state |= {f"net.{index}.{k}": torch.as_tensor(v) for k, v in moments.items()}
+    state["generator"] = fitting.generator.get_state()
+    numbers = [fitting.steps, fitting.samples, fitting.rays]
+    state["counters"] = torch.tensor(numbers)
+    state["floats"] = torch.tensor(
+        [fitting.seconds, fitting.step_scale, fitting.error], dtype=torch.float64
+    )
+    write_safetensors(run / "optimiser.safetensors", state, {})
+
+
+def restore(fitting: Fitting, run: Path) -> None:
+    """Puts a checkpoint back into a fit of the same scene and settings."""
+    if not (run / "config.json").is_file():
+        raise UserError(f"{run} holds no run to resume; leave --resume out to begin one")
+    config = read_json(run / "config.json", "the run's configuration")
+    check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
+    field = load_field(run)
+    if field.embeddings.shape != fitting.field.embeddings.shape or field.size != fitting.field.size:
+        raise UserError(
+            f"{run} was fitted to other photos or with another preset; resume it with the same"
+            " scene, --holdout and --preset"
+        )
+    fitting.field.occupancy = field.occupancy
+    with torch.no_grad():
+        fitting.field.load_state_dict(field.state_dict())
+    fitting.field.unit, fitting.field.near = field.unit, field.near
+    arrays, _ = read_safetensors(run / "optimiser.safetensors", "the optimiser's state")
+    state = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}
+    fitting.grid_adam.load(
+        {k.removeprefix("grid."): v for k, v in state.items() if k.startswith("grid.")}
+    )
+    moments: dict[int, dict] = {}
+    for key, value in state.items():
+        if key.startswith("net."):
+            _, index, name = key.split(".")
+            moments.setdefault(int(index), {})[name] = value
+    groups = fitting.net_adam.state_dict()["param_groups"]
+    fitting.net_adam.load_state_dict({"state": moments, "param_groups": groups})
+    fitting.generator.set_state(state["generator"])
+    fitting.steps, fitting.samples, fitting.rays = state["counters"].tolist()
+    fitting.seconds, fitting.step_scale, fitting.error = state["floats"].tolist()
+
+
+def save_preview(field: Field, scene: Scene, view: View, folder: Path, step: int) -> None:
+    """A small picture: the field's rendering beside the photo it is fitted to."""
+    camera = scene.cameras[view.camera]
+    small = camera.resized(PREVIEW_WIDTH, round(PREVIEW_WIDTH * camera.height / camera.width))
+    with torch.no_grad():
+        picture = render_view(field, small, scene.c2w_world(view))
+    photo = _resized(load_image(view, scene), small)
+    pair = np.concatenate([(picture * 255 + 0.5).astype(np.uint8), photo], axis=1)
+    with atomic_path(folder / f"step_{step:06d}.jpg") as path:
+        Image.fromarray(pair).save(path, quality=90)
+
+
+def _resized(
+    photo: UInt8[np.ndarray, "h w 3"], camera: Camera
+) -> UInt8[np.ndarray, "height width 3"]:
+    return np.asarray(Image.fromarray(photo).resize((camera.width, camera.height)))
+
+
+def _config(settings: FitSettings, downscale: int, field: Field) -> dict:
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "climatenerf": climatenerf.__version__,
+        "settings": dataclasses.asdict(settings),
+        "downscale": downscale,
+        "field": dataclasses.asdict(field.size),
+        "metres_per_grid_unit": field.unit,
+        "near_m": field.near,
+    }

@@ -1,0 +1,1 @@
+"""A small street modelled in code, and its path-traced pictures (the embedded scene)."""

@@ -1,0 +1,133 @@
+import errno
+import os
+import subprocess
+import sys
+import types
+from dataclasses import dataclass
+
+import pytest
+
+import climatenerf
+from climatenerf import cli
+from climatenerf.errors import UserError
+
+
+@dataclass
+class Options:
+    """Options of a verb made for the tests."""
+
+    scene: str
+    minutes: float = 5.0
+
+
+@pytest.fixture
+def verb(monkeypatch):
+    """Replaces ``fit`` by a verb whose ``run`` each test sets."""
+    module = types.ModuleType("a_verb_for_tests")
+    module.Options = Options  # type: ignore[attr-defined]
+    module.run = lambda options: None  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setitem(cli.VERBS, "fit", cli.Verb(module.__name__, "Options", "test"))
+    for name in cli.THREADING:
+        monkeypatch.delenv(name, raising=False)
+    return module
+
+
+def program(*words):
+    return subprocess.run(
+        [sys.executable, "-m", "climatenerf", *words], capture_output=True, text=True, timeout=60
+    )
+
+
+def test_help_lists_every_verb_and_imports_nothing_heavy():
+    done = program("--help")
+    assert done.returncode == 0 and done.stderr == ""
+    for name, verb in cli.VERBS.items():
+        assert f"{name} " in done.stdout and verb.summary in done.stdout
+    code = "import sys, climatenerf.cli as c; c.main(['--help']); c.main(['--version']);"
+    code += "heavy = {'torch', 'numba', 'numpy', 'tyro', 'rich', 'PIL'} & set(sys.modules);"
+    code += "sys.exit(f'imported: {heavy}' if heavy else 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert f"climatenerf {climatenerf.__version__}\n" in done.stdout
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    words = [sys.executable, "-m", "climatenerf", "--help"]
+    buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, env=buffered)
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait(timeout=60) == 0
+
+
+def test_no_verb_and_wrong_verbs(capsys):
+    assert cli.main([]) == 2
+    assert "usage:" in capsys.readouterr().out
+    assert cli.main(["rendr"]) == 2
+    complaint = "climatenerf: there is no verb 'rendr'; did you mean render?\n"
+    assert capsys.readouterr().err == complaint
+    assert cli.main(["xyzzy"]) == 2
+    assert "use one of fit, render, demo" in capsys.readouterr().err
+
+
+def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):
+    seen = []
+    verb.run = lambda options: seen.append((options, os.environ["NUMBA_THREADING_LAYER"]))
+    assert cli.main(["fit", "--scene", "a", "--minutes", "2"]) == 0
+    assert seen == [(Options("a", 2.0), "omp")]
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    cli.main(["fit", "--scene", "a"])
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE", "the user's own choice stays"
+    for name in cli.THREADING:
+        monkeypatch.setenv(name, "")  # so that monkeypatch takes them away again
+
+
+def failing(error):
+    def run(options):
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "error, status, words",
+    [
+        (UserError("no photographs in /x; give another folder"), 2, "climatenerf: no photographs"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+        (OSError(errno.ENOSPC, "No space", "/x/a.png"), 2, "disk is full while writing /x/a.png"),
+    ],
+)
+def test_expected_failures_are_one_line(verb, capsys, error, status, words):
+    verb.run = failing(error)
+    assert cli.main(["fit", "--scene", "a"]) == status
+    err = capsys.readouterr().err
+    assert words in err and len(err.strip().splitlines()) == 1 and "Traceback" not in err
+
+
+def test_a_defect_is_not_hidden(verb):
+    verb.run = failing(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["fit", "--scene", "a"])
+    verb.run = failing(OSError(errno.EIO, "broken"))
+    with pytest.raises(OSError):
+        cli.main(["fit", "--scene", "a"])
+
+
+def test_wrong_options_exit_with_2(verb, capsys):
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["fit", "--scene", "a", "--minutse", "2"])
+    assert caught.value.code == 2
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["fit", "--help"])
+    assert caught.value.code == 0
+    assert "climatenerf fit" in capsys.readouterr().out
+
+
+def test_status_of_a_verb_is_passed_on(verb):
+    verb.run = lambda options: 1
+    assert cli.main(["fit", "--scene", "a"]) == 1

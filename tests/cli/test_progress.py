@@ -1,0 +1,85 @@
+import io
+import re
+import sys
+
+import pytest
+
+from climatenerf.cli import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    class Clock:
+        now = 100.0
+
+        def monotonic(self):
+            return self.now
+
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    return clock
+
+
+def test_plain_lines_every_ten_seconds_with_eta(clock, capsys):
+    with progress.Bar("fit", total=100) as bar:
+        for step in range(1, 51):
+            clock.now += 0.5
+            bar.update(step, {"rays/s": "21 k", "PSNR": f"{step}.0"})
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert out == ""
+    assert lines == [
+        "fit: 20 %  ETA 0:40  rays/s 21 k  PSNR 20.0",
+        "fit: 40 %  ETA 0:30  rays/s 21 k  PSNR 40.0",
+        "fit: 50 %  0:25 in all  rays/s 21 k  PSNR 50.0",
+    ]
+
+
+def test_quiet_is_silent(clock, capsys):
+    with progress.Bar("fit", total=2, quiet=True) as bar:
+        clock.now += 60
+        bar.advance()
+    assert list(progress.track("a", [1, 2], quiet=True)) == [1, 2]
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("width", ["80", "140"])
+def test_terminal_shows_a_bar_with_its_columns(monkeypatch, width):
+    for name in ("NO_COLOR", "TERM", "FORCE_COLOR", "TTY_COMPATIBLE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("COLUMNS", width)
+    progress._console.cache_clear()
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with progress.Bar("fit", total=10) as bar:
+        bar.update(4, {"step": "[12]", "rays/s": "21.4 k", "samples/ray": "12.3", "PSNR": "24.3"})
+        progress.say("preview saved [here]")
+    progress._console.cache_clear()
+    text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", stream.getvalue())
+    assert "40%" in text and "step [12]" in text
+    assert re.search(r"ETA +(--|\d\d?):", text), "not squeezed out by the columns"
+    assert "preview saved [here]" in text
+
+
+def test_track_counts(capsys):
+    assert list(progress.track("frames", [3, 4])) == [3, 4]
+    assert "frames: 100 %" in capsys.readouterr().err
+    assert list(progress.track("nothing", [])) == []
+
+
+def test_results_go_to_standard_output(capsys):
+    progress.result("PSNR 25.1 dB")
+    progress.warn("17 pictures are missing")
+    assert capsys.readouterr() == ("PSNR 25.1 dB\n", "warning: 17 pictures are missing\n")
+
+
+def test_numbers():
+    assert progress.duration(None) == "-:--" and progress.duration(59.6) == "1:00"
+    assert progress.duration(3725) == "1:02:05"
+    assert progress.rate(21440) == "21.4 k" and progress.rate(7) == "7"
+    assert progress.rate(2.5e6) == "2.5 M"

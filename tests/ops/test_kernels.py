@@ -1,0 +1,255 @@
+"""Every fast kernel against its twin in `ops/reference.py`, values and gradients."""
+
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.ops import cpu, dispatch, reference
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(3)
+
+
+def packed(generator, rays=40, most=12):
+    """Offsets of rays with 0 to `most` samples, some empty."""
+    counts = torch.randint(0, most, (rays,), generator=generator)
+    counts[3] = 0
+    return torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
+
+
+def grid(generator, levels=4, log2_rows=9):
+    table = torch.randn(levels, 2**log2_rows, 2, generator=generator)
+    return table, torch.tensor([4, 9, 21, 50])[:levels]
+
+
+def test_hash_encoding_and_its_gradient_match_the_twin(generator):
+    table, resolutions = grid(generator)
+    u = torch.rand(700, 3, generator=generator) * 0.999999
+    u[0], u[1] = 0.0, 0.999999
+    fast_table = table.clone().requires_grad_()
+    slow_table = table.double().clone().requires_grad_()
+    fast = dispatch.hash_encode(u, fast_table, resolutions)
+    slow = reference.hash_encode(u.double(), slow_table, resolutions)
+    assert torch.allclose(fast.double(), slow, atol=2e-4)
+    upstream = torch.randn(fast.shape, generator=generator)
+    (fast * upstream).sum().backward()
+    (slow * upstream.double()).sum().backward()
+    assert torch.allclose(fast_table.grad.double(), slow_table.grad, atol=2e-3)
+
+
+def test_the_twins_have_right_gradients(generator):
+    table, resolutions = grid(generator, levels=2, log2_rows=4)
+    u = (torch.rand(5, 3, generator=generator) * 0.9).double()
+    assert torch.autograd.gradcheck(
+        lambda t: reference.hash_encode(u, t, resolutions), table.double().requires_grad_()
+    )
+    offsets = torch.tensor([0, 3, 3, 7])
+    tau = torch.rand(7, generator=generator).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: reference.render_weights(x, offsets), tau)
+    s = torch.rand(7, generator=generator).double()
+    s = torch.cat([s[:3].sort()[0], s[3:].sort()[0]])
+    ds = torch.full_like(s, 0.01)
+    weights = torch.rand(7, generator=generator).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda w: reference.distortion(w, s, ds, offsets), weights)
+
+
+def test_a_trilinear_function_is_reproduced_on_dense_levels():
+    """On a level that fits its table, interpolating a linear function of the corners is exact."""
+    side = 5
+    corners = torch.stack(
+        torch.meshgrid(*[torch.arange(side + 1.0)] * 3, indexing="ij"), dim=-1
+    ).permute(2, 1, 0, 3)  # rows run x fastest
+    table = torch.zeros(1, 512, 2)
+    table[0, : (side + 1) ** 3, 0] = (corners @ torch.tensor([1.0, 2.0, 3.0])).flatten()
+    u = torch.rand(50, 3) * 0.99
+    out = dispatch.hash_encode(u, table, torch.tensor([side]))
+    assert torch.allclose(out[:, 0], u * side @ torch.tensor([1.0, 2.0, 3.0]), atol=1e-4)
+
+
+def network(generator, inputs, width):
+    layers = [
+        (torch.randn(inputs, width, generator=generator) * 0.3, torch.randn(width) * 0.1),
+        (torch.randn(width, 1, generator=generator) * 0.3, torch.zeros(1)),
+    ]
+    (w1, b1), (w2, b2) = layers
+    return layers, (w1.numpy(), b1.numpy(), w2[:, 0].numpy().copy(), np.float32(b2[0]))
+
+
+def test_density_matches_the_twin_inside_and_outside_the_core(generator):
+    table, resolutions = grid(generator)
+    layers, plain = network(generator, 8, 16)
+    q = torch.randn(500, 3, generator=generator) * 2
+    q[0] = 0.0
+    out = torch.empty(500)
+    cpu.density_at(q.numpy(), table.numpy(), resolutions.numpy(), *plain, out.numpy())
+    twin = reference.density(
+        q.double(), table.double(), resolutions, [(w.double(), b.double()) for w, b in layers]
+    )
+    assert torch.allclose(out.double(), twin, rtol=5e-3)
+    assert torch.isfinite(out).all()
+
+
+def test_marching_matches_the_twin(generator):
+    table, resolutions = grid(generator)
+    layers, plain = network(generator, 8, 16)
+    net = (table.numpy(), resolutions.numpy(), *plain)
+    occupied = (torch.rand(3, 8, 8, 8, generator=generator) < 0.3).to(torch.uint8)
+    n = 60
+    o = torch.randn(n, 3, generator=generator)
+    d = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
+    d[0] = torch.tensor([0.0, 0.0, 1.0])  # along an axis
+    o[1] = torch.tensor([9.0, 9.0, 9.0])  # outside all cascades
+    jitter = torch.rand(n, generator=generator)
+    near, far = torch.full((n,), 0.05), torch.full((n,), 1e9)
+    far[2] = 0.5
+    padded = [np.zeros((n, 1024), np.float32) for _ in range(3)]
+    steps = (0.05, 0.02)
+    counts = cpu.march(
+        o.numpy(), d.numpy(), near.numpy(), far.numpy(), jitter.numpy(), occupied.numpy(),
+        steps, 1e-3, net, *padded,
+    )
+    agree = 0
+    for r in range(n):
+        twin = reference.march(
+            o[r], d[r], (0.05, float(far[r]), float(jitter[r])), occupied, steps, 1e-3,
+            lambda q: reference.density(q, table, resolutions, layers),
+        )
+        same = counts[r] == len(twin) and np.allclose(
+            [p[r, : counts[r]] for p in padded], np.array(twin).reshape(-1, 3).T, rtol=2e-2
+        )
+        agree += same
+    # Where a step ends on a cell's face, rounding may put it on either side.
+    assert agree >= n - 3
+    assert counts.sum() > 100
+
+
+def test_a_ray_ends_where_it_is_opaque_and_cells_that_are_empty_give_no_samples(generator):
+    table, resolutions = grid(generator)
+    _, plain = network(generator, 8, 16)
+    net = (table.numpy(), resolutions.numpy(), *plain[:3], np.float32(6.0))  # dense everywhere
+    o, d = np.zeros((1, 3), np.float32), np.array([[1.0, 0, 0]], np.float32)
+    bounds = np.zeros(1, np.float32), np.full(1, 1e9, np.float32), np.zeros(1, np.float32)
+    for fill, expected in ((0, 0), (1, None)):
+        occupied = np.full((2, 8, 8, 8), fill, np.uint8)
+        padded = [np.zeros((1, 1024), np.float32) for _ in range(3)]
+        counts = cpu.march(o, d, *bounds, occupied, (0.01, 0.0), 1e-3, net, *padded)
+        if expected is not None:
+            assert counts[0] == expected
+        else:
+            tau = (padded[1] * padded[2])[0, : counts[0]]
+            assert tau.sum() >= -np.log(1e-3) > tau[:-1].sum()
+
+
+def test_weights_and_their_gradient_match_the_twin(generator):
+    offsets = packed(generator)
+    n = int(offsets[-1])
+    tau = torch.rand(n, generator=generator) * 3
+    tau[0], tau[1] = 0.0, 40.0
+    fast, slow = tau.clone().requires_grad_(), tau.double().requires_grad_()
+    up_w = torch.randn(n, generator=generator)
+    up_t = torch.randn(offsets.shape[0] - 1, generator=generator)
+    w, left = dispatch.render_weights(fast, offsets)
+    w2, left2 = reference.render_weights(slow, offsets)
+    assert torch.allclose(w.double(), w2, atol=1e-6)
+    assert torch.allclose(left.double(), left2, atol=1e-6)
+    ((w * up_w).sum() + (left * up_t).sum()).backward()
+    ((w2 * up_w.double()).sum() + (left2 * up_t.double()).sum()).backward()
+    assert torch.allclose(fast.grad.double(), slow.grad, atol=1e-5)
+
+
+def test_weights_and_what_is_left_sum_to_one(generator):
+    offsets = packed(generator)
+    tau = torch.rand(int(offsets[-1]), generator=generator) * 3
+    w, left = dispatch.render_weights(tau, offsets)
+    total = dispatch.accumulate(w, torch.ones(len(w), 1), offsets)[:, 0] + left
+    assert torch.allclose(total, torch.ones_like(total), atol=1e-6)
+
+
+def test_accumulation_matches_the_twin(generator):
+    offsets = packed(generator)
+    n = int(offsets[-1])
+    w, v = torch.rand(n, generator=generator), torch.randn(n, 3, generator=generator)
+    fast = [w.clone().requires_grad_(), v.clone().requires_grad_()]
+    slow = [w.double().requires_grad_(), v.double().requires_grad_()]
+    a, b = dispatch.accumulate(*fast, offsets), reference.accumulate(*slow, offsets)
+    assert torch.allclose(a.double(), b, atol=1e-5)
+    up = torch.randn(a.shape, generator=generator)
+    (a * up).sum().backward()
+    (b * up.double()).sum().backward()
+    for x, y in zip(fast, slow, strict=True):
+        assert torch.allclose(x.grad.double(), y.grad, atol=1e-5)
+
+
+def test_distortion_matches_the_double_sum(generator):
+    offsets = packed(generator)
+    n = int(offsets[-1])
+    s = torch.empty(n)
+    for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
+        s[a:b] = torch.rand(b - a, generator=generator).sort()[0]
+    ds = torch.rand(n, generator=generator) * 0.1
+    w = torch.rand(n, generator=generator)
+    fast, slow = w.clone().requires_grad_(), w.double().requires_grad_()
+    a = dispatch.distortion(fast, s, ds, offsets)
+    b = reference.distortion(slow, s.double(), ds.double(), offsets)
+    assert torch.allclose(a.double(), b, atol=1e-5)
+    up = torch.randn(a.shape, generator=generator)
+    (a * up).sum().backward()
+    (b * up.double()).sum().backward()
+    assert torch.allclose(fast.grad.double(), slow.grad, atol=1e-4)
+
+
+def leaf(tensor, dtype):
+    return tensor.clone().to(dtype).requires_grad_()
+
+
+def test_network_matches_the_twin_and_autograd(generator):
+    layers = [
+        (torch.randn(6, 16, generator=generator), torch.randn(16, generator=generator)),
+        (torch.randn(16, 8, generator=generator), torch.randn(8, generator=generator)),
+        (torch.randn(8, 3, generator=generator), torch.randn(3, generator=generator)),
+    ]
+    n = 9000  # more than two chunks
+    x = torch.randn(n, 6, generator=generator)
+    shared = torch.randn(50, 16, generator=generator)
+    row = torch.randint(0, 50, (n,), generator=generator)
+    up = torch.randn(n, 3, generator=generator)
+    grads = []
+    for run, dtype in ((dispatch.mlp, torch.float32), (reference.mlp, torch.float64)):
+        own = [tuple(leaf(p, dtype) for p in pair) for pair in layers]
+        inputs = [leaf(x, dtype), leaf(shared, dtype)]
+        out = run(inputs[0], own, inputs[1], row)
+        (out * up.to(dtype)).sum().backward()
+        grads.append([out, *[t.grad for t in inputs], *[p.grad for pair in own for p in pair]])
+    for fast, slow in zip(*grads, strict=True):
+        assert torch.allclose(fast.double(), slow, rtol=1e-3, atol=2e-2)
+
+
+def test_merging_two_lists_matches_the_twin(generator):
+    lists = []
+    for _ in range(2):
+        offsets = packed(generator)
+        t = torch.empty(int(offsets[-1]))
+        for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
+            t[a:b] = torch.rand(b - a, generator=generator).sort()[0]
+        lists += [t, offsets]
+    order, offsets = dispatch.merge_order(*lists)
+    twin, twin_offsets = reference.merge_order(*lists)
+    assert torch.equal(order, twin)
+    assert torch.equal(offsets, twin_offsets)
+
+
+def test_contraction_is_bounded_invertible_and_has_finite_gradients():
+    q = (torch.randn(1000, 3) * 5).double().requires_grad_()
+    u = reference.contract(q)
+    assert (u >= 0).all() and (u < 1).all()
+    c = 4 * u - 2
+    m = c.norm(dim=-1, keepdim=True)
+    back = torch.where(m <= 1, c, c / m / (2 - m))
+    assert torch.allclose(back, q, rtol=1e-6)
+    zero = torch.zeros(1, 3, requires_grad=True)
+    reference.contract(zero).sum().backward()
+    assert torch.isfinite(zero.grad).all()
+    u.sum().backward()
+    assert torch.isfinite(q.grad).all()

@@ -1,0 +1,322 @@
+"""The checks of the physics that concern smog, flood and their composition, through the renderer."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from analytic_fields import AnalyticField, Box, HalfSpace
+
+from climatenerf.render.frame import render_frame
+from climatenerf.render.trace import trace
+from climatenerf.render.world import Water, World
+from climatenerf.scene.cameras import Camera
+from climatenerf.weather.parameters import Flood, Smog, Snow
+from climatenerf.weather.smog import medium
+from climatenerf.weather.snow import bake_snow
+from climatenerf.weather.waves import at_time, make_waves
+
+WIDE = ((-3000.0, -3000.0, -20.0), (3000.0, 3000.0, 30.0))
+CAMERA = Camera(96, 54, 60.0, 60.0, 48.0, 27.0)
+
+
+def looking(direction, eye=(0.0, -3.0, 1.6)):
+    """Pose that looks along a direction with a level horizon."""
+    forward = np.array(direction, float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    c2w = np.eye(4)
+    c2w[:3, 0], c2w[:3, 1], c2w[:3, 2] = right, np.cross(forward, right), forward
+    c2w[:3, 3] = eye
+    return c2w
+
+
+def street():
+    """Ground that rises along y, a wall, a box; a sky that brightens upwards."""
+    slope = np.array([0.0, -0.1, 1.0])
+    slope /= np.linalg.norm(slope)
+    return AnalyticField(
+        [
+            HalfSpace(tuple(slope), 0.0, (0.30, 0.33, 0.2), checker=0.7),
+            Box((-2.0, 6.0, -1.0), (0.5, 8.0, 3.0), (0.6, 0.3, 0.2)),
+            Box((1.0, 2.0, -1.0), (2.0, 3.0, 1.0), (0.2, 0.2, 0.7)),
+        ],
+        zenith=(0.3, 0.5, 0.9),
+        horizon=(0.8, 0.8, 0.8),
+        box=((-60.0, -60.0, -20.0), (60.0, 60.0, 30.0)),
+    )
+
+
+def flooded(level=0.3, **changes):
+    flood = dataclasses.replace(Flood(level=level), **changes)
+    waves = at_time(make_waves(flood, 0), 0.4)
+    return Water(flood, level, waves, torch.full((3,), math.pi * 0.6))
+
+
+def frame(world, eye=(0.0, -3.0, 1.6), direction=(0.0, 1.0, -0.2), camera=CAMERA):
+    return render_frame(world, camera, looking(direction, eye))
+
+
+def linear(world, direction=(0.0, 1.0, -0.2), eye=(0.0, -3.0, 1.6)):
+    from climatenerf.render.view import camera_rays
+
+    o, d = camera_rays(CAMERA, looking(direction, eye))
+    return trace(world, o, d, torch.full((o.shape[0],), 1 / 60), normals=False)
+
+
+# --- smog ---------------------------------------------------------------------------------------
+
+
+def test_smog_contrast_falls_with_depth_at_the_rate_asked_for():
+    air = medium(Smog(visibility=30.0), 0.0)
+    dry, hazy = linear(World(street())), linear(World(street(), air=air))
+    colour = torch.tensor(air.colour)
+    solid = torch.isfinite(dry.depth)
+    for c in range(3):
+        contrast = (hazy.rgb[solid, c] - colour[c]) / (dry.rgb[solid, c] - colour[c])
+        y, x = contrast.log(), dry.depth[solid]
+        slope = ((x - x.mean()) * (y - y.mean())).sum() / (x - x.mean()).square().sum()
+        explained = torch.corrcoef(torch.stack([x, y]))[0, 1] ** 2
+        assert abs(float(slope) / -(2.996 / 30) - 1) < 0.005
+        assert explained > 0.999
+
+
+def test_an_endless_smog_swallows_the_sky_and_layers_say_so():
+    seen = linear(World(street(), air=medium(Smog(visibility=30.0), 0.0)))
+    sky = torch.isinf(seen.depth)
+    assert sky.any()
+    assert torch.allclose(seen.rgb[sky], torch.tensor(medium(Smog(sigma=1.0), 0.0).colour))
+    assert (seen.transmittance[sky] == 0).all()
+
+
+# --- flood --------------------------------------------------------------------------------------
+
+
+def test_white_furnace():
+    white = AnalyticField(
+        [HalfSpace(colour=(1.0, 1.0, 1.0))], zenith=(1.0,) * 3, horizon=(1.0,) * 3, box=WIDE
+    )
+    flood = Flood(level=0.5, attenuation=(0.0, 0.0, 0.0), wind_speed=4.0)
+    water = Water(flood, 0.5, at_time(make_waves(flood, 0), 0.3), torch.full((3,), math.pi))
+    generator = torch.Generator().manual_seed(0)
+    d = torch.randn(3000, 3, generator=generator)
+    d[:, 2] = -d[:, 2].abs() - 0.02
+    d = torch.nn.functional.normalize(d, dim=-1)
+    o = torch.tensor([0.0, 0.0, 1.6]).expand_as(d).contiguous()
+    seen = trace(World(white, water=water), o, d, torch.full((3000,), 2e-3))
+    assert (seen.rgb - 1).abs().max() < 1e-3
+    assert seen.mask_water.min() > 0.999
+
+
+def test_a_perfect_mirror_shows_what_a_mirrored_camera_sees():
+    """Snowless, waveless, R = 1: the water shows the scene as from under it, cut at the plane."""
+    level = 0.3
+    still = flooded(level, wind_speed=0.0)
+    water = dataclasses.replace(still, mirror_only=True)
+    world = World(street(), water=water)
+    seen = linear(world)
+    from climatenerf.render.view import camera_rays
+
+    o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
+    t = (level - o[:, 2]) / d[:, 2]
+    wet = (d[:, 2] < 0) & (seen.mask_water > 0.999)
+    assert wet.float().mean() > 0.1
+    mirrored_o, mirrored_d = o.clone(), d.clone()
+    mirrored_o[:, 2] = 2 * level - o[:, 2]
+    mirrored_d[:, 2] *= -1
+    start = mirrored_o[wet] + t[wet, None] * mirrored_d[wet]
+    clean = trace(World(street()), start, mirrored_d[wet], torch.full((int(wet.sum()),), 1 / 60))
+    error = (clean.rgb - seen.rgb[wet]).square().mean()
+    assert -10 * math.log10(float(error) + 1e-12) >= 40
+
+
+def test_fresnel_governs_how_much_the_sky_shows():
+    """Black opaque water under a white sky shows exactly its reflectance."""
+    black = AnalyticField(
+        [HalfSpace(colour=(0.0, 0.0, 0.0))], zenith=(1.0,) * 3, horizon=(1.0,) * 3, box=WIDE
+    )
+    flood = Flood(level=0.5, wind_speed=0.0, attenuation=(1e4,) * 3, colour=(0.0,) * 3)
+    water = Water(flood, 0.5, at_time(make_waves(flood, 0), 0.0), torch.ones(3))
+    angles = torch.deg2rad(torch.tensor([0.0, 30.0, 60.0, 75.0, 80.0, 85.0]))
+    d = torch.stack([torch.zeros(6), angles.sin(), -angles.cos()], dim=-1)
+    o = torch.tensor([0.0, 0.0, 1.6]).expand(6, 3).contiguous()
+    seen = trace(World(black, water=water), o, d, torch.full((6,), 1e-3))
+    expected = torch.tensor([0.0204, 0.0214, 0.0597, 0.212, 0.348, 0.584])
+    assert torch.allclose(seen.rgb[:, 0], expected, rtol=0.01)
+
+
+def test_attenuation_per_channel_is_recovered_from_the_picture():
+    """A white bed under depth d, seen from straight above: c = (1-R) L exp(-beta 2.2 d)."""
+    betas = (0.5, 1.0, 2.0)
+    values = []
+    for depth in (0.4, 0.9):
+        field = AnalyticField(
+            [HalfSpace(offset=-depth, colour=(0.5,) * 3)],
+            zenith=(0.0,) * 3, horizon=(0.0,) * 3, box=WIDE,
+        )  # fmt: skip
+        flood = Flood(level=0.0, wind_speed=0.0, attenuation=betas, colour=(0.0,) * 3)
+        water = Water(flood, 0.0, at_time(make_waves(flood, 0), 0.0), torch.ones(3))
+        o, d = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+        values.append(trace(World(field, water=water), o, d, torch.full((1,), 1e-3)).rgb[0])
+    path = 0.5 * (1 + 1 / 0.83)
+    found = -(values[1] / values[0]).log() / path
+    assert torch.allclose(found, torch.tensor(betas), rtol=0.01)
+
+
+def test_snell_apparent_depth_near_the_nadir():
+    """The edge of a block under water appears where a block at d / 1.333 would show it."""
+    depth = 0.8
+    bed = AnalyticField(
+        [HalfSpace(offset=-1.0, colour=(1.0,) * 3), Box((-9, -5, -9), (0.1, 5, -depth))],
+        zenith=(0.0,) * 3, horizon=(0.0,) * 3, box=WIDE,
+    )  # fmt: skip
+    flood = Flood(level=0.0, wind_speed=0.0, attenuation=(0.0,) * 3)
+    water = Water(flood, 0.0, at_time(make_waves(flood, 0), 0.0), torch.ones(3))
+    slant = torch.linspace(0.0, 0.1, 4001)
+    d = torch.nn.functional.normalize(
+        torch.stack([slant, torch.zeros_like(slant), -torch.ones_like(slant)], dim=-1), dim=-1
+    )
+    o = torch.tensor([0.0, 0.0, 1.0]).expand_as(d).contiguous()
+    green = trace(World(bed, water=water), o, d, torch.full((4001,), 1e-5)).rgb[:, 1]
+    edge = slant[(green[1:] - green[:-1]).abs().argmax()]
+    apparent = 0.1 / float(edge) - 1.0
+    assert abs(apparent / (depth / 1.333) - 1) < 0.01
+
+
+def test_flooded_pixels_are_nested_as_the_level_rises():
+    before = torch.zeros(CAMERA.width * CAMERA.height)
+    for level in (0.05, 0.2, 0.35, 0.6):
+        share = linear(World(street(), water=flooded(level))).mask_water
+        assert (share >= before - 1e-4).all()
+        assert share.mean() > before.mean()
+        before = share
+
+
+def test_water_depth_layer_against_the_true_ground():
+    level = 0.3
+    seen = linear(World(street(), water=flooded(level)))
+    dry = linear(World(street()))
+    wet = (seen.mask_water > 0.999) & torch.isfinite(dry.depth)
+    from climatenerf.render.view import camera_rays
+
+    o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
+    bed = o[:, 2] + dry.depth * d[:, 2]
+    assert (seen.water_depth[wet] - (level - bed[wet])).abs().max() < 0.01
+    assert (seen.water_depth[seen.mask_water < 1e-4] == 0).all()
+
+
+def test_the_waterline_is_soft_and_lies_where_water_meets_ground():
+    level = 0.3
+    seen = linear(World(street(), water=flooded(level)))
+    dry = linear(World(street()))
+    from climatenerf.render.view import camera_rays
+
+    o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
+    ground = o[:, 2] + dry.depth * d[:, 2]
+    solid = torch.isfinite(dry.depth)
+    assert (seen.mask_water[solid & (ground < level - 0.1)] > 0.95).all()
+    assert (seen.mask_water[solid & (ground > level + 0.1)] < 0.05).all()
+    assert ((seen.mask_water > 0.05) & (seen.mask_water < 0.95)).any()
+
+
+def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it():
+    field = street()
+    water = flooded(1.5, wind_speed=0.0, attenuation=(0.0,) * 3)
+    o = torch.tensor([[0.0, -3.0, 1.0], [0.0, -3.0, 1.0]])
+    d = torch.nn.functional.normalize(
+        torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.3]]), dim=-1
+    )
+    seen = trace(World(field, water=water), o, d, torch.full((2,), 1e-3))
+    zenith = field.sky(torch.tensor([[0.0, 0.0, 1.0]]))[0]
+    assert torch.allclose(seen.rgb[0], zenith * (1 - 0.0204), atol=0.03)
+    assert torch.isfinite(seen.rgb).all()
+    # Total reflection: the second ray sees the bed, which is darker than the sky at that height.
+    assert seen.rgb[1, 2] < 0.6
+
+
+# --- composition and anything -----------------------------------------------------------------------
+
+
+def snowed(depth, field=None):
+    return bake_snow(
+        field or street(), Snow(depth=depth), np.array([[0.0, -3.0, 1.6]]), np.full(3, 0.6)
+    )
+
+
+def test_weather_that_does_nothing_is_bit_identical():
+    clean, layers = frame(World(street()))
+    same, same_layers = frame(World(street(), air=medium(Smog(), 0.0), matter=None, water=None))
+    assert np.array_equal(clean, same)
+    for key in layers:
+        assert np.array_equal(layers[key], same_layers[key])
+
+
+@pytest.mark.parametrize("what", ["smog", "flood", "snow"])
+def test_weather_in_the_limit_changes_no_pixel_by_more_than_one_step(what):
+    flat = AnalyticField(
+        [HalfSpace(colour=(0.3, 0.3, 0.3), checker=0.5), Box((1, 2, 0), (2, 3, 1))], box=WIDE
+    )
+    small = dataclasses.replace(flat, box=((-30, -30, -5), (30, 30, 10)))
+    if what == "smog":
+        world = World(small, air=medium(Smog(visibility=1e6), 0.0))
+    elif what == "flood":
+        world = World(small, water=flooded(-0.01))
+    else:
+        world = World(small, matter=snowed(1e-4, small))
+    clean, layers = frame(World(small))
+    other, _ = frame(world)
+    # Not the sky: an endless smog swallows it at any visibility, and the ground here ends at 30 m.
+    solid = np.isfinite(layers["depth"])
+    difference = np.abs(clean.astype(int) - other.astype(int)).max(-1)
+    assert difference[solid].max() <= 1
+
+
+def test_all_weathers_at_once_compose():
+    level = 0.3
+    snow = snowed(0.15)
+    air = medium(Smog(visibility=60.0), 0.0)
+    world = World(street(), 0.0, air, snow.above(level), flooded(level))
+    seen = linear(world)
+    assert seen.mask_water.max() > 0.99 and seen.mask_snow.max() > 0.99
+    assert (seen.snow_thickness[seen.mask_water > 0.99] == 0).all()
+    shown = (seen.mask_snow > 0.9) & (seen.snow_thickness > 0)
+    assert 0.05 < seen.snow_thickness[shown].mean() < 0.25
+    assert torch.isfinite(seen.rgb).all()
+    # The snow of the bank shows in the water: reflections see the other weathers.
+    without = linear(dataclasses.replace(world, matter=None))
+    wet = seen.mask_water > 0.999
+    assert (seen.rgb[wet] - without.rgb[wet]).abs().max() > 0.02
+
+
+def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):
+    from climatenerf.render import trace as module
+
+    world = World(street(), 0.0, medium(Smog(visibility=60.0), 0.0), None, flooded(0.3))
+    whole = linear(world).rgb
+    monkeypatch.setattr(module, "RAYS_AT_ONCE", 777)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    parts = linear(world).rgb
+    torch.set_num_threads(threads)
+    assert (whole - parts).abs().max() < 1e-5
+
+
+def test_no_parameters_give_nan():
+    for flood in (
+        Flood(level=0.3, wind_speed=20.0, fetch=1e4),
+        Flood(level=0.3, clarity=50.0),
+        Flood(level=1.6),  # the eye is on the surface
+        Flood(level=2.5, clarity=0.01),
+    ):
+        assert flood.level is not None
+        water = Water(
+            flood, flood.level, at_time(make_waves(flood, 0), 3.0), torch.full((3,), 1.0)
+        )
+        for air in (None, medium(Smog(visibility=5.0, height_falloff=2.0), 0.0)):
+            seen = linear(World(street(), air=air, water=water))
+            for name in ("rgb", "water_depth", "mask_water", "transmittance", "normal"):
+                assert torch.isfinite(getattr(seen, name)).all(), (flood, name)
+            assert not torch.isnan(seen.depth).any()
+            assert (seen.rgb >= 0).all()

@@ -1,0 +1,125 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from climatenerf.errors import UserError
+from climatenerf.scene import Camera, Scene, View, load_image
+from climatenerf.scene.images import downscaled_camera, picture_header
+
+CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+
+
+def scene_of(path: Path, camera=CAMERA):
+    view = View(path.name, path, 0, np.eye(4))
+    return view, Scene(path.parent, "test", (camera,), (view,))
+
+
+def save(tmp_path, image: Image.Image, name="a.png", **options):
+    image.save(tmp_path / name, **options)
+    return scene_of(tmp_path / name)
+
+
+RGB = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
+
+
+def test_rgb_is_untouched(tmp_path):
+    np.testing.assert_array_equal(load_image(*save(tmp_path, Image.fromarray(RGB))), RGB)
+
+
+def test_grey_becomes_rgb(tmp_path):
+    values = load_image(*save(tmp_path, Image.fromarray(RGB[..., 0])))
+    np.testing.assert_array_equal(values, np.repeat(RGB[..., :1], 3, axis=-1))
+
+
+def test_16_bit_grey(tmp_path):
+    deep = RGB[..., 0].astype(np.uint16) * 257
+    values = load_image(*save(tmp_path, Image.fromarray(deep)))
+    np.testing.assert_array_equal(values[..., 1], RGB[..., 0])
+
+
+def test_dark_16_bit_grey_stays_dark(tmp_path):
+    deep = np.full((24, 32), 200, dtype=np.uint16)
+    assert load_image(*save(tmp_path, Image.fromarray(deep))).max() <= 1
+
+
+def test_alpha_is_dropped_not_composited(tmp_path):
+    alpha = np.zeros((24, 32, 1), dtype=np.uint8)
+    view, scene = save(tmp_path, Image.fromarray(np.concatenate([RGB, alpha], axis=-1)))
+    np.testing.assert_array_equal(load_image(view, scene), RGB)
+    assert picture_header(view.path).alpha
+
+
+def test_palette(tmp_path):
+    image = Image.fromarray(RGB).quantize(16)
+    values = load_image(*save(tmp_path, image))
+    np.testing.assert_array_equal(values, np.asarray(image.convert("RGB")))
+
+
+def test_downscale_averages_light(tmp_path):
+    # Half the pixels white: half the light is sRGB 188, not 128.
+    checks = ((np.indices((24, 32)).sum(axis=0) % 2) * 255).astype(np.uint8)
+    values = load_image(*save(tmp_path, Image.fromarray(checks)), 2)
+    assert values.shape == (12, 16, 3) and (values == 188).all()
+
+
+def test_downscale_keeps_flat_colours_and_cuts_the_rest(tmp_path):
+    for level in (0, 1, 7, 128, 255):
+        view, scene = save(tmp_path, Image.new("L", (32, 24), level))
+        values = load_image(view, scene, 5)
+        assert values.shape == (4, 6, 3) and (values == level).all()
+
+
+def test_downscaled_camera_sees_the_same_rays():
+    small = downscaled_camera(CAMERA, 5)
+    assert (small.width, small.height) == (6, 4)
+    full, coarse = CAMERA.directions(), small.directions()
+    # The centre of a 5x5 block is the centre of its middle pixel.
+    np.testing.assert_allclose(coarse, full[2:20:5, 2:30:5], atol=1e-6)
+    with pytest.raises(UserError, match="downscaled by 25"):
+        downscaled_camera(CAMERA, 25)
+
+
+def exif(orientation):
+    tags = Image.Exif()
+    tags[0x0112] = orientation
+    return tags
+
+
+def test_exif_orientation_is_ignored_when_poses_fit_the_stored_size(tmp_path):
+    for orientation in (3, 6, 8):
+        view, scene = save(tmp_path, Image.fromarray(RGB), exif=exif(orientation))
+        np.testing.assert_array_equal(load_image(view, scene), RGB)
+
+
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_exif_orientation_is_used_when_only_it_fits(tmp_path, orientation):
+    from PIL import ImageOps
+
+    camera = Camera(24, 32, 30.0, 30.0, 12.0, 16.0)
+    Image.fromarray(RGB).save(tmp_path / "a.png", exif=exif(orientation))
+    view, scene = scene_of(tmp_path / "a.png", camera)
+    with Image.open(tmp_path / "a.png") as image:
+        expected = np.asarray(ImageOps.exif_transpose(image))
+    np.testing.assert_array_equal(load_image(view, scene), expected)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_where_the_shown_top_is(tmp_path, orientation):
+    from PIL import ImageOps
+
+    # A gradient that brightens towards `up_in_picture` is brightest at the top once shown.
+    view, _ = save(tmp_path, Image.fromarray(RGB), exif=exif(orientation))
+    x, y = picture_header(view.path).up_in_picture(CAMERA)
+    rows, columns = np.mgrid[:24, :32]
+    ramp = Image.fromarray((100 + 3 * (x * columns + y * rows)).astype(np.uint8))
+    ramp.getexif()[0x0112] = orientation
+    shown = np.asarray(ImageOps.exif_transpose(ramp)).astype(int)
+    assert (np.diff(shown, axis=0) < 0).all() and (np.diff(shown, axis=1) == 0).all()
+
+
+def test_wrong_size(tmp_path):
+    view, scene = save(tmp_path, Image.new("RGB", (10, 10)))
+    with pytest.raises(UserError, match="10x10"):
+        load_image(view, scene)

@@ -1,0 +1,194 @@
+import numpy as np
+import pytest
+from PIL import Image
+from scene_builders import PINHOLE, names_of, ring, write_colmap, write_images, write_transforms
+
+from climatenerf.errors import UserError
+from climatenerf.scene import load_image, read_scene, save_scene
+from climatenerf.scene.images import load_labels, load_mask
+
+
+def make(tmp_path, count=9, points=()):
+    write_images(tmp_path / "images", names_of(count))
+    write_colmap(tmp_path / "sparse/0", ring(count), names_of(count), points=points)
+    return tmp_path
+
+
+def test_every_eighth_by_sorted_name(tmp_path):
+    names = [f"{i}.png" for i in range(17)]  # sorted as text: 0, 1, 10, 11, ...
+    write_images(tmp_path / "images", names)
+    write_colmap(tmp_path / "sparse/0", ring(17), names)
+    scene = read_scene(tmp_path)
+    order = sorted(names)
+    assert [v.name for v in scene.views] == order
+    assert [v.name for v in scene.of_split("heldout")] == [order[0], order[8], order[16]]
+
+
+def test_holdout_by_name(tmp_path):
+    make(tmp_path)
+    scene = read_scene(tmp_path, holdout="002.png, 005")
+    assert [v.name for v in scene.of_split("heldout")] == ["002.png", "005.png"]
+    assert not read_scene(tmp_path, holdout="0").of_split("heldout")
+
+
+@pytest.mark.parametrize("holdout", ["nope.png", "002.png,nope.png", "", ","])
+def test_unknown_holdout(tmp_path, holdout):
+    make(tmp_path)
+    with pytest.raises(UserError, match="nope|no name"):
+        read_scene(tmp_path, holdout=holdout)
+
+
+def test_everything_held_out(tmp_path):
+    make(tmp_path, 3)
+    with pytest.raises(UserError, match="none is left"):
+        read_scene(tmp_path, holdout=",".join(names_of(3)))
+
+
+def test_missing_pictures_are_counted_once(tmp_path):
+    make(tmp_path, 9)
+    for name in names_of(9)[2:6]:
+        (tmp_path / "images" / name).unlink()
+    scene = read_scene(tmp_path)
+    found = [w for w in scene.warnings if "not on disk" in w]
+    assert len(found) == 1 and found[0].startswith("4 of the 9") and "002.png" in found[0]
+    assert len(scene.views) == 5
+
+
+def test_too_few_pictures(tmp_path):
+    make(tmp_path, 5)
+    for name in names_of(5)[2:]:
+        (tmp_path / "images" / name).unlink()
+    with pytest.raises(UserError, match="Only 2 of the 5"):
+        read_scene(tmp_path)
+
+
+def test_missing_folder(tmp_path):
+    with pytest.raises(UserError, match="does not exist"):
+        read_scene(tmp_path / "nowhere")
+
+
+def test_no_pictures_and_unknown_layout(tmp_path):
+    with pytest.raises(UserError, match="no pictures and no poses"):
+        read_scene(tmp_path)
+    write_images(tmp_path / "images", names_of(3))
+    with pytest.raises(UserError, match="no poses in a known layout"):
+        read_scene(tmp_path)
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(UserError, match="not a folder or a .json"):
+        read_scene(tmp_path / "a.txt")
+
+
+def test_unreadable_picture(tmp_path):
+    make(tmp_path)
+    (tmp_path / "images/004.png").write_bytes(b"not a picture")
+    with pytest.raises(UserError, match=r"004\.png cannot be read"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_truncated_picture(tmp_path, suffix):
+    names = [f"{i}.{suffix}" for i in range(4)]
+    write_colmap(tmp_path / "sparse/0", ring(4), names)
+    noise = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    (tmp_path / "images").mkdir()
+    for name in names:
+        Image.fromarray(noise).save(tmp_path / "images" / name)
+    scene = read_scene(tmp_path)
+    path = scene.views[2].path
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with pytest.raises(UserError, match=rf"2\.{suffix} cannot be read"):
+        load_image(scene.views[2], scene)
+    path.unlink()
+    with pytest.raises(UserError, match=rf"2\.{suffix} is missing"):
+        load_image(scene.views[2], scene)
+
+
+def test_other_shape_is_an_error(tmp_path):
+    make(tmp_path)
+    Image.new("RGB", (24, 32)).save(tmp_path / "images/003.png")
+    with pytest.raises(UserError, match=r"003\.png has 24x32 .* another shape"):
+        read_scene(tmp_path)
+
+
+def test_same_name_twice(tmp_path):
+    write_images(tmp_path / "images", names_of(4))
+    write_colmap(tmp_path / "sparse/0", ring(4), [*names_of(3), "000.png"])
+    with pytest.raises(UserError, match=r"000\.png twice"):
+        read_scene(tmp_path)
+
+
+def test_labels_and_masks_are_found(tmp_path):
+    make(tmp_path, 4)
+    write_images(tmp_path / "labels", names_of(2))
+    labels = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32)
+    Image.fromarray(labels).save(tmp_path / "labels/000.png")
+    mask = np.full((24, 32), 255, dtype=np.uint8)
+    mask[:4, :4] = 0
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks/001.png.png")
+    scene = read_scene(tmp_path)
+    np.testing.assert_array_equal(load_labels(scene.views[0], scene), labels)
+    small = load_labels(scene.views[0], scene, 4)
+    assert small is not None and small.shape == (6, 8) and set(small.flat) <= set(labels.flat)
+    assert scene.views[1].mask_path == tmp_path / "masks/001.png.png"
+    usable = load_mask(scene.views[1], scene, 3)
+    assert usable is not None and usable.shape == (8, 10)
+    # The mask ends inside the second pixel, which is therefore not used either.
+    np.testing.assert_array_equal(usable[:3, 0], [False, False, True])
+    assert load_mask(scene.views[2], scene) is None and load_labels(scene.views[2], scene) is None
+
+
+def test_labels_of_another_size_are_brought_to_the_picture(tmp_path):
+    make(tmp_path, 3)
+    (tmp_path / "labels").mkdir()
+    Image.fromarray(np.full((48, 64), 7, dtype=np.uint8)).save(tmp_path / "labels/000.png")
+    Image.fromarray(np.full((48, 48), 7, dtype=np.uint8)).save(tmp_path / "labels/001.png")
+    scene = read_scene(tmp_path)
+    labels = load_labels(scene.views[0], scene)
+    assert labels is not None and labels.shape == (24, 32) and (labels == 7).all()
+    with pytest.raises(UserError, match=r"001\.png has 48x48"):
+        load_labels(scene.views[1], scene)
+
+
+def test_reading_does_not_need_torch():
+    import subprocess
+    import sys
+
+    code = "import sys, climatenerf.scene; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_transforms_are_preferred_over_colmap(tmp_path):
+    make(tmp_path, 4)
+    names = [f"images/{n}" for n in names_of(3)]
+    write_transforms(tmp_path / "transforms.json", ring(3), names, fl_x=30, w=32, h=24)
+    assert read_scene(tmp_path).source == "transforms"
+
+
+def test_own_scene_keeps_its_similarity(tmp_path):
+    make(tmp_path)
+    scene = read_scene(tmp_path, camera_height=2.0)
+    save_scene(scene, tmp_path)
+    again = read_scene(tmp_path)
+    np.testing.assert_array_equal(again.world_from_input, scene.world_from_input)
+    assert again.scale_source == "camera-height" and again.source == "colmap"
+    assert [v.split for v in again.views] == [v.split for v in scene.views]
+    other = read_scene(tmp_path / "scene.json", holdout="0", camera_height=4.0)
+    assert other.scale == pytest.approx(2 * scene.scale)
+    assert not other.of_split("heldout")
+
+
+@pytest.mark.parametrize("height", [0.0, -1.0, float("nan")])
+def test_bad_camera_height(tmp_path, height):
+    make(tmp_path)
+    with pytest.raises(UserError, match="camera height"):
+        read_scene(tmp_path, camera_height=height)
+
+
+def test_distortion_without_inverse_is_a_warning(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    camera = (1, "SIMPLE_RADIAL", 32, 24, (10.0, 16.0, 12.0, -1.0))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(camera,))
+    assert any("cannot be undone" in w for w in read_scene(tmp_path).warnings)
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(PINHOLE,))
+    assert not any("cannot be undone" in w for w in read_scene(tmp_path).warnings)

@@ -1,0 +1,131 @@
+"""The weather file: read, refused, keyframed, overridden by flags, and written back."""
+
+import json
+import math
+import tomllib
+
+import pytest
+
+from climatenerf.errors import UserError
+from climatenerf.weather.description import (
+    KeyframedWeather,
+    combine,
+    given_flags,
+    read_weather,
+    to_toml,
+    weather_from_table,
+    weather_to_table,
+)
+from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
+
+FILE = """
+seed = 7
+[flood]
+level = { "4 s" = "0.8 m", "0 s" = "0 m" }
+wind-speed = "6 m/s"
+colour = [0.5, 0.4, 0.3]
+[smog]
+visibility = "200 m"
+contrast = 0.02
+[snow]
+slope = "40 deg"
+"""
+
+
+@pytest.fixture
+def film(tmp_path) -> KeyframedWeather:
+    path = tmp_path / "weather.toml"
+    path.write_text(FILE)
+    return read_weather(path)
+
+
+def test_values_and_keyframes(film):
+    assert film.base.seed == 7
+    assert film.base.flood.wind_speed == 6
+    assert film.base.flood.colour == (0.5, 0.4, 0.3)
+    assert film.base.smog == Smog(visibility=200, contrast=0.02)
+    assert film.base.snow == Snow(slope=math.radians(40))
+    levels = [film.at(t).flood.level for t in (-1, 0, 1, 2, 4, 9)]
+    assert levels == pytest.approx([0, 0, 0.2, 0.4, 0.8, 0.8])
+    assert film.at(3).smog == film.base.smog
+
+
+def test_colours_move_too():
+    film = weather_from_table(
+        {"smog": {"sigma": "1 1/m", "colour": {"1 s": [0, 0, 0], "3 s": [1, 0.5, 0]}}}
+    )
+    assert film.at(1.5).smog.colour == pytest.approx((0.25, 0.125, 0))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[fload]", 'unknown section "fload"; did you mean "flood"?'),
+        ('[flood]\nlevle = "1 m"', 'unknown key in [flood] "levle"; did you mean "level"?'),
+        ('[flood]\nwind = "1 m/s"', "did you mean"),
+        ('[flood]\nlevel = "3 kg"', 'flood.level wants a length such as "0.5 m"; got "3 kg"'),
+        ("[flood]\nlevel = 3", 'flood.level wants a length such as "0.5 m"; got 3'),
+        ("[flood]\nwave-scale = true", "flood.wave-scale wants a number; got True"),
+        ("[flood]\ncolour = [1, 2]", "flood.colour wants three numbers"),
+        ("[flood]\nlevel = {}", "empty table of keyframes"),
+        (
+            '[flood]\nlevel = {"1 m" = "1 m"}',
+            'a time of flood.level wants a duration such as "4 s"',
+        ),
+        ('[flood]\nlevel = {"1 s" = "1 m", "1000 ms" = "2 m"}', "names the same time twice"),
+        ('[flood]\nlevel = {"0 s" = "none", "1 s" = "2 m"}', 'has "none" in a keyframe'),
+        ('[flood]\nlevel = {"0 s" = "1 m", "1 s" = "2000 m"}', "must lie between"),
+        ('[smog]\nvisibility = "9 m"\nsigma = "1 1/m"', "give only one"),
+        ("flood = 3", "[flood] wants a table of values; got 3"),
+        ("seed = 1.5", "seed wants a whole number; got 1.5"),
+        ("[flood", "is not valid TOML"),
+    ],
+)
+def test_refused(tmp_path, text, message):
+    path = tmp_path / "weather.toml"
+    path.write_text(text)
+    with pytest.raises(UserError) as error:
+        read_weather(path)
+    assert message in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_missing_and_binary_files(tmp_path):
+    with pytest.raises(UserError, match="cannot read the weather file"):
+        read_weather(tmp_path / "none.toml")
+    with pytest.raises(UserError, match="cannot read the weather file"):
+        read_weather(tmp_path)
+    (tmp_path / "a.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(UserError, match="not valid TOML"):
+        read_weather(tmp_path / "a.toml")
+
+
+def test_round_trip(film):
+    for weather in (film, KeyframedWeather(Weather(), {})):
+        table = weather_to_table(weather)
+        assert weather_from_table(json.loads(json.dumps(table))) == weather
+        assert weather_from_table(tomllib.loads(to_toml(table))) == weather
+    assert weather_to_table(film.at(2))["flood"]["level"] == "0.4 m"
+
+
+def test_flags_override_the_file(film):
+    arguments = ["render", "--flood.wind-speed=2 m/s", "--smog.sigma", "0.1 1/m", "--frames", "3"]
+    given = given_flags(arguments)
+    assert given == {"flood.wind_speed", "smog.sigma"}
+    # A flag counts even where it repeats the default, so the file's value does not come back.
+    flags = Weather(flood=Flood(wind_speed=Flood().wind_speed), smog=Smog(sigma=0.1))
+    mixed = combine(film, flags, given)
+    assert mixed.base.flood.wind_speed == Flood().wind_speed
+    assert (mixed.base.smog.visibility, mixed.base.smog.sigma) == (None, 0.1)
+    assert mixed.base.smog.contrast == 0.02
+    assert mixed.base.seed == 7
+    assert mixed.at(2).flood.level == pytest.approx(0.4)
+
+
+def test_a_flag_replaces_keyframes(film):
+    given = given_flags(["--flood.level", "2 m"])
+    assert combine(film, Weather(flood=Flood(level=2.0)), given).at(3).flood.level == 2
+
+
+def test_flags_alone():
+    assert combine(None, Weather(seed=3), frozenset()).at(1) == Weather(seed=3)
