@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+OPACITY = 0.3  # of a crossed cell
+
 DensityAt = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 
 
@@ -68,7 +70,7 @@ class Occupancy(torch.nn.Module):
         flat[cells] = torch.maximum(flat[cells] * decay, seen)
         self._threshold()
 
-    def _threshold(self, opacity: float = 0.05) -> None:
+    def _threshold(self, opacity: float = OPACITY) -> None:
         """A cell is occupied if crossing it would absorb more than `opacity` of the light.
 
         Early on all density is low: then the cascade's mean is the threshold, or the grid would

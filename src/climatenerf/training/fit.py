@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.field.extent import Extent
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
+from climatenerf.render.samples import Samples
 from climatenerf.render.view import LEAST_WEIGHT
 from climatenerf.training import losses
 from climatenerf.training.optimiser import GridAdam
@@ -36,11 +37,11 @@ class FitSettings:
     samples_per_step: int = 2**17
     grid_rate: float = 1e-2
     """Learning rate of the hash grids at the start."""
-    net_rate: float = 3e-3
+    net_rate: float = 1e-2
     """Learning rate of networks, sky and appearance at the start."""
-    final_rate: float = 0.03
+    final_rate: float = 0.1
     """Both rates end at this share of their start."""
-    distortion_weight: float = 3e-4
+    distortion_weight: float = 1e-2
     opacity_weight: float = 2e-4
     sky_weight: float = 1e-1
     seed: int = 0
@@ -74,8 +75,13 @@ class Fitting:
         size = PRESETS[settings.preset]
         self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near)
         self.grid_adam = GridAdam([self.field.geometry_grid, self.field.appearance_grid])
-        nets = [p for n, p in self.field.named_parameters() if not n.endswith("_grid")]
-        self.net_adam = torch.optim.Adam(nets, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
+        named = dict(self.field.named_parameters())
+        # Appearance learns slowly: a vector per image is enough to paint every photo onto haze.
+        groups = [
+            {"params": [p for n, p in named.items() if "_net." in n], "share": 1},
+            {"params": [named["embeddings"]], "share": EMBEDDING_SHARE},
+        ]
+        self.net_adam = torch.optim.Adam(groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
         self.generator = torch.Generator().manual_seed(settings.seed)
         self.steps = 0
         self.seconds = 0.0
@@ -144,10 +150,17 @@ class Fitting:
         )
         # Lengths from here on in grid units.
         t, dt = samples.t / field.unit, samples.dt / field.unit
-        u = field.sample_positions(batch.rays_o, batch.rays_d, samples)
-        tau = field.density_with_gradient(u) * dt
+        tau = samples.sigma * samples.dt
+        kept, chance = self.choose(tau, samples)
+        u = field.sample_positions(batch.rays_o, batch.rays_d, samples)[kept]
+        # Near a camera many rays crowd into little space that few other cameras see, and haze there
+        # is learned first. Gradients scaled with the distance squared, as the rays' spread, undo
+        # that (Philip & Deschaintre 2023, Eq. 5).
+        spread = t[kept].square().clamp_max(1.0)
+        own = field.density_with_gradient(u) * dt[kept]
+        tau = tau.index_copy(0, kept, scale_gradient(own, spread / chance))
         weights, left = dispatch.render_weights(tau, samples.offsets)
-        radiance = self.radiance(batch, u, weights, left, samples)
+        radiance = self.radiance(batch, u, samples, kept, weights, left, spread, chance)
 
         error = losses.colour_loss(radiance, batch.rgb)
         loss = error
@@ -164,24 +177,52 @@ class Fitting:
         loss.backward()
         decay = settings.final_rate**self.progress * min(1.0, (self.steps + 1) / 50)
         for group in self.net_adam.param_groups:
-            group["lr"] = settings.net_rate * decay
+            group["lr"] = settings.net_rate * decay * group["share"]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * decay)
         return error.item(), samples.t.shape[0]
 
+    def choose(self, tau: Tensor, samples: Samples) -> tuple[Tensor, Tensor]:
+        """The samples that get colour and gradients, and the chance that each had.
+
+        Early on rays cross haze, with hundreds of samples that hardly weigh: about `CHOSEN` a ray
+        are drawn in proportion to their weights, each standing for those like it. Where surfaces
+        are found all that weigh are taken. The estimate's noise is larger the more a ray's colours
+        differ, which favours surfaces over haze.
+        """
+        weights, _ = dispatch.render_weights(tau, samples.offsets)
+        chance = (CHOSEN * weights).clamp(LEAST_CHANCE, 1.0)
+        draw = torch.rand(chance.shape[0], generator=self.generator)
+        kept = (draw < chance).nonzero()[:, 0]
+        return kept, chance[kept]
+
     def radiance(
-        self, batch: Batch, u: Tensor, weights: Tensor, left: Tensor, samples
+        self,
+        batch: Batch,
+        u: Float[Tensor, "k 3"],
+        samples: Samples,
+        kept: Int[Tensor, "k"],
+        weights: Float[Tensor, "s"],
+        left: Float[Tensor, "n"],
+        spread: Float[Tensor, "k"],
+        chance: Float[Tensor, "k"],
     ) -> Float[Tensor, "n 3"]:
         """Linear radiance of a batch's rays: matter in front of the directional sky."""
         n = batch.rays_o.shape[0]
-        keep = (weights.detach() > LEAST_WEIGHT).nonzero()[:, 0]
-        ray = samples.ray_index()[keep]
+        share = weights[kept] / chance
+        seen = (share.detach() > LEAST_WEIGHT).nonzero()[:, 0]
+        ray = samples.ray_index()[kept][seen]
         offsets = torch.zeros(n + 1, dtype=torch.long)
         offsets[1:] = torch.bincount(ray, minlength=n).cumsum(0)
         appearance = self.field.embeddings[batch.image]
-        colour = self.field.colour_at(u[keep], ray, batch.rays_d, appearance)
-        sky = self.field.sky_colour(batch.rays_d, appearance)
-        return dispatch.accumulate(weights[keep], colour, offsets) + left[:, None] * sky
+        colour = self.field.colour_at(u[seen], ray, batch.rays_d, appearance)
+        colour = scale_gradient(colour, spread[seen, None])
+        own = dispatch.accumulate(share[seen], colour, offsets)
+        # The drawn shares sum to the ray's opacity on average only; made to sum to it, they are far
+        # less noisy.
+        drawn = torch.zeros(n).index_add(0, ray, share[seen].detach())
+        own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
+        return own + left[:, None] * self.field.sky_colour(batch.rays_d, appearance)
 
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
@@ -195,18 +236,29 @@ class Fitting:
             occupancy.refine()
 
     def adapt(self, rays: int, samples: int) -> None:
-        """Keeps the samples per step at their budget and the samples per ray affordable.
+        """Keeps the samples per step at their budget, and makes marching finer with time.
 
-        Steps are coarse while the grid is full, so that early steps are many; they become fine as
-        space empties. The budget grows at first: early on, many small steps learn faster.
+        Coarse steps while the grid is full, so that early steps are many; but not for long, since
+        surfaces cannot become thinner than a step. The budget grows at first: early on, many small
+        steps learn faster.
         """
         budget = self.settings.samples_per_step * min(1.0, 0.25 + 2.5 * self.progress)
         factor = min(2.0, max(0.5, budget / max(samples, 1)))
         self.rays = int(min(16384, max(256, rays * factor)))
-        change = 1.05 if samples / rays > SAMPLES_PER_RAY else 0.97
-        self.step_scale = min(MAX_STEP_SCALE, max(1.0, self.step_scale * change))
+        self.step_scale *= 1.03 if samples > SAMPLES_PER_RAY * rays else 0.98
+        coarsest = 1 + (MAX_STEP_SCALE - 1) * max(0.0, 1 - self.progress / FINE_AT)
+        self.step_scale = min(coarsest, max(1.0, self.step_scale))
 
 
-MAX_STEP_SCALE = 6.0
-SAMPLES_PER_RAY = 64  # coarser steps while rays have more samples than this
+def scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
+    """The same value, its gradient multiplied by a factor."""
+    return value * factor + (value * (1 - factor)).detach()
+
+
+EMBEDDING_SHARE = 0.05  # learning rate of appearance vectors over that of the networks
+CHOSEN = 12  # samples of a ray that get colour and gradients, about
+LEAST_CHANCE = 0.02  # of any sample, so that empty space can fill
+MAX_STEP_SCALE = 8.0
+SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
+FINE_AT = 0.8  # progress from which steps are as fine as when rendering
 REFINE_AT = 0.25  # progress at which occupancy cells are halved

@@ -1,0 +1,132 @@
+import dataclasses
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+import torch
+from random_field import directions, points, random_field
+
+from climatenerf.errors import UserError
+from climatenerf.field.checkpoint import FILE_NAME, SCHEMA_VERSION, load_field, save_field
+from climatenerf.render.view import render_view
+from climatenerf.scene.cameras import Camera
+from climatenerf.storage import read_safetensors, write_safetensors
+
+CAMERA = Camera(32, 24, 25.0, 25.0, 16.0, 12.0)
+
+
+def rewritten(run, change):
+    """Changes what the file says about itself."""
+    arrays, metadata = read_safetensors(run / FILE_NAME)
+    about = json.loads(metadata["climatenerf"])
+    change(about, arrays)
+    write_safetensors(run / FILE_NAME, arrays, {"climatenerf": json.dumps(about)})
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_a_loaded_field_renders_bit_identically(tmp_path, refined):
+    field = random_field()
+    if refined:
+        field.occupancy.update(field.grid_density, 1.0, 0.9, torch.Generator().manual_seed(0))
+        field.occupancy.refine()
+    field.occupancy.seen[0, 3:9, 2:8, 4:7] = 1
+    save_field(field, tmp_path)
+    loaded = load_field(tmp_path)
+    assert (loaded.size, loaded.unit, loaded.near) == (field.size, field.unit, field.near)
+    assert loaded.state_dict().keys() == field.state_dict().keys()
+    for name, tensor in field.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], tensor), name
+    pose = np.eye(4)
+    pose[:3, 3] = field.centre.numpy()
+    picture = render_view(field, CAMERA, pose)
+    assert picture.std() > 0.01
+    assert np.array_equal(render_view(loaded, CAMERA, pose), picture)
+    x, d = points(field, 200), directions(200)
+    for one, other in ((field, loaded), (field.trusted(), loaded.trusted())):
+        assert torch.equal(one.density(x), other.density(x))
+        assert torch.equal(one.colour(x, d), other.colour(x, d))
+        assert torch.equal(one.sky(d), other.sky(d))
+    assert not any(p.requires_grad for p in loaded.parameters())
+
+
+def test_a_folder_without_a_field(tmp_path):
+    with pytest.raises(UserError, match="climatenerf fit"):
+        load_field(tmp_path)
+    with pytest.raises(UserError, match="climatenerf fit"):
+        load_field(tmp_path / "absent")
+
+
+def test_a_newer_schema_is_refused_and_says_so(tmp_path):
+    save_field(random_field(), tmp_path)
+    rewritten(tmp_path, lambda about, _: about.update(schema_version=SCHEMA_VERSION + 1))
+    with pytest.raises(UserError, match="newer") as caught:
+        load_field(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0001, 0.3, 0.999])
+def test_a_truncated_file(tmp_path, share):
+    save_field(random_field(), tmp_path)
+    data = (tmp_path / FILE_NAME).read_bytes()
+    (tmp_path / FILE_NAME).write_bytes(data[: int(share * len(data))])
+    with pytest.raises(UserError, match="damaged") as caught:
+        load_field(tmp_path)
+    assert FILE_NAME in str(caught.value)
+
+
+def without(name):
+    return lambda about, arrays: arrays.pop(name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without("embeddings"),
+        without("geometry_grid"),
+        without("occupancy.density"),
+        lambda about, _: about.pop("unit"),
+        lambda about, _: about["size"].update(geometry_levels=7),
+        lambda about, _: about["size"].update(flavour="new"),
+        lambda about, arrays: arrays.update(centre=np.zeros(4, np.float32)),
+        lambda about, _: about.update(unit="wide"),
+        lambda about, _: about.update(unit=0.0),
+        lambda about, arrays: arrays["centre"].fill(np.nan),
+    ],
+)
+def test_a_damaged_file_is_one_clear_sentence(tmp_path, change):
+    save_field(random_field(), tmp_path)
+    rewritten(tmp_path, change)
+    with pytest.raises(UserError, match="damaged"):
+        load_field(tmp_path)
+
+
+def test_a_file_of_another_program(tmp_path):
+    write_safetensors(tmp_path / FILE_NAME, {"a": np.zeros(3, np.float32)}, {})
+    with pytest.raises(UserError, match="damaged"):
+        load_field(tmp_path)
+    (tmp_path / FILE_NAME).write_bytes(b"not a field at all")
+    with pytest.raises(UserError, match="damaged"):
+        load_field(tmp_path)
+
+
+def test_a_full_disk_leaves_the_old_field(tmp_path, monkeypatch):
+    save_field(random_field(0), tmp_path)
+    before = (tmp_path / FILE_NAME).read_bytes()
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(UserError, match="disk is full"):
+        save_field(random_field(1), tmp_path)
+    assert (tmp_path / FILE_NAME).read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == [FILE_NAME]
+
+
+def test_sizes_survive(tmp_path):
+    save_field(random_field(), tmp_path)
+    _, metadata = read_safetensors(tmp_path / FILE_NAME)
+    about = json.loads(metadata["climatenerf"])
+    assert about["size"] == dataclasses.asdict(random_field().size)

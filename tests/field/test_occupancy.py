@@ -1,0 +1,123 @@
+import pytest
+import torch
+from random_field import random_field
+
+from climatenerf.field.occupancy import OPACITY, Occupancy
+
+
+def ball(q, radius=0.5, density=200.0):
+    return density * (q.norm(dim=-1) < radius).float()
+
+
+def updated(times=1, fraction=1.0, density_at=ball, occupancy=None):
+    generator = torch.Generator().manual_seed(0)
+    occupancy = occupancy or Occupancy(cascades=2, side=16)
+    for _ in range(times):
+        occupancy.update(density_at, fraction, 0.95, generator)
+    return occupancy
+
+
+def inside_ball(occupancy, radius):
+    """Cells that lie wholly nearer than `radius`, and cells wholly farther."""
+    cells = torch.arange(occupancy.density.numel())
+    centre, size = occupancy.cell_centres(cells)
+    half = size * 3**0.5 / 2
+    distance = centre.norm(dim=-1)
+    return distance + half < radius, distance - half > radius
+
+
+def test_cells_and_their_centres_agree_with_the_field():
+    field = random_field()
+    occupancy = field.occupancy
+    cells = torch.arange(occupancy.density.numel())
+    centre, size = occupancy.cell_centres(cells)
+    cascade = cells // occupancy.side**3
+    # A cascade's middle belongs to the next finer one.
+    own = (centre.abs().amax(-1) > 2.0 ** (cascade - 1)) | (cascade == 0)
+    offset = (torch.rand(centre.shape) - 0.5) * 0.99 * size[:, None]
+    for q in (centre, centre + offset):
+        found, inside = field._cells(q)
+        assert inside.all()
+        assert torch.equal(found[own], cells[own])
+        assert (found[~own] // occupancy.side**3 < cascade[~own]).all()
+    _, inside = field._cells(torch.tensor([[4.01, 0.0, 0.0], [0.0, -9.0, 0.0], [0.0, 0.0, 3.99]]))
+    assert inside.tolist() == [False, False, True]
+
+
+def test_marching_finds_matter_in_exactly_the_cell_that_is_occupied():
+    field = random_field()
+    with torch.no_grad():
+        field.geometry_net[3].add_(6.0)  # samples thinner than 1e-5 are dropped
+    occupancy = field.occupancy
+    cells = torch.arange(occupancy.density.numel())
+    centre, size = occupancy.cell_centres(cells)
+    cascade = cells // occupancy.side**3
+    own = (centre.abs().amax(-1) > 2.0 ** (cascade - 1)) | (cascade == 0)
+    some = cells[own][torch.randperm(int(own.sum()))[:40]]
+    for cell in some.tolist():
+        occupancy.occupied.zero_().view(-1)[cell] = 1
+        middle = field.centre + field.unit * centre[cell]
+        d = torch.nn.functional.normalize(torch.randn(1, 3), dim=-1)
+        far = torch.full((1,), 20.0)
+        samples = field.march(middle - 10 * d, d, torch.zeros(1), far, step_scale=0.2, stop=1e-9)
+        assert samples.t.numel() > 0
+        q = field.to_grid(middle - 10 * d + samples.t[:, None] * d)
+        assert ((q - centre[cell]).abs() < 0.5 * size[cell] + 1e-5).all()
+
+
+def test_one_look_at_every_cell_finds_all_matter_and_clears_empty_space():
+    occupancy = updated()
+    within, beyond = inside_ball(occupancy, 0.5)
+    assert within.any() and beyond.any()
+    occupied = occupancy.occupied.view(-1).bool()
+    assert occupied[within].all() and not occupied[beyond].any()
+
+
+def test_later_looks_at_a_share_of_cells_keep_what_is_there():
+    occupancy = updated(times=60, fraction=0.06, occupancy=updated())
+    within, beyond = inside_ball(occupancy, 0.5)
+    occupied = occupancy.occupied.view(-1).bool()
+    assert occupied[within].all() and not occupied[beyond].any()
+
+
+def test_matter_that_has_gone_is_forgotten_and_new_matter_found():
+    occupancy = updated()
+    occupancy = updated(300, 0.2, lambda q: ball(q - 0.5, 0.3), occupancy)
+    cells = torch.arange(occupancy.density.numel())
+    centre, _ = occupancy.cell_centres(cells)
+    occupied = occupancy.occupied.view(-1).bool()
+    assert occupied[((centre - 0.5).norm(dim=-1) < 0.2) & (cells < 16**3)].all()
+    assert not occupied[(centre + 0.3).norm(dim=-1) < 0.2].any()
+
+
+def test_threshold_is_the_light_absorbed_by_crossing_a_cell():
+    size = 2.0 / 16
+    for depth, expected in ((OPACITY * 0.9, 0), (OPACITY * 1.1, 1)):
+        # One dense corner in each cascade lifts the mean above the fixed threshold.
+        def density(q, depth=depth):
+            cascade = (q.abs().amax(-1) > 1).float()
+            return torch.where((q > 0).all(-1), 1e4, depth / (size * 2**cascade))
+
+        occupancy = updated(density_at=density)
+        centre, _ = occupancy.cell_centres(torch.arange(16**3))
+        thin = (centre < 0).any(-1)
+        assert (occupancy.occupied.view(-1)[: 16**3][thin] == expected).all()
+
+
+def test_a_field_that_is_thin_everywhere_does_not_become_empty():
+    share = updated(density_at=lambda q: torch.rand(q.shape[0]) * 1e-3).occupied.float().mean()
+    assert 0.3 < share < 0.7
+
+
+@pytest.mark.parametrize("density", [200.0, 0.02])
+def test_refining_keeps_matter_and_halves_the_cells(density):
+    occupancy = updated(density_at=lambda q: ball(q, 0.6, density))
+    before = occupancy.occupied.clone()
+    cells, densities = before.bool(), occupancy.density.clone()
+    occupancy.refine()
+    assert occupancy.side == 32 and occupancy.seen.shape == occupancy.occupied.shape
+    for corner in range(8):
+        x, y, z = corner & 1, corner >> 1 & 1, corner >> 2
+        child = occupancy.occupied[:, x::2, y::2, z::2].bool()
+        assert torch.equal(child, cells)
+        assert torch.equal(occupancy.density[:, x::2, y::2, z::2], densities)

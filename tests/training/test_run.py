@@ -1,0 +1,239 @@
+import dataclasses
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from toy_scene import TINY, make_scene
+
+from climatenerf.errors import UserError
+from climatenerf.field.checkpoint import load_field
+from climatenerf.field.presets import PRESETS
+from climatenerf.render.view import render_view
+from climatenerf.scene import load_scene
+from climatenerf.scene.scene import with_split
+from climatenerf.storage import read_json, write_json
+from climatenerf.training import run as run_module
+from climatenerf.training.fit import FitSettings
+from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return make_scene(tmp_path_factory.mktemp("toy"))
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+
+
+def nothing(*_):
+    pass
+
+
+def fitted(scene, folder, steps=6, resume=False, report=nothing, evaluated=nothing, **settings):
+    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
+    settings = FitSettings(steps=steps, **chosen)
+    return fit_scene(scene, folder, settings, 1, resume, report, evaluated)
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+def full_disk_for(name, monkeypatch):
+    """Renaming onto a file of this name fails as on a full disk."""
+    real = os.replace
+
+    def replace(source, target):
+        if os.path.basename(target) == name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+
+
+def test_a_run_folder_has_everything(scene, tmp_path):
+    done = []
+    metrics = fitted(scene, tmp_path / "run", evaluated=lambda *count: done.append(count))
+    assert done == [(i, 4) for i in range(1, 5)]
+    on_disk = read_json(tmp_path / "run" / "metrics.json")
+    assert on_disk == json.loads(json.dumps(metrics))
+    assert {"psnr", "ssim", "psnr_cc", "seconds", "steps", "samples"} <= set(on_disk)
+    assert on_disk["steps"] == 6 and on_disk["samples"] > 0 and on_disk["seconds"] > 0
+    assert on_disk["interrupted"] is False and on_disk["train_views"] == 20
+    assert sorted(on_disk["views"]) == [f"{i:02d}.png" for i in (0, 6, 12, 18)]
+    for key in ("psnr", "ssim", "psnr_cc"):
+        rows = [row[key] for row in on_disk["views"].values()]
+        assert on_disk[key] == pytest.approx(np.mean(rows)) and np.isfinite(rows).all()
+    assert on_disk["psnr_cc"] >= on_disk["psnr"]
+    config = read_json(tmp_path / "run" / "config.json")
+    assert config["schema_version"] == 1 and config["settings"]["steps"] == 6
+    loaded = load_scene(tmp_path / "run")
+    assert [v.split for v in loaded.views] == [v.split for v in scene.views]
+    preview = Image.open(next((tmp_path / "run" / "previews").glob("*.jpg")))
+    assert preview.size == (480, 180)
+    field = load_field(tmp_path / "run")
+    view = scene.of_split("heldout")[0]
+    picture = render_view(field, scene.cameras[0], scene.c2w_world(view))
+    truth = np.asarray(Image.open(view.path)) / 255
+    found = -10 * np.log10(np.mean((picture - truth) ** 2))
+    assert found == pytest.approx(on_disk["views"][view.name]["psnr"], abs=1e-3)
+
+
+def test_nothing_held_out_means_no_quality(scene, tmp_path):
+    metrics = fitted(with_split(scene, set()), tmp_path / "run", steps=2)
+    assert metrics["psnr"] is None and metrics["ssim"] is None and metrics["psnr_cc"] is None
+    assert metrics["train_views"] == 24 and metrics["steps"] == 2
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=2)
+    before = contents(tmp_path / "run")
+    with pytest.raises(UserError, match="--resume"):
+        fitted(scene, tmp_path / "run", steps=2)
+    assert contents(tmp_path / "run") == before
+
+
+# --- resuming ---------------------------------------------------------------------------------
+
+
+def state_of(fitting):
+    """All that a step reads or changes."""
+    state = {f"field.{k}": v for k, v in fitting.field.state_dict().items()}
+    state |= {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
+    for index, moments in fitting.net_adam.state_dict()["state"].items():
+        state |= {f"net.{index}.{k}": torch.as_tensor(v) for k, v in moments.items()}
+    state["generator"] = fitting.generator.get_state()
+    counters = (fitting.steps, fitting.samples, fitting.rays)
+    floats = (fitting.seconds, fitting.step_scale, fitting.error)
+    return {k: v.clone() for k, v in state.items()}, counters, floats
+
+
+def begin(scene, **settings):
+    views = scene.of_split("train")
+    poses = np.stack([scene.c2w_world(v) for v in views])
+    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
+    extent = run_module.find_extent(poses, None)
+    return run_module.Fitting(load_pixels(scene, 1), len(views), extent, FitSettings(**chosen))
+
+
+def assert_same(a, b):
+    for one, other in zip(state_of(a), state_of(b), strict=True):
+        if isinstance(one, dict):
+            assert one.keys() == other.keys()
+            for key in one:
+                assert torch.equal(one[key], other[key]), key
+        else:
+            assert one == other
+
+
+def stop_at(step):
+    def report(state):
+        if state.step == step:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
+    fitting = begin(scene, steps=40)
+    with pytest.raises(KeyboardInterrupt):
+        fitting.run(stop_at(20))
+    write_json(tmp_path / "config.json", run_module._config(fitting.settings, 1, fitting.field))
+    checkpoint(fitting, tmp_path)
+    again = begin(scene, steps=40)
+    restore(again, tmp_path)
+    assert_same(fitting, again)
+    fitting.run(nothing)
+    again.run(nothing)
+    fitting.seconds = again.seconds  # the one thing that may differ
+    assert fitting.steps == 40
+    assert_same(fitting, again)
+
+
+def test_resuming_counts_on(scene, tmp_path):
+    first = fitted(scene, tmp_path / "run", steps=8)
+    second = fitted(scene, tmp_path / "run", steps=16, resume=True)
+    assert second["steps"] == 16
+    assert second["samples"] > first["samples"] and second["seconds"] > first["seconds"]
+    third = fitted(scene, tmp_path / "run", steps=16, resume=True)
+    assert third["steps"] == 16 and third["samples"] == second["samples"], "it was finished"
+
+
+def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):
+    metrics = fitted(scene, tmp_path / "run", steps=50, report=stop_at(5))
+    assert metrics["interrupted"] is True and metrics["steps"] == 5
+    assert metrics["psnr"] > 0
+    assert read_json(tmp_path / "run" / "metrics.json")["interrupted"] is True
+    load_field(tmp_path / "run")
+    again = fitted(scene, tmp_path / "run", steps=9, resume=True)
+    assert again["steps"] == 9 and again["interrupted"] is False
+
+
+def test_resuming_where_there_is_nothing(scene, tmp_path):
+    with pytest.raises(UserError, match="no run to resume"):
+        fitted(scene, tmp_path / "run", resume=True)
+
+
+def test_resuming_with_other_photos_or_another_size(scene, tmp_path, monkeypatch):
+    fitted(scene, tmp_path / "run", steps=2)
+    with pytest.raises(UserError, match="other photos"):
+        fitted(with_split(scene, {"01.png"}), tmp_path / "run", steps=4, resume=True)
+    monkeypatch.setitem(PRESETS, "tiny", dataclasses.replace(TINY, geometry_levels=5))
+    with pytest.raises(UserError, match="another preset"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+
+
+def test_a_run_from_a_newer_program_is_left_alone(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=2)
+    config = read_json(tmp_path / "run" / "config.json")
+    write_json(tmp_path / "run" / "config.json", {**config, "schema_version": 99})
+    before = contents(tmp_path / "run")
+    with pytest.raises(UserError, match="newer"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+    assert contents(tmp_path / "run") == before
+
+
+@pytest.mark.parametrize("name", ["optimiser.safetensors", "config.json"])
+@pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: b"{}"])
+def test_a_damaged_run_is_one_clear_sentence(scene, tmp_path, name, damage):
+    fitted(scene, tmp_path / "run", steps=2)
+    path = tmp_path / "run" / name
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(UserError):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+
+
+# --- full disk ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["field.safetensors", "optimiser.safetensors", "metrics.json", "scene.json"]
+)
+def test_a_full_disk_harms_nothing_and_the_run_goes_on_later(scene, tmp_path, monkeypatch, name):
+    fitted(scene, tmp_path / "run", steps=3)
+    before = contents(tmp_path / "run")
+    with monkeypatch.context() as patch:
+        full_disk_for(name, patch)
+        with pytest.raises(UserError, match="space") as caught:
+            fitted(scene, tmp_path / "run", steps=6, resume=True)
+        assert name in str(caught.value)
+    after = contents(tmp_path / "run")
+    assert after[name] == before[name]
+    assert after.keys() == before.keys(), "no temporary file stays"
+    load_field(tmp_path / "run")
+    assert fitted(scene, tmp_path / "run", steps=6, resume=True)["steps"] == 6
+
+
+@pytest.mark.parametrize("name", ["config.json", "field.safetensors", "optimiser.safetensors"])
+def test_a_run_that_never_got_saved_can_be_begun_again(scene, tmp_path, monkeypatch, name):
+    with monkeypatch.context() as patch:
+        full_disk_for(name, patch)
+        with pytest.raises(UserError, match="disk is full"):
+            fitted(scene, tmp_path / "run", steps=3)
+    assert fitted(scene, tmp_path / "run", steps=3)["steps"] == 3
