@@ -107,13 +107,26 @@ def test_marching_matches_the_twin(generator):
     padded = [np.zeros((n, 1024), np.float32) for _ in range(3)]
     steps = (0.05, 0.02)
     counts = cpu.march(
-        o.numpy(), d.numpy(), near.numpy(), far.numpy(), jitter.numpy(), occupied.numpy(),
-        steps, 1e-3, net, *padded,
+        o.numpy(),
+        d.numpy(),
+        near.numpy(),
+        far.numpy(),
+        jitter.numpy(),
+        occupied.numpy(),
+        steps,
+        1e-3,
+        net,
+        *padded,
     )
     agree = 0
     for r in range(n):
         twin = reference.march(
-            o[r], d[r], (0.05, float(far[r]), float(jitter[r])), occupied, steps, 1e-3,
+            o[r],
+            d[r],
+            (0.05, float(far[r]), float(jitter[r])),
+            occupied,
+            steps,
+            1e-3,
             lambda q: reference.density(q, table, resolutions, layers),
         )
         same = counts[r] == len(twin) and np.allclose(

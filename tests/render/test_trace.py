@@ -1,4 +1,4 @@
-"""The checks of the physics that concern smog, flood and their composition, through the renderer."""
+"""Smog, flood and their composition: the checks of the physics, through the renderer."""
 
 import dataclasses
 import math
@@ -225,9 +225,7 @@ def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it
     field = street()
     water = flooded(1.5, wind_speed=0.0, attenuation=(0.0,) * 3)
     o = torch.tensor([[0.0, -3.0, 1.0], [0.0, -3.0, 1.0]])
-    d = torch.nn.functional.normalize(
-        torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.3]]), dim=-1
-    )
+    d = torch.nn.functional.normalize(torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.3]]), dim=-1)
     seen = trace(World(field, water=water), o, d, torch.full((2,), 1e-3))
     zenith = field.sky(torch.tensor([[0.0, 0.0, 1.0]]))[0]
     assert torch.allclose(seen.rgb[0], zenith * (1 - 0.0204), atol=0.03)
@@ -236,7 +234,7 @@ def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it
     assert seen.rgb[1, 2] < 0.6
 
 
-# --- composition and anything -----------------------------------------------------------------------
+# --- composition and anything ---
 
 
 def snowed(depth, field=None):
@@ -311,9 +309,7 @@ def test_no_parameters_give_nan():
         Flood(level=2.5, clarity=0.01),
     ):
         assert flood.level is not None
-        water = Water(
-            flood, flood.level, at_time(make_waves(flood, 0), 3.0), torch.full((3,), 1.0)
-        )
+        water = Water(flood, flood.level, at_time(make_waves(flood, 0), 3.0), torch.full((3,), 1.0))
         for air in (None, medium(Smog(visibility=5.0, height_falloff=2.0), 0.0)):
             seen = linear(World(street(), air=air, water=water))
             for name in ("rgb", "water_depth", "mask_water", "transmittance", "normal"):

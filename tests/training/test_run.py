@@ -11,6 +11,7 @@ from toy_scene import TINY, make_scene
 
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
+from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.render.view import render_view
 from climatenerf.scene import load_scene
@@ -22,13 +23,23 @@ from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory):
+def toy(tmp_path_factory):
     return make_scene(tmp_path_factory.mktemp("toy"))
+
+
+@pytest.fixture(scope="module")
+def scene(toy):
+    """With one picture held out, since measuring takes the most time here."""
+    return with_split(toy, {"00.png"})
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
+    """Small sizes; a field of a few steps is thick haze, in which full pictures take seconds."""
     monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
+    mark_seen = Field.mark_seen
+    monkeypatch.setattr(Field, "mark_seen", lambda self, o, d: mark_seen(self, o[:50], d[:50]))
 
 
 def nothing(*_):
@@ -57,7 +68,8 @@ def full_disk_for(name, monkeypatch):
     monkeypatch.setattr(os, "replace", replace)
 
 
-def test_a_run_folder_has_everything(scene, tmp_path):
+def test_a_run_folder_has_everything(toy, tmp_path):
+    scene = toy
     done = []
     metrics = fitted(scene, tmp_path / "run", evaluated=lambda *count: done.append(count))
     assert done == [(i, 4) for i in range(1, 5)]
@@ -76,7 +88,7 @@ def test_a_run_folder_has_everything(scene, tmp_path):
     loaded = load_scene(tmp_path / "run")
     assert [v.split for v in loaded.views] == [v.split for v in scene.views]
     preview = Image.open(next((tmp_path / "run" / "previews").glob("*.jpg")))
-    assert preview.size == (480, 180)
+    assert preview.size == (64, 24)
     field = load_field(tmp_path / "run")
     view = scene.of_split("heldout")[0]
     picture = render_view(field, scene.cameras[0], scene.c2w_world(view))
@@ -180,10 +192,16 @@ def test_resuming_where_there_is_nothing(scene, tmp_path):
         fitted(scene, tmp_path / "run", resume=True)
 
 
-def test_resuming_with_other_photos_or_another_size(scene, tmp_path, monkeypatch):
+@pytest.mark.parametrize("heldout", [{"01.png", "02.png"}, {"01.png"}])
+def test_resuming_with_other_photos_is_refused(scene, tmp_path, heldout):
+    """Also with as many: what was held out must not become training, nor the reverse."""
     fitted(scene, tmp_path / "run", steps=2)
     with pytest.raises(UserError, match="other photos"):
-        fitted(with_split(scene, {"01.png"}), tmp_path / "run", steps=4, resume=True)
+        fitted(with_split(scene, heldout), tmp_path / "run", steps=4, resume=True)
+
+
+def test_resuming_with_another_size_is_refused(scene, tmp_path, monkeypatch):
+    fitted(scene, tmp_path / "run", steps=2)
     monkeypatch.setitem(PRESETS, "tiny", dataclasses.replace(TINY, geometry_levels=5))
     with pytest.raises(UserError, match="another preset"):
         fitted(scene, tmp_path / "run", steps=4, resume=True)

@@ -99,6 +99,8 @@ def _run(words: list[str]) -> int:
     module = importlib.import_module(verb.module)
     # tyro prints its own help and complaints, and leaves by SystemExit with status 0 or 2.
     options = tyro.cli(getattr(module, verb.options), prog=f"climatenerf {name}", args=words[1:])
+    if name == "render":  # which flags were given decides over a weather file
+        return module.run(options, words[1:]) or 0
     return module.run(options) or 0
 
 

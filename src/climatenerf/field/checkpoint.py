@@ -46,6 +46,9 @@ def load_field(run: Path) -> Field:
         about = json.loads(metadata["climatenerf"])
         check_schema(about["schema_version"], SCHEMA_VERSION, f"the field in {run}")
         size = FieldSize(**about["size"])
+        numbers = [about["unit"], about["near"], *arrays["centre"].tolist()]
+        if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0:
+            raise ValueError("a length is not a finite number above 0")
         field = Field(
             size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
         )

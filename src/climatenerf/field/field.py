@@ -133,7 +133,8 @@ class Field(nn.Module):
     def grid_density(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Density (1/grid unit) at positions in grid units, without gradient."""
         out = torch.empty(q.shape[0])
-        cpu.density_at(q.contiguous().numpy(), *self._net(), out.numpy())
+        table, resolutions, w1, b1, w2, b2 = self._net()
+        cpu.density_at(q.contiguous().numpy(), table, resolutions, w1, b1, w2, b2, out.numpy())
         return out
 
     @torch.no_grad()

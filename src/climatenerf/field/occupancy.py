@@ -45,7 +45,7 @@ class Occupancy(torch.nn.Module):
     def update(
         self, density_at: DensityAt, fraction: float, decay: float, generator: torch.Generator
     ) -> None:
-        """Looks at all occupied cells or, for fraction < 1, at some of them and of all others.
+        """Looks at all cells or, for fraction < 1, at some occupied ones and some of all.
 
         Args:
             density_at: density (1/grid unit) at positions in grid units.
@@ -54,31 +54,46 @@ class Occupancy(torch.nn.Module):
             generator: source of the positions inside the cells.
         """
         total = self.density.numel()
+        flat, held = self.density.view(-1), self.occupied.view(-1)
         if fraction >= 1:
             cells = torch.arange(total)
         else:
-            count = int(total * fraction)
+            # Half anywhere, half occupied ones found by drawing until enough are met: listing all
+            # occupied cells would cost more than looking at these.
+            count = int(total * fraction / 2)
             anywhere = torch.randint(total, (count,), generator=generator)
-            held = self.occupied.view(-1).nonzero()[:, 0]
-            if held.numel() > 2 * count:
-                held = held[torch.randint(held.numel(), (2 * count,), generator=generator)]
-            cells = torch.cat([anywhere, held])
+            drawn = torch.randint(total, (4 * count,), generator=generator)
+            cells = torch.cat([anywhere, drawn[held[drawn] > 0][:count]])
         centre, size = self.cell_centres(cells)
         offset = torch.rand(centre.shape, generator=generator) - 0.5
         seen = density_at(centre + offset * size[:, None])
-        flat = self.density.view(-1)
         flat[cells] = torch.maximum(flat[cells] * decay, seen)
-        self._threshold()
+        if fraction >= 1:
+            self._threshold()
+        else:
+            some = torch.randint(total, (100_000,), generator=generator)
+            threshold = self._thresholds(some)
+            held[cells] = (flat[cells] * size > threshold[cells // self.side**3]).to(torch.uint8)
 
-    def _threshold(self, opacity: float = OPACITY) -> None:
-        """A cell is occupied if crossing it would absorb more than `opacity` of the light.
+    def _thresholds(self, cells: Int[Tensor, "n"]) -> Float[Tensor, "cascades"]:
+        """Optical depth across a cell from which it is occupied, for each cascade.
 
-        Early on all density is low: then the cascade's mean is the threshold, or the grid would
+        A cell is occupied if crossing it absorbs more than `OPACITY` of the light. Early on all
+        density is low: then the cascade's mean (over the cells given) decides, or the grid would
         be empty.
         """
+        count = self.density.shape[0]
+        cascade = cells // self.side**3
+        depth = self.density.view(-1)[cells] * 2.0 ** (cascade + 1) / self.side
+        total = torch.zeros(count).index_add(0, cascade, depth)
+        number = torch.bincount(cascade, minlength=count).clamp_min(1)
+        return (total / number).clamp_max(OPACITY)
+
+    def _threshold(self) -> None:
+        """Decides every cell anew."""
         cascades = torch.arange(self.density.shape[0])
         depth = self.density * (2.0 ** (cascades + 1) / self.side)[:, None, None, None]
-        threshold = depth.mean((1, 2, 3), keepdim=True).clamp_max(opacity)
+        threshold = depth.mean((1, 2, 3), keepdim=True).clamp_max(OPACITY)
         self.occupied = (depth > threshold).to(torch.uint8)
 
     def refine(self) -> None:

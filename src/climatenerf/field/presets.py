@@ -7,13 +7,13 @@ from dataclasses import dataclass
 class FieldSize:
     """Sizes of the two hash grids and of their networks."""
 
-    geometry_levels: int = 10
+    geometry_levels: int = 8
     geometry_log2_rows: int = 17
     geometry_finest: int = 2048
     """Cells across the contracted cube (4 grid units) at the finest level."""
     geometry_hidden: int = 32
     appearance_levels: int = 12
-    appearance_log2_rows: int = 18
+    appearance_log2_rows: int = 17
     appearance_finest: int = 4096
     colour_hidden: int = 64
     coarsest: int = 16

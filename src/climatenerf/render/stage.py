@@ -1,8 +1,9 @@
 """Weather put into a fitted scene: prepared once, then asked for the world at each moment."""
 
+import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -31,7 +32,7 @@ class Stage:
     irradiance: Float[Tensor, "3"]
     snow: BakedSnow | None
     waves: Waves | None
-    _grown: dict[float, BakedSnow] = field(default_factory=dict)
+    _grown: dict[float, BakedSnow] = dataclasses.field(default_factory=dict)
 
     def at(self, time: float) -> World:
         """Everything there is at a time in s."""

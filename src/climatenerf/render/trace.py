@@ -198,6 +198,9 @@ def _beyond(
 ) -> Float[Tensor, "s"]:
     """Share of each sample that lies beyond the water plane: 0 or 1 but for the waterline's pixel.
 
+    The soft edge is kept to the wet side (0 at the waterline, 1 half a pixel from it), so that
+    water under the ground shows nowhere; the visible edge moves by a quarter of a pixel.
+
     The waterline's softness depends on how the ground slopes, so the ground's normal is found for
     the rays that have matter within a pixel of the plane.
     """
@@ -212,7 +215,7 @@ def _beyond(
     normal = torch.zeros_like(rays_d)
     normal[:, 2] = 1.0
     normal[rays] = _field_normal(world, x, step, rays_d[rays])
-    return water_physics.shore_coverage(*arguments, normal[ray])
+    return (2 * water_physics.shore_coverage(*arguments, normal[ray]) - 1).clamp_min(0.0)
 
 
 def _sample_colour(

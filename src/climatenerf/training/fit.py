@@ -34,8 +34,8 @@ class FitSettings:
     """Stop after this many minutes; None: by steps alone."""
     steps: int | None = None
     """Stop after this many steps; None: by minutes alone."""
-    samples_per_step: int = 2**17
-    grid_rate: float = 1e-2
+    samples_per_step: int = 2**16
+    grid_rate: float = 2e-2
     """Learning rate of the hash grids at the start."""
     net_rate: float = 1e-2
     """Learning rate of networks, sky and appearance at the start."""
@@ -78,8 +78,9 @@ class Fitting:
         named = dict(self.field.named_parameters())
         # Appearance learns slowly: a vector per image is enough to paint every photo onto haze.
         groups = [
-            {"params": [p for n, p in named.items() if "_net." in n], "share": 1},
-            {"params": [named["embeddings"]], "share": EMBEDDING_SHARE},
+            {"params": _of(named, "geometry_net", "colour_net", "view_net"), "share": 1.0},
+            {"params": _of(named, "sky_net"), "share": SKY_SHARE},
+            {"params": _of(named, "embeddings"), "share": EMBEDDING_SHARE},
         ]
         self.net_adam = torch.optim.Adam(groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -156,7 +157,7 @@ class Fitting:
         # Near a camera many rays crowd into little space that few other cameras see, and haze there
         # is learned first. Gradients scaled with the distance squared, as the rays' spread, undo
         # that (Philip & Deschaintre 2023, Eq. 5).
-        spread = t[kept].square().clamp_max(1.0)
+        spread = (samples.t[kept] / (CROWDED * field.near)).square().clamp_max(1.0)
         own = field.density_with_gradient(u) * dt[kept]
         tau = tau.index_copy(0, kept, scale_gradient(own, spread / chance))
         weights, left = dispatch.render_weights(tau, samples.offsets)
@@ -230,7 +231,7 @@ class Fitting:
         if self.steps in (16, 32, 64, 128):
             occupancy.update(self.field.grid_density, 1.0, 0.9, self.generator)
         elif self.steps % 16 == 0 and self.steps > 128:
-            occupancy.update(self.field.grid_density, 0.06, 0.95, self.generator)
+            occupancy.update(self.field.grid_density, 0.04, 0.8, self.generator)
         late = self.progress > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
@@ -250,14 +251,21 @@ class Fitting:
         self.step_scale = min(coarsest, max(1.0, self.step_scale))
 
 
+def _of(named: dict[str, torch.nn.Parameter], *starts: str) -> list[torch.nn.Parameter]:
+    return [p for n, p in named.items() if n.startswith(starts)]
+
+
 def scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
     """The same value, its gradient multiplied by a factor."""
     return value * factor + (value * (1 - factor)).detach()
 
 
+# The sky learns slowly too: it may not paint the view before there is matter.
+SKY_SHARE = 0.03
 EMBEDDING_SHARE = 0.05  # learning rate of appearance vectors over that of the networks
-CHOSEN = 12  # samples of a ray that get colour and gradients, about
-LEAST_CHANCE = 0.02  # of any sample, so that empty space can fill
+CROWDED = 3.0  # rays of one camera crowd within this many times the nearest distance
+CHOSEN = 32  # samples of a ray that get colour and gradients, about
+LEAST_CHANCE = 0.1  # of any sample, so that empty space can fill
 MAX_STEP_SCALE = 8.0
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
 FINE_AT = 0.8  # progress from which steps are as fine as when rendering

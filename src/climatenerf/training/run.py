@@ -19,7 +19,7 @@ from climatenerf.field.field import Field
 from climatenerf.render.view import render_view
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.images import downscaled_camera, load_image, load_labels, load_mask
-from climatenerf.scene.scene import Scene, View, save_scene
+from climatenerf.scene.scene import Scene, View, load_scene, save_scene
 from climatenerf.storage import (
     atomic_path,
     check_schema,
@@ -33,6 +33,7 @@ from climatenerf.training.fit import FitSettings, Fitting, Report
 from climatenerf.training.pixels import TrainingPixels
 
 SCHEMA_VERSION = 1
+OPTIMISER = "optimiser.safetensors"
 CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0
 PREVIEW_WIDTH = 240
@@ -77,7 +78,8 @@ def fit_scene(
     Raises:
         UserError: the folder already holds a run (without resume) or none (with it).
     """
-    if not resume and (run / "config.json").exists():
+    # Of a checkpoint's files this is written last: without it there is nothing to lose.
+    if not resume and (run / OPTIMISER).exists():
         raise UserError(
             f"{run} already holds a run; choose another -o, or continue it with --resume"
         )
@@ -86,6 +88,7 @@ def fit_scene(
     poses = np.stack([scene.c2w_world(view) for view in views])
     fitting = Fitting(pixels, len(views), find_extent(poses, scene.points_world()), settings)
     if resume:
+        check_same_photos(scene, run)
         restore(fitting, run)
     make_folder(run / "previews")
     save_scene(scene, run)
@@ -109,8 +112,10 @@ def fit_scene(
         fitting.run(after_step)
     except KeyboardInterrupt:
         interrupted = True
-    fitting.field.occupancy.seen.zero_()
-    for _ in range(16):
+    occupancy = fitting.field.occupancy
+    occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
+    occupancy.seen.zero_()
+    for _ in range(4):
         batch = pixels.draw(16384, fitting.generator)
         fitting.field.mark_seen(batch.rays_o, batch.rays_d)
     checkpoint(fitting, run)
@@ -166,7 +171,19 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     state["floats"] = torch.tensor(
         [fitting.seconds, fitting.step_scale, fitting.error], dtype=torch.float64
     )
-    write_safetensors(run / "optimiser.safetensors", state, {})
+    write_safetensors(run / OPTIMISER, state, {})
+
+
+def check_same_photos(scene: Scene, run: Path) -> None:
+    """Refuses to resume on other photos: appearance belongs to photos, and held-out ones must not
+    have been trained on."""
+    if not (run / "scene.json").is_file():
+        return  # `restore` says that there is no run
+    before = [view.name for view in load_scene(run).of_split("train")]
+    if before != [view.name for view in scene.of_split("train")]:
+        raise UserError(
+            f"{run} was fitted to other photos; resume it with the same scene and --holdout"
+        )
 
 
 def restore(fitting: Fitting, run: Path) -> None:
@@ -185,7 +202,7 @@ def restore(fitting: Fitting, run: Path) -> None:
     with torch.no_grad():
         fitting.field.load_state_dict(field.state_dict())
     fitting.field.unit, fitting.field.near = field.unit, field.near
-    arrays, _ = read_safetensors(run / "optimiser.safetensors", "the optimiser's state")
+    arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
     state = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}
     fitting.grid_adam.load(
         {k.removeprefix("grid."): v for k, v in state.items() if k.startswith("grid.")}

@@ -1,0 +1,50 @@
+"""How good is a fit after so many minutes?
+
+python benchmarks/fit_quality.py --minutes 5 --captures fox ditch stone_sign kitti_drive
+python benchmarks/fit_quality.py --minutes 5 15 --captures fox --seed 1
+
+Captures are names in ../shared/data or folders, fitted at their stored size by the command line in
+a process of their own. Held-out PSNR, SSIM and colour-corrected PSNR in the mean appearance.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+from common import CAPTURES, command, report
+
+KEYS = ("psnr", "psnr_cc", "ssim", "seconds", "steps", "samples")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
+    parser.add_argument("--captures", nargs="+", default=["fox"])
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--keep", type=Path, help="folder for the runs; default: thrown away")
+    options = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for capture in options.captures:
+            folder = Path(capture) if Path(capture).is_dir() else CAPTURES / capture
+            for minutes in options.minutes:
+                run = (options.keep or Path(temporary)) / f"{folder.name}-{minutes:g}min"
+                words = ["fit", str(folder), "-o", str(run), "--minutes", str(minutes)]
+                words += ["--downscale", str(options.downscale), "--seed", str(options.seed)]
+                start = time.perf_counter()
+                command(*words)
+                metrics = json.loads((run / "metrics.json").read_text())
+                row = {"capture": folder.name, "minutes": minutes, "downscale": options.downscale}
+                row |= {key: metrics[key] for key in KEYS}
+                row["wall_seconds"] = time.perf_counter() - start
+                psnrs = sorted(view["psnr"] for view in metrics["views"].values())
+                row["psnr_of_views"] = psnrs
+                rows.append(row)
+    report("held-out quality after a bounded time of fitting", rows, options.seed)
+
+
+if __name__ == "__main__":
+    main()

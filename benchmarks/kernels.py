@@ -1,0 +1,98 @@
+"""How fast is each kernel, and how much faster than its twin (the same in eager PyTorch)?
+
+python benchmarks/kernels.py
+python benchmarks/kernels.py --samples 131072 --repeats 7
+
+Million samples a second, forward and with backward. Twins that loop over rays in Python get fewer
+samples and fewer repeats; the rate is what counts.
+"""
+
+import argparse
+from collections.abc import Callable
+
+import common
+import torch
+
+from climatenerf.field.field import Field
+from climatenerf.field.presets import PRESETS
+from climatenerf.ops import cpu, dispatch, reference
+
+SAMPLES_PER_RAY = 32
+
+
+def packed(n: int) -> torch.Tensor:
+    return torch.arange(0, n + 1, SAMPLES_PER_RAY)
+
+
+def backward(*outputs: torch.Tensor) -> None:
+    torch.autograd.backward([o.sum() for o in outputs])
+
+
+def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
+    """Each operation on n samples, by the fast kernels (`dispatch`) or the twins (`reference`)."""
+    torch.manual_seed(0)
+    size = PRESETS["cpu"]
+    field = Field(size, 10, torch.zeros(3).numpy(), 1.0)
+    table, resolutions = field.appearance_grid, field.appearance_resolutions
+    table.grad_buffer = torch.zeros_like(table)  # as the optimiser gives it: spares a copy
+    u, offsets = torch.rand(n, 3), packed(n)
+    row = torch.arange(n) // SAMPLES_PER_RAY
+    x = torch.rand(n, 2 * size.appearance_levels, requires_grad=True)
+    shared = torch.rand(n // SAMPLES_PER_RAY, size.colour_hidden, requires_grad=True)
+    layers = list(zip(field.colour_net[::2], field.colour_net[1::2], strict=True))
+    geometry = list(zip(field.geometry_net[::2], field.geometry_net[1::2], strict=True))
+    tau = torch.rand(n, requires_grad=True)
+    values = torch.rand(n, 3, requires_grad=True)
+    t = torch.rand(n // SAMPLES_PER_RAY, SAMPLES_PER_RAY).sort(-1)[0].flatten()
+    ds = torch.full((n,), 0.01)
+    q = torch.randn(n, 3)
+
+    def density() -> torch.Tensor:
+        if ops is dispatch:
+            return field.grid_density(q)
+        with torch.no_grad():
+            return reference.density(q, field.geometry_grid, field.geometry_resolutions, geometry)
+
+    return {
+        "hash encode": lambda: ops.hash_encode(u, table.detach(), resolutions),
+        "hash encode + backward": lambda: backward(ops.hash_encode(u, table, resolutions)),
+        "density": density,
+        "network": lambda: ops.mlp(x.detach(), [(w.detach(), b.detach()) for w, b in layers],
+                                   shared.detach(), row),
+        "network + backward": lambda: backward(ops.mlp(x, layers, shared, row)),
+        "weights + backward": lambda: backward(*ops.render_weights(tau, offsets)),
+        "accumulate + backward": lambda: backward(ops.accumulate(tau, values, offsets)),
+        "distortion + backward": lambda: backward(ops.distortion(tau, t, ds, offsets)),
+        "merge": lambda: ops.merge_order(t, offsets, t, offsets),
+    }  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=2**17)
+    parser.add_argument("--twin-samples", type=int, default=2**13)
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    few = min(options.twin_samples, options.samples)
+    fast, slow = jobs(options.samples, dispatch), jobs(few, reference)
+    rows = {}
+    for name in fast:
+        a = common.measure(fast[name], options.repeats)
+        b = common.measure(slow[name], max(2, options.repeats // 2))
+        rate, twin = options.samples / a["median"] / 1e6, few / b["median"] / 1e6
+        rows[name] = {"Msamples/s": rate, "twin Msamples/s": twin, "times": rate / twin,
+                      "seconds": a}  # fmt: skip
+    table = torch.randn(2**22)
+    gradient = torch.randn(2**22) * (torch.rand(2**22) < 0.1)
+    moments = [torch.zeros(2**22).numpy() for _ in range(2)]
+    scalars = (0.01, 0.9, 0.99, 1e-15, 0.1, 0.01)
+    adam = common.measure(
+        lambda: cpu.adam(table.numpy(), gradient.clone().numpy(), *moments, *scalars),
+        options.repeats,
+    )
+    rows["Adam, a tenth touched"] = {"Mentries/s": 2**22 / adam["median"] / 1e6, "seconds": adam}
+    common.report("speed of the kernels against their twins", rows, seed=0)
+
+
+if __name__ == "__main__":
+    main()

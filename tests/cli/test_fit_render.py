@@ -1,0 +1,307 @@
+"""The two commands of the main job, through the command line, on the street that comes along."""
+
+import dataclasses
+import functools
+import json
+import shutil
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from climatenerf import cli
+from climatenerf.cli.render import LAYER_NAMES
+from climatenerf.storage import read_safetensors, write_safetensors
+
+STREET = Path(str(files("climatenerf") / "assets" / "street"))
+SMALL = ["--size", "96x54", "--frames", "2"]
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A short fit in small steps with small grids: a blurred street in some haze."""
+    from climatenerf.field.presets import PRESETS
+    from climatenerf.training import fit as fit_module
+    from climatenerf.training import run as run_module
+
+    folder = tmp_path_factory.mktemp("street") / "run"
+    small = dataclasses.replace(
+        PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
+    )
+    settings = functools.partial(fit_module.FitSettings, samples_per_step=2**14)
+    words = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "cpu", small)
+        patch.setattr(fit_module, "FitSettings", settings)
+        patch.setattr(run_module, "PREVIEW_WIDTH", 64)
+        assert cli.main(words) == 0
+    return folder
+
+
+def status(*words):
+    try:
+        return cli.main([str(word) for word in words])
+    except SystemExit as left:
+        return left.code
+
+
+def complaint(capsys, *words):
+    """The one sentence that a command which fails with status 2 leaves on standard error."""
+    capsys.readouterr()
+    assert status(*words) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    lines = [line for line in err.splitlines() if line.startswith("climatenerf: ")]
+    assert len(lines) == 1 and err.rstrip().endswith(lines[0]), err
+    return lines[0]
+
+
+# --- fit --------------------------------------------------------------------------------------
+
+
+def test_fit_leaves_a_run(run_folder):
+    metrics = json.loads((run_folder / "metrics.json").read_text())
+    assert {"psnr", "ssim", "psnr_cc", "seconds", "steps", "samples"} <= metrics.keys()
+    assert metrics["steps"] == 300 and metrics["downscale"] == 6 and metrics["psnr"] > 8
+    assert len(metrics["views"]) == 8
+    assert {"config.json", "field.safetensors", "optimiser.safetensors", "scene.json"} <= {
+        p.name for p in run_folder.iterdir()
+    }
+    assert list((run_folder / "previews").glob("*.jpg"))
+
+
+def test_fit_refuses_a_folder_that_holds_a_run(run_folder, capsys):
+    said = complaint(capsys, "fit", STREET, "-o", run_folder, "--steps", "1")
+    assert "--resume" in said
+
+
+# --- render -----------------------------------------------------------------------------------
+
+
+def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypatch):
+    words = ["render", run_folder, "-o", tmp_path, *SMALL, "--layers", "all"]
+    words += ["--flood.level", "0.4 m", "--smog.visibility", "60 m", "--snow.depth", "15 cm"]
+    assert status(*words) == 0
+    assert f"movie: {tmp_path / 'movie.mp4'}" in capsys.readouterr().out
+    assert (tmp_path / "movie.mp4").stat().st_size > 500
+    frames = [np.asarray(Image.open(p)) for p in sorted((tmp_path / "frames").glob("*.png"))]
+    assert [f.shape for f in frames] == [(54, 96, 3)] * 2
+    assert "simulated" in str(Image.open(tmp_path / "frames" / "0000.png").info)
+    sidecar = json.loads((tmp_path / "movie.json").read_text())
+    assert sidecar["simulated"] is True and sidecar["seed"] == 0
+    assert sidecar["weather"]["flood"]["level"] == "0.4 m"
+    assert sidecar["weather"]["smog"]["visibility"] == "60 m"
+    assert sidecar["weather"]["snow"]["depth"] == "0.15 m"
+    assert sidecar["units"]["length"] == "m" and "scale" in sidecar and "versions" in sidecar
+    assert len(sidecar["frames"]) == 2
+    for frame in sidecar["frames"]:
+        assert (frame["camera"]["width"], frame["camera"]["height"]) == (96, 54)
+        assert np.array(frame["c2w_world"]).shape == (4, 4)
+        assert set(frame["layers"]) == set(LAYER_NAMES)
+        layers = {}
+        for name in LAYER_NAMES:
+            layers[name] = np.load(tmp_path / frame["layers"][name][0])[name]
+            assert not np.isnan(layers[name]).any(), name
+            assert layers[name].shape[:2] == (54, 96)
+        assert frame["measured"]["water_share"] == pytest.approx(
+            float(layers["mask_water"].mean()), abs=1e-6
+        )
+        for mask in ("mask_water", "mask_snow", "mask_smog", "transmittance"):
+            assert layers[mask].min() >= -1e-5 and layers[mask].max() <= 1 + 1e-5
+        assert layers["mask_water"].mean() > 0.02 and layers["mask_smog"].mean() > 0.05
+        # Smog in closed form: the transmittance is that of the depth beside it.
+        seen = np.isfinite(layers["depth"])
+        expected = np.exp(-2.996 / 60 * layers["depth"][seen])
+        assert np.allclose(layers["transmittance"][seen], expected, atol=2e-3)
+
+
+def test_render_without_weather_from_a_drawn_path(run_folder, tmp_path):
+    c2w = json.loads((STREET / "scene.json").read_text())["views"][10]["c2w"]
+    opengl = (np.array(c2w) @ np.diag([1, -1, -1, 1])).ravel().tolist()
+    path = {
+        "camera_type": "perspective",
+        "render_width": 64,
+        "render_height": 36,
+        "fps": 5,
+        "camera_path": [{"camera_to_world": opengl, "fov": 45}] * 2,
+    }
+    (tmp_path / "camera_path.json").write_text(json.dumps(path))
+    out = tmp_path / "out"
+    words = ["render", run_folder, "-o", out, "--path", tmp_path / "camera_path.json"]
+    assert status(*words) == 0
+    sidecar = json.loads((out / "movie.json").read_text())
+    assert sidecar["fps"] == 5 and len(sidecar["frames"]) == 2
+    assert np.allclose(sidecar["frames"][0]["c2w_input"], c2w, atol=1e-5)
+    assert Image.open(out / "frames" / "0001.png").size == (64, 36)
+    assert sidecar["frames"][0]["measured"]["water_share"] == 0
+    assert not (out / "depth").exists(), "layers come on request only"
+
+
+def test_a_weather_file_and_a_flag_on_top(run_folder, tmp_path, monkeypatch):
+    weather = tmp_path / "weather.toml"
+    weather.write_text('seed = 7\n[smog]\nvisibility = "80 m"\n[flood]\nlevel = "0.3 m"\n')
+    out = tmp_path / "out"
+    words = ["render", run_folder, "-o", out, "--weather", weather, "--frames", "1"]
+    words += ["--size", "64x36", "--smog.visibility", "20 m"]
+    assert status(*words) == 0
+    told = json.loads((out / "movie.json").read_text())["weather"]
+    assert told["seed"] == 7 and told["flood"]["level"] == "0.3 m"
+    assert told["smog"]["visibility"] == "20 m", "flags win, whoever called main"
+
+
+# --- mistakes ---------------------------------------------------------------------------------
+
+
+def capture(folder, count=6, **changes):
+    """A small transforms.json whose frames can be spoilt."""
+    frames = []
+    for i in range(count):
+        path = folder / "images" / f"{i}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        noise = np.random.default_rng(i).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(path)
+        turn = 2 * np.pi * i / count
+        back = np.array([np.cos(turn), np.sin(turn), 0.0])
+        pose = np.eye(4)
+        pose[:3] = np.stack([[-back[1], back[0], 0], [0, 0, 1], back, 4 * back], -1)
+        frames.append({"file_path": f"images/{i}.png", "transform_matrix": pose.tolist()})
+    data = {"w": 32, "h": 24, "fl_x": 30.0, "frames": frames, **changes}
+    (folder / "transforms.json").write_text(json.dumps(data))
+    return data
+
+
+def spoil_pose(data):
+    data["frames"][2]["transform_matrix"][0][3] = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (spoil_pose, "finite"),
+        (lambda data: data.update(fl_x=0.0), "focal"),
+        (lambda data: data.update(camera_model="PERISCOPE"), "PERISCOPE"),
+    ],
+)
+def test_bad_poses_and_cameras(tmp_path, capsys, spoil, words):
+    data = capture(tmp_path / "scene")
+    spoil(data)
+    (tmp_path / "scene" / "transforms.json").write_text(json.dumps(data))
+    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
+    assert words in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_folder_and_one_without_pictures(tmp_path, capsys):
+    said = complaint(capsys, "fit", tmp_path / "absent", "-o", tmp_path / "run")
+    assert "absent" in said and "does not exist" in said
+    (tmp_path / "empty").mkdir()
+    said = complaint(capsys, "fit", tmp_path / "empty", "-o", tmp_path / "run")
+    assert "no pictures" in said
+
+
+def test_missing_pictures_are_counted_and_too_few_are_an_error(tmp_path, capsys):
+    capture(tmp_path / "scene")
+    for i in (1, 2, 3, 4):
+        (tmp_path / "scene" / "images" / f"{i}.png").unlink()
+    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run")
+    assert "2 of the 6" in said
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.5])
+def test_a_truncated_picture(tmp_path, capsys, keep):
+    capture(tmp_path / "scene")
+    path = tmp_path / "scene" / "images" / "3.png"
+    data = path.read_bytes()
+    path.write_bytes(data[: int(keep * len(data))])
+    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
+    assert "3.png" in said
+    assert not (tmp_path / "run" / "field.safetensors").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [["--minutes", "0"], ["--steps", "0"], ["--downscale", "0"], ["--downscale", "99"]]
+)
+def test_fit_options_out_of_range(tmp_path, capsys, words):
+    capture(tmp_path / "scene")
+    complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", *words)
+
+
+def test_unknown_names_to_hold_out(tmp_path, capsys):
+    capture(tmp_path / "scene")
+    words = ["fit", tmp_path / "scene", "-o", tmp_path / "run", "--holdout", "nobody.png"]
+    assert "nobody.png" in complaint(capsys, *words)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--flood.level", "90 m"], "above the whole scene"),
+        (["--size", "wide"], "--size"),
+        (["--size", "0x10"], "--size"),
+        (["--path", "loop"], "loop"),
+        (["--path", "still:nobody.jpg"], "nobody.jpg"),
+        (["--path", "absent.json"], "absent.json"),
+        (["--frames", "0"], "--frames"),
+        (["--weather", "absent.toml"], "absent.toml"),
+        (["--smog.visibility", "1 mm"], "smog.visibility"),
+    ],
+)
+def test_render_mistakes(run_folder, tmp_path, capsys, words, expected):
+    said = complaint(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL, *words)
+    assert expected in said
+    assert not (tmp_path / "out").exists(), "nothing is begun"
+
+
+@pytest.mark.parametrize("value", ["10 kg", "half a metre", "0.5"])
+def test_a_level_of_the_wrong_dimension(run_folder, tmp_path, capsys, value):
+    """Told by the parser of options, in its own frame, with status 2."""
+    capsys.readouterr()
+    assert status("render", run_folder, "-o", tmp_path / "out", "--flood.level", value) == 2
+    err = "".join(capsys.readouterr())
+    assert "such as" in err and "Traceback" not in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_that_are_no_run(tmp_path, capsys):
+    said = complaint(capsys, "render", tmp_path, "-o", tmp_path / "out")
+    assert "climatenerf fit" in said
+    complaint(capsys, "render", tmp_path / "absent", "-o", tmp_path / "out")
+    complaint(capsys, "render", STREET, "-o", tmp_path / "out")
+
+
+def test_a_run_from_a_newer_schema(run_folder, tmp_path, capsys):
+    shutil.copytree(run_folder, tmp_path / "run")
+    path = tmp_path / "run" / "field.safetensors"
+    arrays, metadata = read_safetensors(path)
+    about = {**json.loads(metadata["climatenerf"]), "schema_version": 99}
+    write_safetensors(path, arrays, {"climatenerf": json.dumps(about)})
+    said = complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
+    assert "newer" in said and "99" in said
+
+
+def test_a_damaged_run(run_folder, tmp_path, capsys):
+    shutil.copytree(run_folder, tmp_path / "run")
+    path = tmp_path / "run" / "field.safetensors"
+    path.write_bytes(path.read_bytes()[:5000])
+    assert "damaged" in complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out")
+
+
+# --- help -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("verb", ["fit", "render", "demo"])
+def test_help_of_a_verb_loads_no_torch(verb):
+    code = (
+        "import sys; from climatenerf.cli import main\n"
+        "try:\n    status = main(sys.argv[1:])\n"
+        "except SystemExit as left:\n    status = left.code\n"
+        "print('HEAVY', sorted({'torch', 'numba'} & set(sys.modules)), 'STATUS', status)"
+    )
+    words = [sys.executable, "-c", code, verb, "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.stdout.rstrip().endswith("HEAVY [] STATUS 0"), done.stdout + done.stderr
+    assert f"climatenerf {verb}" in done.stdout
