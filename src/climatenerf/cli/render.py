@@ -45,7 +45,7 @@ class Render:
     fps: float = 24.0
     """Frames per second of the movie."""
     size: str | None = None
-    """Size of the frames, such as 480x270. Default: the photos' own, at most 960 wide."""
+    """Size of the frames, such as 480x270. Default: the photos' own."""
     supersample: int = 1
     """Rays per pixel along each side."""
     layers: tuple[Literal["all", *LAYER_NAMES], ...] = ()  # type: ignore[valid-type]

@@ -177,7 +177,7 @@ def march(
     """Marches rays front to back through occupied space, evaluating density on the way.
 
     Args: rays [n,3] in grid units, t_min, t_max, jitter [n]; occupied [K,G,G,G] uint8, cascade k
-    covers the cube of half side 2^k; steps = (smallest step, step per length, near scale);
+    covers the cube of half side 2^k; steps = (smallest step, step per length);
     stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
     out_* [n, capacity]. Returns counts [n], the samples written per ray.
     """

@@ -78,9 +78,9 @@ class Fitting:
         named = dict(self.field.named_parameters())
         # Appearance learns slowly: a vector per image is enough to paint every photo onto haze.
         groups = [
-            {"params": _of(named, "geometry_net", "colour_net", "view_net"), "share": 1.0},
-            {"params": _of(named, "sky_net"), "share": SKY_SHARE},
-            {"params": _of(named, "embeddings"), "share": EMBEDDING_SHARE},
+            {"params": _of(named, "geometry_net", "colour_net", "view_net"), "shares": (1.0, 1.0)},
+            {"params": _of(named, "sky_net"), "shares": SKY_SHARES},
+            {"params": _of(named, "embeddings"), "shares": (EMBEDDING_SHARE, EMBEDDING_SHARE)},
         ]
         self.net_adam = torch.optim.Adam(groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -178,7 +178,7 @@ class Fitting:
         loss.backward()
         decay = settings.final_rate**self.progress * min(1.0, (self.steps + 1) / 50)
         for group in self.net_adam.param_groups:
-            group["lr"] = settings.net_rate * decay * group["share"]
+            group["lr"] = settings.net_rate * decay * group["shares"][self.progress > REFINE_AT]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * decay)
         return error.item(), samples.t.shape[0]
@@ -260,8 +260,9 @@ def scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
     return value * factor + (value * (1 - factor)).detach()
 
 
-# The sky learns slowly too: it may not paint the view before there is matter.
-SKY_SHARE = 0.03
+# The sky's share before and after surfaces are found: it may not paint the view before there is
+# matter.
+SKY_SHARES = (0.03, 0.3)
 EMBEDDING_SHARE = 0.05  # learning rate of appearance vectors over that of the networks
 CROWDED = 3.0  # rays of one camera crowd within this many times the nearest distance
 CHOSEN = 32  # samples of a ray that get colour and gradients, about

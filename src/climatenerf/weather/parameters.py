@@ -108,7 +108,7 @@ class Snow:
 
 @dataclass(frozen=True)
 class Sun:
-    """Where the sun stands. none: it is estimated from the scene, or overhead."""
+    """Where the sun stands. none: no shadows, light from above."""
 
     elevation: OptionalAngle = None
     """Height above the horizon, -90 to 90 deg."""
