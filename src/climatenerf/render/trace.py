@@ -15,6 +15,7 @@ from torch import Tensor
 
 from climatenerf.ops import dispatch
 from climatenerf.render.samples import Samples
+from climatenerf.render.view import RENDER_STEP
 from climatenerf.render.world import SKY_OPACITY, TINY, Seen, Water, World
 from climatenerf.weather import flood as water_physics
 from climatenerf.weather import smog, waves
@@ -22,6 +23,8 @@ from climatenerf.weather import smog, waves
 LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
 LEAST_SHARE = 1.0 / 2048  # of a pixel that water must have to be traced: below an 8-bit step
 RAYS_AT_ONCE = 16384  # bounds memory
+BOUNCES = 2  # meetings with the water, then the plain field
+SECONDARY_STEP = 5.0  # marching step of secondary rays; RENDER_STEP is that of camera rays
 SKIN = 2e-3  # secondary rays begin this far from the water, m
 
 
@@ -55,7 +58,7 @@ def trace(
                 pixel_angle[some],
                 None if roll is None else roll[some],
                 torch.full_like(pixel_angle[some], world.near),
-                bounces=2,
+                bounces=BOUNCES,
                 normals=normals,
             )
         )
@@ -77,7 +80,9 @@ def _trace(
     """See `trace`; at most `bounces` more meetings with the water, then the plain field."""
     n = rays_o.shape[0]
     water = world.water if bounces > 0 else None
-    samples, is_matter = _all_samples(world, rays_o, rays_d, t_min)
+    # Reflections are blurred by the waves: coarser steps do for them.
+    step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
+    samples, is_matter = _all_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
 
@@ -170,11 +175,11 @@ def _trace(
 
 
 def _all_samples(
-    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor
+    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
 ) -> tuple[Samples, Bool[Tensor, "s"]]:
     """Samples of field and matter, merged, and which of them are matter's."""
     endless = torch.full_like(t_min, 1e9)
-    field = world.field.march(rays_o, rays_d, t_min, endless)
+    field = world.field.march(rays_o, rays_d, t_min, endless, step_scale)
     if world.matter is None:
         return field, torch.zeros(field.t.shape[0], dtype=torch.bool)
     own = world.matter.march(rays_o, rays_d, t_min, endless)
@@ -341,13 +346,14 @@ def _other_side(
     behind, through = torch.zeros(n, 3), torch.zeros(n, 3)
     direction, total = water_physics.refract(rays_d, normal, water.flood.ior, below)
     beta = torch.tensor(water_physics.attenuation(water.flood))
-    # Under the straight ray's depth of opaque water no bed shows: no ray is spent on it. Half that
-    # depth is assumed, for a bed that rises.
-    shows = torch.exp(-beta.min() * depth) > LEAST_SHARE
+    # Under the straight ray's depth of opaque water no bed shows: no ray is spent on it. Light
+    # comes down through the depth and goes up through at least as much.
+    shows = torch.exp(-2 * beta.min() * depth) > LEAST_SHARE
     down = (~below & shows & (direction[:, 2] < 0)).nonzero()[:, 0]
     if down.numel():
         o, d = start[down], direction[down]
-        samples = world.field.march(o, d, torch.zeros(down.shape[0]), torch.full_like(o[:, 0], 1e9))
+        zero, far = torch.zeros(down.shape[0]), torch.full_like(o[:, 0], 1e9)
+        samples = world.field.march(o, d, zero, far, SECONDARY_STEP)
         weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
         ray = samples.ray_index()
         keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]

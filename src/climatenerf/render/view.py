@@ -11,6 +11,9 @@ from climatenerf.ops import dispatch
 from climatenerf.scene.cameras import Camera
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
+# Of the finest step. Measured on the street after 3 minutes: steps of 1, 1.5, 2 and 3 give 24.86,
+# 24.84, 24.79 and 24.66 dB at half size, and 2 takes 0.6 of the time of 1.
+RENDER_STEP = 2.0
 LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
 
 
@@ -33,7 +36,8 @@ def field_radiance(
     for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
         o, d = rays_o[start : start + RAYS_AT_ONCE], rays_d[start : start + RAYS_AT_ONCE]
         n = o.shape[0]
-        samples = field.march(o, d, torch.full((n,), field.near), torch.full((n,), 1e9))
+        near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
+        samples = field.march(o, d, near, far, RENDER_STEP)
         weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
         keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
         ray = samples.ray_index()[keep]

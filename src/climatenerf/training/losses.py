@@ -1,7 +1,7 @@
 """Losses of the paper (supplement, "Training Details"), each a pure function.
 
-Their weights are in `fit.FitSettings`: the paper's, but for the distortion's (docs/decisions.md). Its
-print "3^{-4}" is a mis-set 3e-4.
+Their weights are in `fit.FitSettings`: the paper's, but for the distortion's (docs/decisions.md).
+The paper's print "3^{-4}" is a mis-set 3e-4.
 """
 
 import torch
