@@ -65,7 +65,8 @@ def run(options: Demo) -> int:
         stage = prepare_stage(field, scene, KeyframedWeather(weather, {}), path, fps)
         movies.append(render_movie(stage, path, fps, options.out / name, title=name))
         rows.append((name, _frames(options.out / name / "frames")))
-    write_jpeg(options.out / "contact-sheet.jpg", contact_sheet(rows, SHEET_COLUMNS))
+    sheet = contact_sheet(rows, SHEET_COLUMNS)
+    write_jpeg(options.out / "contact-sheet.jpg", sheet, max_bytes=150_000)
     progress.result(summary(metrics))
     for movie in movies:
         progress.result(f"movie: {movie}")
