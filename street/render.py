@@ -2,7 +2,7 @@
 
 Samples come in passes over all views; a view's linear mean so far is one file in the store, so
 an interrupted run continues where it stopped, and every pass leaves a usable set in OUT/images.
-`--passes 0` writes only scene.json and points.ply.
+`--passes 0` writes only labels, scene.json and points.ply.
 """
 
 import argparse
@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL import Image
 
 from street.geometry import Mesh
@@ -23,6 +23,7 @@ from street.textures import make
 
 EXPOSURE = 0.85  # one gain for all views: most pixels then lie in [0, 1]
 JPEG_QUALITY = 92
+SKY, UNKNOWN = 10, 255  # Cityscapes train ids
 HOLDOUT_EVERY = 8  # the first, ninth, ... view by name is held out
 
 
@@ -103,9 +104,15 @@ def load(meshes: list[Mesh], folder: Path, threads: int = 1):
 
 
 def render_view(
-    scene, pose: Float[np.ndarray, "4 4"], width: int, height: int, spp: int, seed: int
+    scene,
+    pose: Float[np.ndarray, "4 4"],
+    width: int,
+    height: int,
+    spp: int,
+    seed: int,
+    integrator=None,
 ):
-    """Linear radiance of one view before exposure, [height, width, 3]."""
+    """Linear radiance of one view before exposure and coverage by matter, [height, width, 4]."""
     import mitsuba as mi
 
     # Mitsuba's camera looks along +z with +x to the left and +y up.
@@ -123,13 +130,25 @@ def render_view(
                 "type": "hdrfilm",
                 "width": width,
                 "height": height,
-                "pixel_format": "rgb",
+                "pixel_format": "rgba",
                 "component_format": "float32",
                 "rfilter": {"type": "box"},
             },
         }
     )
-    return np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed))
+    return np.array(mi.render(scene, integrator=integrator, sensor=sensor, spp=spp, seed=seed))
+
+
+def write_labels(scene, folder: Path, width: int, height: int, spp: int = 16) -> None:
+    """Label maps in Cityscapes train ids: sky where nothing covers a pixel, else unknown."""
+    import mitsuba as mi
+
+    folder.mkdir(parents=True, exist_ok=True)
+    first_hit = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
+    for name, pose in camera_poses():
+        covered = render_view(scene, pose, width, height, spp, 0, first_hit)[..., 3]
+        label = np.where(covered == 0, SKY, UNKNOWN).astype(np.uint8)
+        Image.fromarray(label).save((folder / name).with_suffix(".png"), optimize=True)
 
 
 def _save_jpeg(picture: np.ndarray, path: Path) -> None:
@@ -140,14 +159,14 @@ def _save_jpeg(picture: np.ndarray, path: Path) -> None:
 
 def sparse_points(
     scene, width: int, height: int, per_view: int = 48, farthest: float = 120.0
-) -> Float[np.ndarray, "n 3"]:
-    """Surface points seen by the views, as structure from motion would give them; metres."""
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Surface points as structure from motion would give them, metres, and the view of each."""
     import mitsuba as mi
 
     rng = np.random.default_rng(1)
     focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
-    points = []
-    for _, pose in camera_poses():
+    points, seen_by = [], []
+    for i, (_, pose) in enumerate(camera_poses()):
         pixel = rng.uniform(size=(per_view, 2)) * [width, height]
         local = np.c_[(pixel - 0.5 * np.array([width, height])) / focal, np.ones(per_view)]
         rays = local @ pose[:3, :3].T
@@ -156,11 +175,16 @@ def sparse_points(
             hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(*pose[:3, 3]), mi.Vector3f(*ray)))
             if hit.is_valid() and hit.t < farthest:
                 points.append(pose[:3, 3] + float(hit.t) * ray)
-    return np.array(points)
+                seen_by.append(i)
+    return np.array(points), np.array(seen_by)
 
 
 def write_scene(
-    out: Path, width: int, height: int, points: Float[np.ndarray, "n 3"] | None
+    out: Path,
+    width: int,
+    height: int,
+    points: Float[np.ndarray, "n 3"],
+    seen_by: Int[np.ndarray, "n"],
 ) -> None:
     """Write scene.json (and points.ply) beside the pictures with climatenerf's own writer."""
     from climatenerf.scene import Camera, Scene, View, save_scene
@@ -171,7 +195,13 @@ def write_scene(
     root = out.resolve()
     views = tuple(
         View(
-            name, root / "images" / name, 0, pose, "heldout" if i % HOLDOUT_EVERY == 0 else "train"
+            name,
+            root / "images" / name,
+            0,
+            pose,
+            "heldout" if i % HOLDOUT_EVERY == 0 else "train",
+            label_path=root / "labels" / Path(name).with_suffix(".png"),
+            seen=np.flatnonzero(seen_by == i),
         )
         for i, (name, pose) in enumerate(camera_poses())
     )
@@ -227,13 +257,15 @@ def main() -> None:
                     continue
                 start = time.monotonic()
                 seed = 1000 * number + i
-                mean = _accumulate(store, render_view(scene, pose, width, height, args.spp, seed))
+                fresh = render_view(scene, pose, width, height, args.spp, seed)[..., :3]
+                mean = _accumulate(store, fresh)
                 _save_jpeg(encode(EXPOSURE * mean), images / name)
                 over = float((EXPOSURE * mean > 1).any(-1).mean())
                 took = time.monotonic() - start
                 print(f"pass {number} {name} {took:.1f} s, {over:.1%} over 1", flush=True)
         if all((images / name).exists() for name, _ in every):
-            write_scene(args.out, width, height, sparse_points(scene, width, height))
+            write_labels(scene, args.out / "labels", width, height)
+            write_scene(args.out, width, height, *sparse_points(scene, width, height))
 
 
 if __name__ == "__main__":

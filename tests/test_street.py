@@ -13,6 +13,7 @@ ASSETS = ROOT / "src" / "climatenerf" / "assets" / "street"
 sys.path.insert(0, str(ROOT))
 
 from climatenerf.scene import load_image, read_scene  # noqa: E402
+from climatenerf.scene.images import load_labels  # noqa: E402
 from street.geometry import LABELS  # noqa: E402
 from street.layout import (  # noqa: E402
     EYE,
@@ -170,9 +171,26 @@ def test_embedded_scene_reads(scene):
 def test_embedded_scene_is_small_and_clean():
     files = [f for f in ASSETS.rglob("*") if f.is_file()]
     assert sum(f.stat().st_size for f in files) <= 4_000_000
-    assert {f.suffix for f in files} <= {".jpg", ".json", ".ply"}
+    assert {f.suffix for f in files} <= {".jpg", ".json", ".npz", ".ply", ".png"}
     text = (ASSETS / "scene.json").read_text(encoding="utf-8")
     assert str(ROOT) not in text and '"/' not in text  # no path of the machine it was made on
+
+
+def test_labels_tell_sky_from_all_else(scene):
+    shares = []
+    for view in scene.views:
+        label = load_labels(view, scene, 1)
+        camera = scene.cameras[view.camera]
+        assert label is not None and label.shape == (camera.height, camera.width), view.name
+        assert set(np.unique(label)) <= {10, 255}, view.name
+        sky = label == 10
+        shares.append(sky.mean())
+        down = (camera.directions() @ scene.c2w_world(view)[:3, :3].T)[..., 2] < 0
+        assert not (sky & down).any(), view.name  # the valley's hills hide the horizon
+        photo = load_image(view, scene).astype(float)
+        if sky.sum() > 200:
+            assert photo[sky][:, 2].mean() > 180, view.name
+    assert 0.05 < np.mean(shares) < 0.5
 
 
 def test_sparse_points_lie_on_surfaces(scene):

@@ -94,7 +94,7 @@ def write_colmap(model: Path, poses, names, cameras=(PINHOLE,), points=(), binar
     for i, (key, q, t, camera, name) in enumerate(rows):
         numbers_text = " ".join(repr(float(v)) for v in (*q, *t))
         # Every other picture without features: its second line is empty.
-        text += f"{key} {numbers_text} {camera} {name}\n{'' if i % 2 else '1.0 2.0 -1'}\n"
+        text += f"{key} {numbers_text} {camera} {name}\n{'' if i % 2 else '1.0 2.0 3 4.0 5.0 -1'}\n"
     (model / "images.txt").write_text(text)
     text = "# Points\n"
     for i, p in enumerate(points):

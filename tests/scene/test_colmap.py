@@ -28,6 +28,24 @@ def test_poses_intrinsics_and_points(tmp_path, binary, sub):
     np.testing.assert_allclose(capture.points, POINTS)
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_pictures_know_the_points_that_they_show(tmp_path, binary):
+    """Their features name point 3, and one feature none; ids are not rows."""
+    points = [(float(i), 0.0, 0.0) for i in range(6)]
+    model = tmp_path / "sparse/0"
+    write_colmap(model, ring(4), names_of(4), points=points, binary=binary)
+    write_images(tmp_path / "images", names_of(4))
+    views = read_colmap(tmp_path).views
+    assert [list(v.seen) for v in views] == ([[3]] * 4 if binary else [[3], [], [3], []])
+    write_colmap(model, ring(4), names_of(4), points=points[:3], binary=binary)
+    assert not any(len(v.seen) for v in read_colmap(tmp_path).views), "point 3 is not there"
+    if not binary:
+        lines = (model / "points3D.txt").read_text().splitlines()
+        (model / "points3D.txt").write_text("\n".join([f"3 7 8 9 {lines[1][2:]}", *lines[2:]]))
+        capture = read_colmap(tmp_path)
+        assert [list(capture.points[v.seen]) for v in capture.views[:1]][0][0].tolist() == [7, 8, 9]
+
+
 def test_centre_is_minus_rt_t_and_w_comes_first(tmp_path):
     # 90 degrees about z: q = (cos 45, 0, 0, sin 45); R x = y. Centre = -R^T t.
     write_images(tmp_path / "images", names_of(3))

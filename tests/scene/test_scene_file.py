@@ -39,6 +39,25 @@ def test_round_trip(scene, tmp_path):
     assert again.up_report == scene.up_report and again.warnings == scene.warnings
 
 
+def test_the_points_that_each_view_shows_are_kept(scene, tmp_path):
+    rng = np.random.default_rng(0)
+    seen = [np.sort(rng.choice(50, size=i, replace=False)) for i in range(9)]
+    views = tuple(replace(v, seen=s) for v, s in zip(scene.views, seen, strict=True))
+    save_scene(replace(scene, views=views), tmp_path / "run")
+    for view, expected in zip(load_scene(tmp_path / "run").views, seen, strict=True):
+        np.testing.assert_array_equal(view.seen, expected)
+    file = tmp_path / "run/points_seen.npz"
+    np.savez(file, view=[0], point=[50])
+    with pytest.raises(UserError, match="delete it"):
+        load_scene(tmp_path / "run")
+    file.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(UserError, match="delete it"):
+        load_scene(tmp_path / "run")
+    unknown = tuple(replace(v, seen=None) for v in scene.views)
+    save_scene(replace(scene, views=unknown), tmp_path / "run")
+    assert not file.exists() and load_scene(tmp_path / "run").views[0].seen is None
+
+
 def test_paths_are_relative(scene, tmp_path):
     save_scene(scene, tmp_path / "run")
     data = json.loads((tmp_path / "run/scene.json").read_text())
@@ -122,7 +141,11 @@ def test_full_disk_harms_nothing(scene, tmp_path, monkeypatch):
     with pytest.raises(UserError, match="No space left"):
         save_scene(replace(scene, ground_z=5.0), tmp_path / "run")
     assert path.read_bytes() == before
-    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == ["points.ply", "scene.json"]
+    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == [
+        "points.ply",
+        "points_seen.npz",
+        "scene.json",
+    ]
 
 
 def test_folder_that_cannot_be_made(scene, tmp_path):

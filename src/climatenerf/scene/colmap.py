@@ -6,12 +6,14 @@ with w first, x right, y down, z forward, top-left pixel centre at (0.5, 0.5).
 
 from __future__ import annotations
 
+import itertools
 import struct
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
@@ -40,7 +42,17 @@ _ONE_FOCAL = (
     "RADIAL_FISHEYE",
 )
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "rgb", ".")
-_Poses = list[tuple[str, int, Float[np.ndarray, "4 4"]]]
+_FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
+
+
+class _Image(NamedTuple):
+    """An entry of the images file."""
+
+    name: str
+    camera: int
+    c2w: Float[np.ndarray, "4 4"]
+    points: Int[np.ndarray, " k"]
+    """Ids of the points of its features, -1 where a feature has none."""
 
 
 def model_folders(root: Path) -> list[Path]:
@@ -78,24 +90,31 @@ def read_colmap(root: Path) -> Capture:
             f"{model.name} is used, the others are left out."
         )
     by_id = _read_cameras(model)
-    missing = {c for _, c, _ in chosen} - set(by_id)
+    missing = {image.camera for image in chosen} - set(by_id)
     if missing:
         raise UserError(
             f"{model} has a picture with camera {min(missing)}, which its cameras file lacks; "
             "export the model again."
         )
-    ids = sorted({c for _, c, _ in chosen})
-    image_root, folder = _image_folder(root, [name for name, _, _ in chosen])
+    ids = sorted({image.camera for image in chosen})
+    image_root, folder = _image_folder(root, [image.name for image in chosen])
+    point_ids, points = _read_points3d(model)
     views = tuple(
-        View(name=name, path=folder / name, camera=ids.index(camera), c2w=c2w)
-        for name, camera, c2w in chosen
+        View(
+            name=image.name,
+            path=folder / image.name,
+            camera=ids.index(image.camera),
+            c2w=image.c2w,
+            seen=_rows(image.points, point_ids),
+        )
+        for image in chosen
     )
     return Capture(
         root=image_root,
         source="colmap",
         cameras=tuple(by_id[i] for i in ids),
         views=views,
-        points=_read_points3d(model),
+        points=points if len(points) else None,
         warnings=tuple(warnings),
     )
 
@@ -249,43 +268,57 @@ def _read_cameras(model: Path) -> dict[int, Camera]:
     return out
 
 
-def _read_images(model: Path) -> _Poses:
+def _read_images(model: Path) -> list[_Image]:
     path = model / f"images{_suffix(model)}"
     if path.suffix == ".txt":
         return _images_text(path)
     cursor = _Cursor(path)
-    out: _Poses = []
+    out = []
     for _ in range(cursor.take("Q")[0]):
         values = cursor.take("I7dI")
         name = cursor.name()
-        cursor.skip(24 * cursor.take("Q")[0])
+        count, start = cursor.take("Q")[0], cursor.at
+        cursor.skip(24 * count)
+        observed = np.frombuffer(cursor.data, _FEATURE, count, start)["point"]
         pose = _pose(list(values[1:5]), list(values[5:8]), name, str(path))
-        out.append((name, values[8], pose))
+        out.append(_Image(name, values[8], pose, observed.astype(np.int64)))
     return out
 
 
-def _read_points3d(model: Path) -> Float[np.ndarray, "n 3"] | None:
+def _rows(observed: Int[np.ndarray, " k"], ids: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
+    """Rows of the points with the observed ids; features without a point have id -1."""
+    if not len(ids):
+        return np.empty(0, np.int64)
+    order = np.argsort(ids)
+    place = np.searchsorted(ids, observed, sorter=order).clip(max=len(ids) - 1)
+    row = order[place]
+    return np.unique(row[ids[row] == observed])
+
+
+def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Ids and positions of the points."""
     path = model / f"points3D{_suffix(model)}"
     if not path.is_file():
-        return None
+        return np.empty(0, np.int64), np.empty((0, 3))
     if path.suffix == ".txt":
-        rows = [line.split()[1:4] for line in _lines(path) if line]
+        rows = [line.split()[:4] for line in _lines(path) if line]
         try:
-            points = np.array([[float(v) for v in r] for r in rows]).reshape(-1, 3)
-        except ValueError:
+            ids = np.array([int(r[0]) for r in rows], np.int64)
+            points = np.array([[float(v) for v in r[1:]] for r in rows]).reshape(-1, 3)
+        except (ValueError, OverflowError):
             raise UserError(f"{path} is damaged; export the COLMAP model again.") from None
     else:
         cursor = _Cursor(path)
         count = cursor.take("Q")[0]
         if count * 51 > len(cursor.data):
             raise cursor.damaged()
-        points = np.empty((count, 3))
+        ids, points = np.empty(count, np.int64), np.empty((count, 3))
         for i in range(count):
-            values = cursor.take("Q3d3BdQ")
-            points[i] = values[1:4]
+            values = cursor.take("q3d3BdQ")
+            ids[i], points[i] = values[0], values[1:4]
             cursor.skip(8 * values[8])
-    points = points[np.isfinite(points).all(axis=1)]
-    return points if len(points) else None
+    finite = np.isfinite(points).all(axis=1)
+    return ids[finite], points[finite]
 
 
 def _lines(path: Path) -> list[str]:
@@ -310,17 +343,21 @@ def _cameras_text(path: Path) -> dict[int, Camera]:
     return out
 
 
-def _images_text(path: Path) -> _Poses:
+def _images_text(path: Path) -> list[_Image]:
     lines = _lines(path)
     while lines and not lines[0]:
         lines.pop(0)
-    out: _Poses = []
-    for line in filter(None, lines[::2]):
+    out = []
+    for line, features in itertools.zip_longest(lines[::2], lines[1::2], fillvalue=""):
+        if not line:
+            continue
         words = line.split(maxsplit=9)
         try:
             numbers = [float(w) for w in words[1:8]]
             camera, name = int(words[8]), words[9]
-        except (ValueError, IndexError):
+            observed = np.array([int(w) for w in features.split()[2::3]], np.int64)
+        except (ValueError, IndexError, OverflowError):
             raise UserError(f"{path} has an unreadable line: {line[:60]!r}.") from None
-        out.append((name, camera, _pose(numbers[:4], numbers[4:], name, str(path))))
+        pose = _pose(numbers[:4], numbers[4:], name, str(path))
+        out.append(_Image(name, camera, pose, observed))
     return out

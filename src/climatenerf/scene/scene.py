@@ -5,20 +5,23 @@ from __future__ import annotations
 import json
 import math
 import os
+import zipfile
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.ply import read_points, write_points
+from climatenerf.storage import atomic_path
 
 SCHEMA_VERSION = 1
 FILE_NAME = "scene.json"
 POINTS_NAME = "points.ply"
+SEEN_NAME = "points_seen.npz"
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class View:
         split: "train", or "heldout" for measuring only.
         label_path: 8-bit picture of Cityscapes train ids (255 unknown), if there is one.
         mask_path: Picture whose black pixels are to be ignored, if there is one.
+        seen: Which of the scene's sparse points the picture shows, if that is known.
     """
 
     name: str
@@ -42,6 +46,7 @@ class View:
     split: Literal["train", "heldout"] = "train"
     label_path: Path | None = None
     mask_path: Path | None = None
+    seen: Int[np.ndarray, " k"] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,7 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         ) from None
     if scene.points is not None:
         write_points(folder / POINTS_NAME, scene.points)
+        _save_seen(scene, folder / SEEN_NAME)
     data = {
         "schema_version": SCHEMA_VERSION,
         "source": scene.source,
@@ -124,6 +130,7 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "cameras": [asdict(c) for c in scene.cameras],
         "views": [_view_to_json(v, scene.root) for v in scene.views],
         "points": None if scene.points is None else POINTS_NAME,
+        "points_seen": SEEN_NAME if (folder / SEEN_NAME).is_file() else None,
         "world_from_input": scene.world_from_input.tolist(),
         "scale_source": scene.scale_source,
         "scale_error": scene.scale_error,
@@ -213,12 +220,15 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
         raise ValueError("a view names a camera that is not listed")
     if any(v.split not in ("train", "heldout") for v in views):
         raise ValueError("a view's split is neither train nor heldout")
+    points = None if data["points"] is None else read_points(folder / data["points"])
+    if points is not None and data.get("points_seen"):
+        views = _with_seen(views, len(points), folder / data["points_seen"])
     return Scene(
         root=root,
         source=_text(data["source"]),
         cameras=cameras,
         views=views,
-        points=None if data["points"] is None else read_points(folder / data["points"]),
+        points=points,
         world_from_input=_matrix(data["world_from_input"]),
         scale_source=_text(data["scale_source"]),
         scale_error=_number(data["scale_error"]),
@@ -227,6 +237,33 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
         up_report=dict(data["up_report"]),
         warnings=tuple(_text(w) for w in data["warnings"]),
     )
+
+
+def _save_seen(scene: Scene, path: Path) -> None:
+    """Pairs of view and point, as two arrays; nothing if no view knows its points."""
+    seen = [v.seen if v.seen is not None else np.empty(0, np.int64) for v in scene.views]
+    if not any(map(len, seen)):
+        path.unlink(missing_ok=True)
+        return
+    view = np.repeat(np.arange(len(seen)), [len(k) for k in seen])
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(
+            file, view=view.astype(np.int32), point=np.concatenate(seen).astype(np.int32)
+        )
+
+
+def _with_seen(views: tuple[View, ...], points: int, path: Path) -> tuple[View, ...]:
+    """The views with the points that each shows, as `_save_seen` wrote them."""
+    try:
+        with np.load(path) as data:
+            view, point = data["view"].astype(np.int64), data["point"].astype(np.int64)
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise UserError(
+            f"{path} cannot be read ({error}); delete it to go on without it."
+        ) from None
+    if view.shape != point.shape or (point < 0).any() or (point >= points).any():
+        raise UserError(f"{path} names points that there are none of; delete it to go on.")
+    return tuple(replace(v, seen=point[view == i]) for i, v in enumerate(views))
 
 
 def _matrix(values: Any) -> Float[np.ndarray, "4 4"]:
