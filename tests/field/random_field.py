@@ -17,6 +17,9 @@ SMALL = FieldSize(
     colour_hidden=16,
     coarsest=4,
     embedding=3,
+    sky_levels=2,
+    sky_log2_rows=9,
+    sky_finest=16,
     sky_hidden=8,
     occupancy_side=16,
     cascades=3,
@@ -29,7 +32,7 @@ def random_field(seed: int = 0, images: int = 5, full: bool = False) -> Field:
     torch.manual_seed(seed)
     field = Field(SMALL, images, np.array([1.0, -2.0, 0.5]), unit=2.5, near=0.1)
     with torch.no_grad():
-        for grid in (field.geometry_grid, field.appearance_grid):
+        for grid in (field.geometry_grid, field.appearance_grid, field.sky_grid):
             grid.copy_(torch.randn(grid.shape, generator=generator) * 0.5)
         field.embeddings.copy_(torch.randn(field.embeddings.shape, generator=generator))
     shape = field.occupancy.occupied.shape

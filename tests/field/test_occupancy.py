@@ -47,7 +47,7 @@ def test_cells_and_their_centres_agree_with_the_field():
 def test_marching_finds_matter_in_exactly_the_cell_that_is_occupied():
     field = random_field()
     with torch.no_grad():
-        field.geometry_net[3].add_(6.0)  # samples thinner than 1e-5 are dropped
+        field.geometry_net[3].add_(6.0)  # samples thinner than 1e-3 are dropped
     occupancy = field.occupancy
     cells = torch.arange(occupancy.density.numel())
     centre, size = occupancy.cell_centres(cells)
@@ -121,3 +121,52 @@ def test_refining_keeps_matter_and_halves_the_cells(density):
         child = occupancy.occupied[:, x::2, y::2, z::2].bool()
         assert torch.equal(child, cells)
         assert torch.equal(occupancy.density[:, x::2, y::2, z::2], densities)
+
+
+def test_neighbours_lie_one_cell_away_at_most_and_in_the_same_cascade():
+    occupancy = Occupancy(cascades=3, side=8)
+    cells = torch.arange(occupancy.density.numel())
+    found = occupancy._neighbours(cells, torch.Generator().manual_seed(0))
+    assert torch.equal(found // 512, cells // 512)
+    (a, size), (b, _) = occupancy.cell_centres(cells), occupancy.cell_centres(found)
+    steps = ((a - b) / size[:, None]).round()
+    assert torch.allclose((a - b) / size[:, None], steps, atol=1e-5)
+    assert steps.abs().max() == 1 and (steps != 0).any(-1).float().mean() > 0.8
+
+
+def test_holes_beside_matter_close_sooner_than_by_looking_anywhere():
+    """A slab with a hole in what is known of it: partial updates find the missing cells."""
+
+    def slab(q):
+        return 500.0 * (q[:, 2].abs() < 0.125)
+
+    whole = updated(density_at=slab)
+    # Half of 2 % of all cells, looked at anywhere 25 times, would find 22 % of them.
+    holed = updated(density_at=slab)
+    cells = torch.arange(whole.density.numel())
+    centre, _ = whole.cell_centres(cells)
+    hole = (centre.norm(dim=-1) < 0.4) & (whole.occupied.view(-1) > 0)
+    holed.density.view(-1)[hole] = 0.0
+    holed.occupied.view(-1)[hole] = 0
+    updated(25, 0.02, slab, holed)
+    closed = holed.occupied.view(-1)[hole].float().mean()
+    assert closed > 0.4, closed
+
+
+def test_density_met_by_rays_is_remembered():
+    field = random_field(full=True)
+    with torch.no_grad():
+        field.geometry_net[3].add_(6.0)
+    field.occupancy.density.zero_()
+    o = field.centre.expand(200, 3).contiguous()
+    d = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    samples = field.march(o, d, torch.zeros(200), torch.full((200,), 1e9))
+    which = samples.t > 1.0
+    field.keep_occupied(o, d, samples, which)
+    ray = samples.ray_index()
+    cells, _ = field._cells(field.to_grid(o[ray] + samples.t[:, None] * d[ray]))
+    known = field.occupancy.density.view(-1)
+    assert (known[cells[which]] >= samples.sigma[which] * field.unit * 0.999).all()
+    untouched = torch.ones(known.shape[0], dtype=torch.bool)
+    untouched[cells[which]] = False
+    assert (known[untouched] == 0).all()

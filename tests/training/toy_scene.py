@@ -22,9 +22,12 @@ TINY = FieldSize(
     colour_hidden=32,
     coarsest=8,
     embedding=2,
+    sky_levels=2,
+    sky_log2_rows=9,
+    sky_finest=16,
     sky_hidden=8,
     occupancy_side=32,
-    cascades=2,
+    cascades=4,
 )
 CAMERA = Camera(48, 36, 40.0, 40.0, 24.0, 18.0)
 FIELD = AnalyticField(
@@ -34,7 +37,7 @@ FIELD = AnalyticField(
         Box((0.6, -0.9, 0.0), (1.4, -0.3, 0.4), (0.05, 0.4, 0.1)),
         Box((-1.2, 0.2, 0.0), (-0.6, 1.4, 0.3), (0.7, 0.6, 0.1)),
     ],
-    box=((-6.0, -6.0, -1.0), (6.0, 6.0, 4.0)),
+    box=((-24.0, -24.0, -1.0), (24.0, 24.0, 4.0)),
 )
 
 

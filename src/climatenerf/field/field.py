@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from climatenerf.field.colour_space import decode_srgb
@@ -50,6 +50,7 @@ class Field(nn.Module):
     centre: Tensor
     geometry_resolutions: Tensor
     appearance_resolutions: Tensor
+    sky_resolutions: Tensor
 
     def __init__(
         self,
@@ -81,6 +82,9 @@ class Field(nn.Module):
             "appearance_resolutions",
             _resolutions(size.coarsest, size.appearance_finest, size.appearance_levels),
         )
+        self.register_buffer(
+            "sky_resolutions", _resolutions(size.coarsest, size.sky_finest, size.sky_levels)
+        )
         self.geometry_grid = nn.Parameter(
             torch.empty(size.geometry_levels, 2**size.geometry_log2_rows, 2).uniform_(-1e-4, 1e-4)
         )
@@ -94,7 +98,12 @@ class Field(nn.Module):
         nn.init.constant_(self.geometry_net[-1], -1.5)
         self.colour_net = _layers(2 * size.appearance_levels, size.colour_hidden, 3)
         self.view_net = _layers(16 + size.embedding, size.colour_hidden)
-        self.sky_net = _layers(16 + size.embedding, size.sky_hidden, size.sky_hidden, 3)
+        nn.init.zeros_(self.view_net[0][:16])  # colours alike from all sides to begin with
+        self.sky_grid = nn.Parameter(
+            torch.empty(size.sky_levels, 2**size.sky_log2_rows, 2).uniform_(-1e-4, 1e-4)
+        )
+        inputs = 16 + 2 * size.sky_levels + size.embedding
+        self.sky_net = _layers(inputs, size.sky_hidden, size.sky_hidden, 3)
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
         # Coarse to begin with; `Occupancy.refine` halves the cells later.
         self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
@@ -228,6 +237,23 @@ class Field(nn.Module):
         return raw.clamp_max(15.0).exp() * shell.square()
 
     @torch.no_grad()
+    def keep_occupied(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        samples: Samples,
+        which: Bool[Tensor, "s"],
+    ) -> None:
+        """Tells the occupancy of density met at some samples: a thin surface fills little of its
+        cells, and looking at random places would miss it again and again."""
+        some = which.nonzero()[:, 0]
+        ray = samples.ray_index()[some]
+        cells, inside = self._cells(self.to_grid(rays_o[ray] + samples.t[some, None] * rays_d[ray]))
+        density = self.occupancy.density.view(-1)
+        met = samples.sigma[some] * self.unit * inside
+        density.scatter_reduce_(0, cells, met, "amax")
+
+    @torch.no_grad()
     def mark_seen(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], least: float = 0.02
     ) -> None:
@@ -285,7 +311,10 @@ class Field(nn.Module):
         self, d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]
     ) -> Float[Tensor, "n 3"]:
         """Linear radiance of the sky in direction d, in the appearance given."""
-        x = torch.cat([spherical_harmonics(d), embedding], dim=-1)
+        # Clouds need finer detail than the harmonics have: what the sky cannot show, floating
+        # matter would. Where no photo looked the grid is blank and the harmonics go on.
+        detail = dispatch.hash_encode(0.5 + 0.499 * d, self.sky_grid, self.sky_resolutions)
+        x = torch.cat([spherical_harmonics(d), detail, embedding], dim=-1)
         return _to_radiance(dispatch.mlp(x, _pairs(self.sky_net)))
 
     @torch.no_grad()

@@ -63,7 +63,8 @@ class Occupancy(torch.nn.Module):
             count = int(total * fraction / 2)
             anywhere = torch.randint(total, (count,), generator=generator)
             drawn = torch.randint(total, (4 * count,), generator=generator)
-            cells = torch.cat([anywhere, drawn[held[drawn] > 0][:count]])
+            known = drawn[held[drawn] > 0][:count]
+            cells = torch.cat([anywhere, known, self._neighbours(known[::2], generator)])
         centre, size = self.cell_centres(cells)
         offset = torch.rand(centre.shape, generator=generator) - 0.5
         seen = density_at(centre + offset * size[:, None])
@@ -74,6 +75,14 @@ class Occupancy(torch.nn.Module):
             some = torch.randint(total, (100_000,), generator=generator)
             threshold = self._thresholds(some)
             held[cells] = (flat[cells] * size > threshold[cells // self.side**3]).to(torch.uint8)
+
+    def _neighbours(self, cells: Int[Tensor, "n"], generator: torch.Generator) -> Int[Tensor, "n"]:
+        """A cell next to each: holes in surfaces lie beside what is known, and close this way."""
+        side = self.side
+        shift = torch.randint(-1, 2, (3, cells.shape[0]), generator=generator)
+        place = [cells // side**2 % side, cells // side % side, cells % side]
+        x, y, z = ((p + s).clamp(0, side - 1) for p, s in zip(place, shift, strict=True))
+        return ((cells // side**3 * side + x) * side + y) * side + z
 
     def _thresholds(self, cells: Int[Tensor, "n"]) -> Float[Tensor, "cascades"]:
         """Optical depth across a cell from which it is occupied, for each cascade.

@@ -19,6 +19,10 @@ class FieldSize:
     coarsest: int = 16
     embedding: int = 8
     """Length of the appearance vector of each training image."""
+    sky_levels: int = 4
+    sky_log2_rows: int = 15
+    sky_finest: int = 128
+    """Cells across the sphere of directions at the finest level, 1 degree each."""
     sky_hidden: int = 32
     occupancy_side: int = 128
     """Cells along an edge of each occupancy cascade."""

@@ -228,7 +228,7 @@ def march(
                 iz = min(max(int((qz + half) / cell), 0), side - 1)
                 if occupied[cascade, ix, iy, iz]:
                     sigma = _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden)
-                    if sigma * dt > np.float32(1e-5):
+                    if sigma * dt > np.float32(1e-3):
                         out_t[r, k] = tm
                         out_dt[r, k] = dt
                         out_sigma[r, k] = sigma

@@ -163,7 +163,7 @@ def march(
         index = ((q + half) / cell).long().clamp(0, side - 1)
         if occupied[cascade, index[0], index[1], index[2]]:
             sigma = density_at(q[None])[0].item()
-            if sigma * dt > 1e-5:
+            if sigma * dt > 1e-3:
                 samples.append((middle, dt, sigma))
                 tau += sigma * dt
             t += dt

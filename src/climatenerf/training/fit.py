@@ -23,6 +23,7 @@ from climatenerf.render.view import LEAST_WEIGHT
 from climatenerf.training import losses
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.pixels import Batch, TrainingPixels
+from climatenerf.training.points import PointRays
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,11 @@ class FitSettings:
     """Both rates end at this share of their start."""
     distortion_weight: float = 1e-2
     opacity_weight: float = 2e-4
+    solid_weight: float = 0.1
+    """Of light left on rays that point below the horizon, where no sky is."""
     sky_weight: float = 1e-1
+    depth_weight: float = 1e-1
+    """Of the distance of matter from sparse points, where photos are known to show them."""
     seed: int = 0
 
 
@@ -66,21 +71,33 @@ class Report:
 class Fitting:
     """The state of a fit: field, optimisers, counters; `step` advances it."""
 
-    def __init__(self, pixels: TrainingPixels, images: int, extent: Extent, settings: FitSettings):
+    def __init__(
+        self,
+        pixels: TrainingPixels,
+        images: int,
+        extent: Extent,
+        settings: FitSettings,
+        points: PointRays | None = None,
+    ):
         """Begins with an untrained field."""
         torch.manual_seed(settings.seed)
+        self.points = points
         self.pixels = pixels
         self.extent = extent
         self.settings = settings
         size = PRESETS[settings.preset]
         self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near)
-        self.grid_adam = GridAdam([self.field.geometry_grid, self.field.appearance_grid])
+        labelled = pixels.sky is not None
+        self.field.sky_grid.requires_grad_(labelled)
+        grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
+        self.grid_adam = GridAdam(grids)
         named = dict(self.field.named_parameters())
         # Appearance learns slowly: a vector per image is enough to paint every photo onto haze.
         groups = [
-            {"params": _of(named, "geometry_net", "colour_net", "view_net"), "shares": (1.0, 1.0)},
-            {"params": _of(named, "sky_net"), "shares": SKY_SHARES},
-            {"params": _of(named, "embeddings"), "shares": (EMBEDDING_SHARE, EMBEDDING_SHARE)},
+            {"params": _of(named, "geometry_net", "colour_net"), "shares": (1.0, 1.0)},
+            {"params": _of(named, "view_net"), "shares": VIEW_SHARES},
+            {"params": _of(named, "sky_net"), "shares": (1.0, 1.0) if labelled else SKY_SHARES},
+            {"params": _of(named, "embeddings"), "shares": EMBEDDING_SHARES},
         ]
         self.net_adam = torch.optim.Adam(groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -132,7 +149,7 @@ class Fitting:
     def compile_kernels(self) -> None:
         """Runs every kernel once on a few rays, so that compiling is not taken for fitting."""
         images = self.field.embeddings.shape[0]
-        twin = Fitting(self.pixels, images, self.extent, self.settings)
+        twin = Fitting(self.pixels, images, self.extent, self.settings, self.points)
         twin.step(twin.pixels.draw(16, twin.generator))
         twin.field.grid_density(torch.zeros(16, 3))
 
@@ -143,7 +160,7 @@ class Fitting:
         samples = field.march(
             batch.rays_o,
             batch.rays_d,
-            torch.full((n,), field.near),
+            torch.full((n,), self.near()),
             torch.full((n,), 1e9),
             self.step_scale,
             torch.rand(n, generator=self.generator),
@@ -152,7 +169,10 @@ class Fitting:
         # Lengths from here on in grid units.
         t, dt = samples.t / field.unit, samples.dt / field.unit
         tau = samples.sigma * samples.dt
-        kept, chance = self.choose(tau, samples)
+        before, _ = dispatch.render_weights(tau, samples.offsets)
+        if self.progress > KEEP_AT:
+            field.keep_occupied(batch.rays_o, batch.rays_d, samples, before > SEEN_WEIGHT)
+        kept, chance = self.choose(before)
         u = field.sample_positions(batch.rays_o, batch.rays_d, samples)[kept]
         # Near a camera many rays crowd into little space that few other cameras see, and haze there
         # is learned first. Gradients scaled with the distance squared, as the rays' spread, undo
@@ -171,8 +191,18 @@ class Fitting:
             )
         if settings.opacity_weight:
             loss = loss + settings.opacity_weight * losses.opacity_loss(left)
+        if settings.solid_weight:
+            below = (batch.rays_d[:, 2] < HORIZON) & (batch.is_sky == 0)
+            grown = min(1.0, max(0.0, self.progress / REFINE_AT - 0.5))
+            loss = loss + grown * settings.solid_weight * losses.solid_loss(left, below)
         if settings.sky_weight and self.pixels.sky is not None:
             loss = loss + settings.sky_weight * losses.sky_loss(left, batch.is_sky)
+
+        used = samples.t.shape[0]
+        if settings.depth_weight and self.points is not None:
+            measured = self.points.draw(max(n // POINT_SHARE, 16), self.generator)
+            loss_of_depth, more = self.depth_loss(measured)
+            loss, used = loss + settings.depth_weight * loss_of_depth, used + more
 
         self.net_adam.zero_grad()
         loss.backward()
@@ -181,9 +211,34 @@ class Fitting:
             group["lr"] = settings.net_rate * decay * group["shares"][self.progress > REFINE_AT]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * decay)
-        return error.item(), samples.t.shape[0]
+        return error.item(), used
 
-    def choose(self, tau: Tensor, samples: Samples) -> tuple[Tensor, Tensor]:
+    def depth_loss(self, measured: PointRays) -> tuple[Tensor, int]:
+        """How far matter is from the sparse points on their rays; and the samples used."""
+        field, n = self.field, measured.depth.shape[0]
+        samples = field.march(
+            measured.rays_o,
+            measured.rays_d,
+            torch.full((n,), field.near),
+            2 * measured.depth,  # what is far behind the point shows nowhere
+            self.step_scale,
+            torch.rand(n, generator=self.generator),
+            stop=1e-4,
+        )
+        u = field.sample_positions(measured.rays_o, measured.rays_d, samples)
+        tau = field.density_with_gradient(u) * (samples.dt / field.unit)
+        weights, left = dispatch.render_weights(tau, samples.offsets)
+        loss = losses.depth_loss(
+            weights, left, samples.t / field.unit, measured.depth / field.unit, samples.ray_index()
+        )
+        return loss, samples.t.shape[0]
+
+    def near(self) -> float:
+        """Ray length (m) from which matter is believed at present."""
+        first = FIRST_NEAR * self.field.unit
+        return max(self.field.near, first * (1 - self.progress / REFINE_AT))
+
+    def choose(self, weights: Float[Tensor, "s"]) -> tuple[Tensor, Tensor]:
         """The samples that get colour and gradients, and the chance that each had.
 
         Early on rays cross haze, with hundreds of samples that hardly weigh: about `CHOSEN` a ray
@@ -191,10 +246,10 @@ class Fitting:
         are found all that weigh are taken. The estimate's noise is larger the more a ray's colours
         differ, which favours surfaces over haze.
         """
-        weights, _ = dispatch.render_weights(tau, samples.offsets)
         chance = (CHOSEN * weights).clamp(LEAST_CHANCE, 1.0)
-        draw = torch.rand(chance.shape[0], generator=self.generator)
-        kept = (draw < chance).nonzero()[:, 0]
+        # Systematic sampling: drawn ones are spread evenly among those like them.
+        passed = chance.double().cumsum(0) + torch.rand(1, generator=self.generator).double()
+        kept = (passed.floor() > (passed - chance).floor()).nonzero()[:, 0]
         return kept, chance[kept]
 
     def radiance(
@@ -223,7 +278,11 @@ class Fitting:
         # less noisy.
         drawn = torch.zeros(n).index_add(0, ray, share[seen].detach())
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
-        return own + left[:, None] * self.field.sky_colour(batch.rays_d, appearance)
+        sky = self.field.sky_colour(batch.rays_d, appearance)
+        if self.pixels.sky is not None:
+            # It learns from its own pixels alone; then it may learn fast, and in detail.
+            sky = scale_gradient(sky, batch.is_sky[:, None])
+        return own + left[:, None] * sky
 
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
@@ -260,13 +319,25 @@ def scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
     return value * factor + (value * (1 - factor)).detach()
 
 
-# The sky's share before and after surfaces are found: it may not paint the view before there is
-# matter.
+# The sky's share before and after surfaces are found, where no labels tell it from matter: it may
+# not paint the view before there is matter.
 SKY_SHARES = (0.03, 0.3)
-EMBEDDING_SHARE = 0.05  # learning rate of appearance vectors over that of the networks
+# The same of the view's: as long as colours depend on place alone, matter before one camera cannot
+# show that camera its photo.
+VIEW_SHARES = (0.0, 1.0)
+# Of appearance vectors. They begin with the view's: alone they would take up what the direction
+# explains better, and frames in their mean would be off in colour.
+EMBEDDING_SHARES = (0.0, 0.02)
+# Matter nearer than this to a camera (grid units) is not believed at first: what stands near is
+# seen from elsewhere too, and a wall before each camera would satisfy every photo.
+FIRST_NEAR = 0.6
+HORIZON = -0.05  # rays that sink more than this end on matter
 CROWDED = 3.0  # rays of one camera crowd within this many times the nearest distance
 CHOSEN = 32  # samples of a ray that get colour and gradients, about
-LEAST_CHANCE = 0.1  # of any sample, so that empty space can fill
+SEEN_WEIGHT = 0.05  # samples that weigh more show that their cell is occupied
+KEEP_AT = 0.5  # progress from which this is so: before, haze is to be pruned
+LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
+POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
 FINE_AT = 0.8  # progress from which steps are as fine as when rendering

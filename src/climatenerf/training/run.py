@@ -31,6 +31,7 @@ from climatenerf.storage import (
 )
 from climatenerf.training.fit import FitSettings, Fitting, Report
 from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.points import find_point_rays
 
 SCHEMA_VERSION = 1
 OPTIMISER = "optimiser.safetensors"
@@ -86,7 +87,8 @@ def fit_scene(
     pixels = load_pixels(scene, downscale)
     views = scene.of_split("train")
     poses = np.stack([scene.c2w_world(view) for view in views])
-    fitting = Fitting(pixels, len(views), find_extent(poses, scene.points_world()), settings)
+    extent = find_extent(poses, scene.points_world())
+    fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(scene))
     if resume:
         check_same_photos(scene, run)
         restore(fitting, run)

@@ -1,0 +1,46 @@
+"""Sparse points as measured depth: rays from photos to the points that they are known to show."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from climatenerf.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class PointRays:
+    """Rays that end on a sparse point."""
+
+    rays_o: Float[Tensor, "m 3"]
+    """Camera centres, world m."""
+    rays_d: Float[Tensor, "m 3"]
+    """Unit directions."""
+    depth: Float[Tensor, "m"]
+    """Ray length of the point, m."""
+
+    def draw(self, n: int, generator: torch.Generator) -> "PointRays":
+        """n random ones of them."""
+        chosen = torch.randint(self.depth.shape[0], (n,), generator=generator)
+        return PointRays(self.rays_o[chosen], self.rays_d[chosen], self.depth[chosen])
+
+
+def find_point_rays(scene: Scene) -> PointRays | None:
+    """One ray for each point that each training view shows, or None if that is not known."""
+    points = scene.points_world()
+    eyes, ends = [np.empty((0, 3))], [np.empty((0, 3))]
+    for view in scene.of_split("train"):
+        if points is not None and view.seen is not None:
+            ends.append(points[view.seen])
+            eyes.append(np.broadcast_to(scene.c2w_world(view)[:3, 3], ends[-1].shape))
+    eye, end = np.concatenate(eyes), np.concatenate(ends)
+    depth = np.linalg.norm(end - eye, axis=-1)
+    kept = depth > 1e-6 * depth.max(initial=0.0)  # a point in the camera has no direction
+    if not kept.any():
+        return None
+    rays_d = (end - eye)[kept] / depth[kept, None]
+    return PointRays(
+        *(torch.from_numpy(v.astype(np.float32)) for v in (eye[kept], rays_d, depth[kept]))
+    )
