@@ -2,48 +2,68 @@
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.field.colour_space import luma
 from climatenerf.render.trace import trace
+from climatenerf.render.view import camera_rays
 from climatenerf.render.world import FieldLike, World
+from climatenerf.scene.scene import Scene, View
 
+PLACES = 8
 DIRECTIONS = 256
-GROUND_ALBEDO = 0.3  # of pale ground (dry soil .2, concrete .3 to .4)
+SINKS = -0.2  # rays that sink less may show walls and trees
+GROUND_ALBEDO = 0.12  # to the eye: grass .08, soil and asphalt .1, concrete .3
 
 
 @torch.no_grad()
-def scene_irradiance(
-    field: FieldLike, near: float, places: Float[Tensor, "m 3"]
-) -> Float[Tensor, "3"]:
+def scene_irradiance(field: FieldLike, near: float, scene: Scene) -> Float[Tensor, "3"]:
     """Irradiance E on open level ground, linear, from the fitted light field.
 
     The larger of two estimates, since photos clip the sun and bright sky: the cosine-weighted mean
-    of what is seen upwards, and pale ground's radiance over its albedo. The colour is that of the
-    light from above.
+    of what is seen upwards, and the ground's mean radiance over an albedo of 0.12. The colour is
+    half that of the light from above, half white.
 
     Args:
         field: the fitted field.
         near: rays begin here, m.
-        places: camera positions, m.
+        scene: its capture; light from above is looked for at the cameras, and ground only where
+            photos show it.
     """
-    some = places[:: max(1, places.shape[0] // 8)][:8]
+    views = scene.of_split("train")
+    some = views[:: max(1, len(views) // PLACES)][:PLACES]
     up = _cosine_directions(DIRECTIONS)
-    down = up * torch.tensor([1.0, 1.0, -1.0])
-    above = _seen(field, near, some, up).mean((0, 1))
-    ground = luma(_seen(field, near, some, down)).flatten()
-    lit = torch.quantile(ground, 0.8) / GROUND_ALBEDO
+    eyes = torch.tensor(np.stack([scene.c2w_world(view)[:3, 3] for view in some])).float()
+    above = _seen(field, near, eyes.repeat_interleave(DIRECTIONS, 0), up.repeat(len(some), 1))
+    above = above.mean(0)
+    ground_o, ground_d = _photographed_ground(scene, some)
+    if not ground_d.shape[0]:
+        return math.pi * above
+    lit = luma(_seen(field, near, ground_o, ground_d)).mean() / GROUND_ALBEDO
     brightness = luma(above)
-    return math.pi * above * torch.clamp(lit / brightness.clamp_min(1e-6), min=1.0, max=3.0)
+    # Photos are balanced to the light on what they show, so half of the tint is not the light's.
+    colour = 0.5 * (above + brightness)
+    return math.pi * colour * torch.clamp(lit / brightness.clamp_min(1e-6), min=1.0, max=3.0)
 
 
-def _seen(field: FieldLike, near: float, places: Tensor, directions: Tensor) -> Tensor:
-    o = places.repeat_interleave(directions.shape[0], 0)
-    d = directions.repeat(places.shape[0], 1)
-    angle = torch.full((o.shape[0],), 0.05)
-    return trace(World(field, near), o, d, angle).rgb.view(places.shape[0], -1, 3)
+def _seen(field: FieldLike, near: float, o: Tensor, d: Tensor) -> Float[Tensor, "n 3"]:
+    return trace(World(field, near), o, d, torch.full((o.shape[0],), 0.05)).rgb
+
+
+def _photographed_ground(scene: Scene, views: tuple[View, ...]) -> tuple[Tensor, Tensor]:
+    """Rays of a coarse grid of the views' pixels that sink by more than `SINKS`."""
+    origins, directions = [torch.empty(0, 3)], [torch.empty(0, 3)]
+    for view in views:
+        camera = scene.cameras[view.camera]
+        small = camera.resized(16, max(1, round(16 * camera.height / camera.width)))
+        o, d = camera_rays(small, scene.c2w_world(view))
+        down = d[:, 2] < SINKS
+        origins.append(o[down])
+        directions.append(d[down])
+    return torch.cat(origins), torch.cat(directions)
 
 
 def _cosine_directions(n: int) -> Float[Tensor, "n 3"]:

@@ -95,12 +95,8 @@ def prepare(
     moments = [check(weather.at(float(t))) for t in times]
     _check_levels(scene, moments)
     progress("light", 0.0)
-    taken = torch.tensor(
-        np.stack([scene.c2w_world(view)[:3, 3] for view in scene.of_split("train")]),
-        dtype=torch.float32,
-    )
     wants = any(m.flood.level is not None or m.snow.depth is not None for m in moments)
-    irradiance = scene_irradiance(field, field.near, taken) if wants else torch.ones(3)
+    irradiance = scene_irradiance(field, field.near, scene) if wants else torch.ones(3)
     flooded = [m for m in moments if m.flood.level is not None]
     snowy = [m for m in moments if m.snow.depth is not None and m.snow.depth > 0]
     waves = make_waves(flooded[0].flood, flooded[0].seed) if flooded else None

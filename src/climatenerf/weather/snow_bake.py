@@ -21,6 +21,7 @@ from climatenerf.weather.snow_lattice import Deposits, SnowGrid
 
 PASSES = 3
 """Fall directions; three, so that no half-sheltered place lies exactly on the threshold."""
+SLOPE_BASE = 0.4  # m; a fitted surface is rough, and over less its slopes are those of noise
 _FAR = 2  # from this cascade on one direction has to do
 JITTER = 0.05
 """Spread of the fall direction, rad."""
@@ -183,7 +184,8 @@ def _land(
         opacity[row : row + len(j)][wanted] = dark
         tell(min(row + rows, count[1]) / count[1])
     # A smoother ground is what the snow lies on: a fitted surface is rough by centimetres.
-    smooth, up = smooth_ground(hits, direction / -direction[2], 0.03 + 0.5 * h)
+    base = max(2, round(SLOPE_BASE / h))
+    smooth, up = smooth_ground(hits, direction / -direction[2], 0.03 + 0.5 * h, base)
     weight = np.clip((opacity - 0.5) / 0.3, 0, 1)
     steep = snow.slope_sharpness * (up - math.cos(snow.slope))
     weight = weight / (1 + np.exp(-np.clip(steep, -60, 60)))

@@ -41,7 +41,7 @@ def halfway(
 
 @njit(cache=True, parallel=True)
 def smooth_ground(
-    hits: Float32[np.ndarray, "h w 3"], fall: Float[np.ndarray, "3"], tolerance: float
+    hits: Float32[np.ndarray, "h w 3"], fall: Float[np.ndarray, "3"], tolerance: float, base: int
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
     """Smoothed hits, and the cosine of the surface's slope there.
 
@@ -54,6 +54,7 @@ def smooth_ground(
         hits: one for each ray of the grid, NaN where there is none.
         fall: fall direction, scaled to z = -1.
         tolerance: roughness that is smoothed away, m.
+        base: cells over which the slope is taken: snow bridges what is rough below that.
 
     Returns:
         The hits, moved along their rays, and cosines (0 where there is no hit).
@@ -89,8 +90,8 @@ def smooth_ground(
         for i in range(columns):
             if math.isnan(hits[j, i, 2]):
                 continue
-            ux, uy, uz = _tangent(smooth, j, i, 0, 2)
-            vx, vy, vz = _tangent(smooth, j, i, 2, 0)
+            ux, uy, uz = _tangent(smooth, j, i, 0, base)
+            vx, vy, vz = _tangent(smooth, j, i, base, 0)
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
             # The fall's drift can fold the tangents onto each other: no area, no normal, no 0/0.
             cosine[j, i] = abs(nz) / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
