@@ -25,7 +25,8 @@ def scene_irradiance(field: FieldLike, near: float, scene: Scene) -> Float[Tenso
 
     The larger of two estimates, since photos clip the sun and bright sky: the cosine-weighted mean
     of what is seen upwards, and the ground's mean radiance over an albedo of 0.12. The colour is
-    half that of the light from above, half white.
+    half that of the light from above, half white. A white sheet is at most as bright as
+    the picture can show: who photographs snow exposes for it.
 
     Args:
         field: the fitted field.
@@ -41,12 +42,13 @@ def scene_irradiance(field: FieldLike, near: float, scene: Scene) -> Float[Tenso
     above = above.mean(0)
     ground_o, ground_d = _photographed_ground(scene, some)
     if not ground_d.shape[0]:
-        return math.pi * above
+        return math.pi * above / luma(above).clamp_min(1.0)
     lit = luma(_seen(field, near, ground_o, ground_d)).mean() / GROUND_ALBEDO
     brightness = luma(above)
     # Photos are balanced to the light on what they show, so half of the tint is not the light's.
     colour = 0.5 * (above + brightness)
-    return math.pi * colour * torch.clamp(lit / brightness.clamp_min(1e-6), min=1.0, max=3.0)
+    colour = colour * torch.clamp(lit / brightness.clamp_min(1e-6), min=1.0, max=3.0)
+    return math.pi * colour / luma(colour).clamp_min(1.0)
 
 
 def _seen(field: FieldLike, near: float, o: Tensor, d: Tensor) -> Float[Tensor, "n 3"]:
