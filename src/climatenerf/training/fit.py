@@ -236,6 +236,8 @@ class Fitting:
     def near(self) -> float:
         """Ray length (m) from which matter is believed at present."""
         first = FIRST_NEAR * self.field.unit
+        if self.points is not None:  # a street that was driven along lies nearer than that
+            first = min(first, float(self.points.depth[:100_000].quantile(0.02)) / 2)
         return max(self.field.near, first * (1 - self.progress / REFINE_AT))
 
     def choose(self, weights: Float[Tensor, "s"]) -> tuple[Tensor, Tensor]:
