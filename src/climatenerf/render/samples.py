@@ -24,3 +24,10 @@ class Samples:
         """The ray each sample belongs to."""
         counts = self.offsets[1:] - self.offsets[:-1]
         return torch.repeat_interleave(torch.arange(counts.shape[0]), counts)
+
+
+def offsets_of(ray: Int[Tensor, "s"], rays: int) -> Int[Tensor, "rays+1"]:
+    """Where each ray's samples begin in a packed list whose samples' rays are `ray`, ascending."""
+    offsets = torch.zeros(rays + 1, dtype=torch.long)
+    offsets[1:] = torch.bincount(ray, minlength=rays).cumsum(0)
+    return offsets

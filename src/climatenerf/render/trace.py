@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.ops import dispatch
-from climatenerf.render.samples import Samples
+from climatenerf.render.samples import Samples, offsets_of
 from climatenerf.render.view import RENDER_STEP
 from climatenerf.render.world import SKY_OPACITY, TINY, Seen, Water, World
 from climatenerf.weather import flood as water_physics
@@ -104,7 +104,7 @@ def _trace(
     colour = _sample_colour(world, samples, ray, is_matter, keep, rays_o, rays_d)
     own_t = samples.t[keep]
     colour = _through(world, water, below[ray[keep]], colour, rays_o, rays_d, ray[keep], own_t)
-    offsets = _offsets(ray[keep], n)
+    offsets = offsets_of(ray[keep], n)
     rgb = dispatch.accumulate(front[keep], colour, offsets)
 
     # --- Sky ---------------------------------------------------------------------------------
@@ -154,7 +154,9 @@ def _trace(
         mine = keep[is_matter[keep]]
         x = rays_o[ray[mine]] + samples.t[mine, None] * rays_d[ray[mine]]
         height = world.matter.thickness(x)
-        thickness = dispatch.accumulate(front[mine], height[:, None], _offsets(ray[mine], n))[:, 0]
+        thickness = dispatch.accumulate(front[mine], height[:, None], offsets_of(ray[mine], n))[
+            :, 0
+        ]
         thickness = thickness / snow_share.clamp_min(TINY) * (snow_share > LEAST_SHARE)
     normal = torch.zeros(n, 3)
     if normals:
@@ -363,7 +365,7 @@ def _other_side(
             dispatch.accumulate(
                 weights[keep],
                 world.field.colour(x, d, ray[keep]),
-                _offsets(ray[keep], down.shape[0]),
+                offsets_of(ray[keep], down.shape[0]),
             )
             / opacity[:, None]
         )
@@ -422,10 +424,3 @@ def _squashed(world: World, x: Tensor, step: Tensor) -> Float[Tensor, "n"]:
 
 def _sum(values: Float[Tensor, "s"], offsets: Int[Tensor, "n+1"]) -> Float[Tensor, "n"]:
     return dispatch.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]
-
-
-def _offsets(ray: Int[Tensor, "s"], n: int) -> Int[Tensor, "n+1"]:
-    """Packed offsets of samples whose rays are given in order."""
-    offsets = torch.zeros(n + 1, dtype=torch.long)
-    offsets[1:] = torch.bincount(ray, minlength=n).cumsum(0)
-    return offsets

@@ -8,6 +8,7 @@ from torch import Tensor
 from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
+from climatenerf.render.samples import offsets_of
 from climatenerf.scene.cameras import Camera
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
@@ -41,8 +42,7 @@ def field_radiance(
         weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
         keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
         ray = samples.ray_index()[keep]
-        offsets = torch.zeros(n + 1, dtype=torch.long)
-        offsets[1:] = torch.bincount(ray, minlength=n).cumsum(0)
+        offsets = offsets_of(ray, n)
         u = field.sample_positions(o, d, samples)[keep]
         appearance = field.mean_embedding.expand(n, -1)
         colour = field.colour_at(u, ray, d, appearance)

@@ -18,7 +18,7 @@ from climatenerf.field.extent import Extent
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
-from climatenerf.render.samples import Samples
+from climatenerf.render.samples import Samples, offsets_of
 from climatenerf.render.view import LEAST_WEIGHT
 from climatenerf.training import losses
 from climatenerf.training.optimiser import GridAdam
@@ -82,6 +82,10 @@ class Fitting:
         """Begins with an untrained field."""
         torch.manual_seed(settings.seed)
         self.points = points
+        self.first_near = FIRST_NEAR * extent.unit
+        if points is not None:  # a street that was driven along lies nearer than that
+            nearest = float(np.quantile(points.depth.numpy(), 0.02))
+            self.first_near = min(self.first_near, nearest / 2)
         self.pixels = pixels
         self.extent = extent
         self.settings = settings
@@ -235,18 +239,14 @@ class Fitting:
 
     def near(self) -> float:
         """Ray length (m) from which matter is believed at present."""
-        first = FIRST_NEAR * self.field.unit
-        if self.points is not None:  # a street that was driven along lies nearer than that
-            first = min(first, float(self.points.depth[:100_000].quantile(0.02)) / 2)
-        return max(self.field.near, first * (1 - self.progress / REFINE_AT))
+        return max(self.field.near, self.first_near * (1 - self.progress / REFINE_AT))
 
     def choose(self, weights: Float[Tensor, "s"]) -> tuple[Tensor, Tensor]:
         """The samples that get colour and gradients, and the chance that each had.
 
         Early on rays cross haze, with hundreds of samples that hardly weigh: about `CHOSEN` a ray
         are drawn in proportion to their weights, each standing for those like it. Where surfaces
-        are found all that weigh are taken. The estimate's noise is larger the more a ray's colours
-        differ, which favours surfaces over haze.
+        are found all that weigh are taken.
         """
         chance = (CHOSEN * weights).clamp(LEAST_CHANCE, 1.0)
         # Systematic sampling: drawn ones are spread evenly among those like them.
@@ -270,8 +270,7 @@ class Fitting:
         share = weights[kept] / chance
         seen = (share.detach() > LEAST_WEIGHT).nonzero()[:, 0]
         ray = samples.ray_index()[kept][seen]
-        offsets = torch.zeros(n + 1, dtype=torch.long)
-        offsets[1:] = torch.bincount(ray, minlength=n).cumsum(0)
+        offsets = offsets_of(ray, n)
         appearance = self.field.embeddings[batch.image]
         colour = self.field.colour_at(u[seen], ray, batch.rays_d, appearance)
         colour = scale_gradient(colour, spread[seen, None])
