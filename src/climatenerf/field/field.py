@@ -23,6 +23,7 @@ from climatenerf.render.samples import Samples
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
 STEP_CONE = 1.0 / 160  # marching step per length travelled
 CAPACITY = 1024  # samples a ray may have; a ray across all cascades takes 850 whole steps
+MARCHED_AT_ONCE = 2048  # rays; a multiple of cpu.RAY_BLOCK
 
 
 def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
@@ -193,25 +194,34 @@ class Field(nn.Module):
         n = rays_o.shape[0]
         if jitter is None:
             jitter = torch.zeros(n)
-        padded = [np.empty((n, CAPACITY), np.float32) for _ in range(3)]
-        counts = cpu.march(
-            self.to_grid(rays_o).contiguous().numpy(),
-            rays_d.contiguous().numpy(),
-            (t_min / self.unit).contiguous().numpy(),
-            (t_max / self.unit).contiguous().numpy(),
-            jitter.numpy(),
-            self.occupancy.occupied.numpy(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale),
-            stop,
-            self._net(),
-            *padded,
-        )
+        q, d = self.to_grid(rays_o).contiguous().numpy(), rays_d.contiguous().numpy()
+        start, end = ((x / self.unit).contiguous().numpy() for x in (t_min, t_max))
+        comb, cells, net = jitter.numpy(), self.occupancy.cells(), self._net()
         offsets = np.zeros(n + 1, np.int64)
-        np.cumsum(counts, out=offsets[1:])
-        packed = [np.empty(offsets[-1], np.float32) for _ in range(3)]
-        for source, target in zip(padded, packed, strict=True):
-            cpu.pack(source, counts, offsets, target)
-        t, dt, sigma = (torch.from_numpy(p) for p in packed)
+        # Few rays at a time into the same room: fresh memory for all would cost more than marching.
+        rows = np.empty((3, MARCHED_AT_ONCE // cpu.RAY_BLOCK, cpu.RAY_BLOCK * CAPACITY), np.float32)
+        parts = []
+        for first in range(0, n, MARCHED_AT_ONCE):
+            some = slice(first, first + MARCHED_AT_ONCE)
+            counts = cpu.march(
+                q[some],
+                d[some],
+                start[some],
+                end[some],
+                comb[some],
+                cells,
+                (STEP_MIN * step_scale, STEP_CONE * step_scale),
+                stop,
+                net,
+                rows,
+            )
+            own = np.zeros(counts.shape[0] + 1, np.int64)
+            np.cumsum(counts, out=own[1:])
+            offsets[first : first + own.shape[0]] = offsets[first] + own
+            packed = np.empty((3, own[-1]), np.float32)
+            cpu.pack(rows, own, packed)
+            parts.append(packed)
+        t, dt, sigma = torch.from_numpy(np.concatenate(parts, axis=1))
         return Samples(torch.from_numpy(offsets), t * self.unit, dt * self.unit, sigma / self.unit)
 
     def sample_positions(

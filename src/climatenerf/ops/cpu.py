@@ -11,6 +11,7 @@ from numba import njit, prange
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)
 BLOCK = 256  # points per block: a level's working set for them stays in the first-level cache
+RAY_BLOCK = 32  # rays that one thread marches in turn
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -161,38 +162,57 @@ def density_at(q, table, resolutions, w1, b1, w2, b2, out):
             out[p] = _density(q[p, 0], q[p, 1], q[p, 2], table, resolutions, w1, b1, w2, b2, hidden)
 
 
+@njit(cache=True, parallel=True)
+def occupied_blocks(words, out):
+    """Whether each block of 8³ cells holds an occupied one: words [K,G,G,G/8] → out [K,B,B,B].
+
+    A word is eight cells' bytes, as uint64: the occupancy is read before every march.
+    """
+    for slab in prange(out.shape[0] * out.shape[1]):
+        cascade, x = slab // out.shape[1], slab % out.shape[1]
+        for y in range(out.shape[2]):
+            for z in range(out.shape[3]):
+                some = np.uint64(0)
+                for ix in range(8 * x, 8 * x + 8):
+                    for iy in range(8 * y, 8 * y + 8):
+                        some |= words[cascade, ix, iy, z]
+                out[cascade, x, y, z] = some != 0
+
+
 @njit(cache=True, fastmath=True, inline="always")
-def _cell_exit(o, inv, q, cell):
-    """Ray length at which the ray leaves the lattice cell of side `cell` holding q, one axis."""
+def _cell_exit(o, inv, index, cell, half):
+    """Ray length at which the ray leaves the lattice cell of side `cell`, along one axis."""
     if inv > 1e29 or inv < -1e29:  # the ray runs parallel to this pair of faces
         return np.float32(1e30)
-    edge = np.floor(q / cell) * cell + (cell if inv > 0 else np.float32(0.0))
+    edge = (index + 1 if inv > 0 else index) * cell - half
     return (edge - o) * inv
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def march(
-    rays_o, rays_d, t_min, t_max, jitter, occupied, steps, stop, net, out_t, out_dt, out_sigma
-):
+def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
     """Marches rays front to back through occupied space, evaluating density on the way.
 
-    Args: rays [n,3] in grid units, t_min, t_max, jitter [n]; occupied [K,G,G,G] uint8, cascade k
-    covers the cube of half side 2^k; steps = (smallest step, step per length);
+    Args: rays [n,3] in grid units, t_min, t_max, jitter [n]; cells = (occupied [K,G,G,G] uint8,
+    the same for blocks of 2^n cells a side), cascade k covers the cube of half side 2^k;
+    steps = (smallest step, step per length);
     stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
-    out_* [n, capacity]. Returns counts [n], the samples written per ray.
+    rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
+    samples one after the other, to be packed. Returns counts [n], the samples written per ray.
     """
     table, resolutions, w1, b1, w2, b2 = net
+    occupied, blocks = cells
     n = rays_o.shape[0]
     cascades, side = occupied.shape[0], occupied.shape[1]
-    capacity = out_t.shape[1]
+    shift = int(np.log2(side // blocks.shape[1]))  # >> is quicker than //
+    capacity = rows.shape[2] // RAY_BLOCK
     counts = np.zeros(n, np.int64)
     far = np.float32(2.0 ** (cascades - 1))
     dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
     log_stop = np.float32(-np.log(stop))
-    chunk = 64
-    for block in prange((n + chunk - 1) // chunk):
+    for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
         hidden = np.empty(w1.shape[1], np.float32)
-        for r in range(block * chunk, min(n, block * chunk + chunk)):
+        k = 0
+        for r in range(block * RAY_BLOCK, min(n, block * RAY_BLOCK + RAY_BLOCK)):
             ox, oy, oz = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
             dx, dy, dz = rays_d[r, 0], rays_d[r, 1], rays_d[r, 2]
             big = np.float32(1e30)
@@ -210,9 +230,9 @@ def march(
                     t = max(t, min(ta, tb))
                     end = min(end, max(ta, tb))
             tau = np.float32(0.0)
-            k = 0
+            first = k
             t += jitter[r] * max(dt_min, cone * t)
-            while t < end and k < capacity and tau < log_stop:
+            while t < end and k - first < capacity and tau < log_stop:
                 dt = min(max(dt_min, cone * t), end - t)
                 tm = t + np.float32(0.5) * dt
                 qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz
@@ -222,38 +242,44 @@ def march(
                 while m > half and cascade < cascades - 1:
                     half *= np.float32(2.0)
                     cascade += 1
-                cell = np.float32(2.0) * half / side
-                ix = min(max(int((qx + half) / cell), 0), side - 1)
-                iy = min(max(int((qy + half) / cell), 0), side - 1)
-                iz = min(max(int((qz + half) / cell), 0), side - 1)
+                per_length = side / (np.float32(2.0) * half)
+                ix = min(max(int((qx + half) * per_length), 0), side - 1)
+                iy = min(max(int((qy + half) * per_length), 0), side - 1)
+                iz = min(max(int((qz + half) * per_length), 0), side - 1)
                 if occupied[cascade, ix, iy, iz]:
                     sigma = _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden)
                     if sigma * dt > np.float32(1e-3):
-                        out_t[r, k] = tm
-                        out_dt[r, k] = dt
-                        out_sigma[r, k] = sigma
+                        rows[0, block, k] = tm
+                        rows[1, block, k] = dt
+                        rows[2, block, k] = sigma
                         tau += sigma * dt
                         k += 1
                     t += dt
                 else:
+                    cell = np.float32(2.0) * half / side
+                    if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
+                        cell *= np.float32(1 << shift)
+                        ix, iy, iz = ix >> shift, iy >> shift, iz >> shift
                     leave = min(
-                        _cell_exit(ox, ivx, qx, cell),
-                        _cell_exit(oy, ivy, qy, cell),
-                        _cell_exit(oz, ivz, qz, cell),
+                        _cell_exit(ox, ivx, ix, cell, half),
+                        _cell_exit(oy, ivy, iy, cell, half),
+                        _cell_exit(oz, ivz, iz, cell, half),
                     )
                     # Whole steps, so that the sampling comb does not depend on the cells crossed.
                     skip = np.ceil((leave - tm) / dt)
                     t += dt * max(skip, np.float32(1.0))
-            counts[r] = k
+            counts[r] = k - first
     return counts
 
 
 @njit(cache=True, parallel=True)
-def pack(padded, counts, offsets, out):
-    """Packs padded [n, capacity] rows into out [sum(counts)]."""
-    for r in prange(counts.shape[0]):
-        for k in range(counts[r]):
-            out[offsets[r] + k] = padded[r, k]
+def pack(rows, offsets, out):
+    """Packs what `march` has left in rows [3, blocks, *] into out [3, samples]."""
+    for block in prange((offsets.shape[0] - 2) // RAY_BLOCK + 1):
+        start = offsets[block * RAY_BLOCK]
+        stop = offsets[min(block * RAY_BLOCK + RAY_BLOCK, offsets.shape[0] - 1)]
+        for kind in range(3):
+            out[kind, start:stop] = rows[kind, block, : stop - start]
 
 
 @njit(cache=True, fastmath=True, parallel=True)
