@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from analytic_fields import AnalyticField, Box, HalfSpace
+from field.random_field import directions, random_field
 
 from climatenerf.render.frame import render_frame
 from climatenerf.render.trace import trace
@@ -286,6 +287,109 @@ def test_all_weathers_at_once_compose():
     without = linear(dataclasses.replace(world, matter=None))
     wet = seen.mask_water > 0.999
     assert (seen.rgb[wet] - without.rgb[wet]).abs().max() > 0.02
+
+
+@pytest.mark.parametrize("tilt", [0.0, 5.0, 20.0])
+def test_snow_shows_its_depth_in_the_picture(tilt):
+    """Vertical thickness over planes, and whether it is there at all, by the layers."""
+    angle = math.radians(tilt)
+    plane = HalfSpace((0.0, -math.sin(angle), math.cos(angle)), 0.0, (0.3,) * 3)
+    field = AnalyticField([plane], box=((-8.0, -8.0, -4.0), (8.0, 8.0, 4.0)))
+    snow = bake_snow(field, Snow(depth=0.15), np.array([[0.0, 0.0, 1.6]]), np.full(3, 0.6))
+    generator = torch.Generator().manual_seed(0)
+    foot = torch.rand(400, 3, generator=generator) * 2 - 1
+    foot[:, 2] = foot[:, 1] * math.tan(angle)
+    o = torch.tensor([0.0, -1.5, 2.5]).expand(400, 3).contiguous()
+    d = torch.nn.functional.normalize(foot - o, dim=-1)
+    seen = trace(World(field, matter=snow), o, d, torch.full((400,), 2e-3))
+    assert seen.mask_snow.min() > 0.99
+    assert (seen.snow_thickness - 0.15).abs().max() < 0.15 * 0.1
+    # And the layer's depth is to the snow, not to the ground.
+    height = (o + seen.depth[:, None] * d)[:, 2] - (o + seen.depth[:, None] * d)[:, 1] * math.tan(
+        angle
+    )
+    assert (height - 0.15).abs().max() < 0.15 * 0.15
+
+
+def test_no_snow_shows_under_a_roof_or_on_a_steep_slope():
+    roof = Box((-2.0, -2.0, 2.2), (2.0, 2.0, 2.3))
+    field = AnalyticField([HalfSpace(), roof], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 4.0)))
+    snow = bake_snow(field, Snow(depth=0.15), np.array([[0.0, 0.0, 1.6]]), np.full(3, 0.6))
+    o = torch.tensor([[0.0, -4.0, 1.5]]).expand(300, 3).contiguous()
+    generator = torch.Generator().manual_seed(1)
+    foot = torch.cat([torch.rand(300, 2, generator=generator) * 3 - 1.5, torch.zeros(300, 1)], -1)
+    d = torch.nn.functional.normalize(foot - o, dim=-1)
+    world = World(field, matter=snow)
+    under = trace(world, o, d, torch.full((300,), 2e-3))
+    assert under.mask_snow.max() < 0.01 and under.snow_thickness.max() == 0
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(300, 3).contiguous()
+    above = trace(world, foot + torch.tensor([0.0, 0.0, 3.5]), down, torch.full((300,), 2e-3))
+    assert above.mask_snow.min() > 0.99, "the roof itself carries it"
+
+
+def test_muddy_water_is_lit_by_the_scene():
+    """Deep mud seen steeply is its colour times the light; twice the light, twice the radiance."""
+    black = AnalyticField([HalfSpace(offset=-5.0, colour=(0.0,) * 3)], zenith=(0.0,) * 3,
+                          horizon=(0.0,) * 3, box=WIDE)  # fmt: skip
+    flood = Flood(level=0.0, wind_speed=0.0, clarity=0.05)
+    o, d = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    shown = []
+    for light in (0.5, 1.0):
+        waves = at_time(make_waves(flood, 0), 0.0)
+        water = Water(flood, 0.0, waves, torch.full((3,), math.pi * light))
+        shown.append(trace(World(black, water=water), o, d, torch.full((1,), 1e-3)).rgb[0])
+    albedo = ((torch.tensor(flood.colour) + 0.055) / 1.055) ** 2.4
+    assert torch.allclose(shown[0] * 2, shown[1], rtol=1e-4)
+    assert torch.allclose(shown[1], albedo * (1 - 0.0204), rtol=0.01)
+
+
+def test_white_furnace_from_under_water():
+    """White walls and sky, water that takes nothing: white in every direction, also where the
+    surface reflects all or nearly all."""
+    white = AnalyticField(
+        [HalfSpace(colour=(1.0,) * 3)], zenith=(1.0,) * 3, horizon=(1.0,) * 3, box=WIDE
+    )
+    flood = Flood(level=2.0, attenuation=(0.0,) * 3, colour=(0.0,) * 3, wind_speed=4.0)
+    water = Water(flood, 2.0, at_time(make_waves(flood, 0), 0.3), torch.full((3,), math.pi))
+    elevation = torch.deg2rad(torch.linspace(5, 90, 400))
+    d = torch.stack([torch.zeros(400), elevation.cos(), elevation.sin()], dim=-1)
+    o = torch.tensor([0.0, 0.0, 1.0]).expand(400, 3).contiguous()
+    for angle in (2e-3, 0.5):  # waves resolved, and averaged over
+        seen = trace(World(white, water=water), o, d, torch.full((400,), angle))
+        assert (seen.rgb - 1).abs().max() < 1e-3
+
+
+def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypatch):
+    """A fitted kind of field, snow and water: Numba's kernels, not the closed form's torch."""
+    import numba
+
+    from climatenerf.render import trace as module
+
+    field = random_field(full=True)
+    field.occupancy.occupied[..., field.occupancy.side // 2 :] = 0  # air above the middle
+    with torch.no_grad():
+        field.geometry_net[-1].add_(5.0)
+    places = (field.centre + torch.tensor([0.0, 0.0, 1.5]))[None].numpy().astype(np.float64)
+    air, ground = medium(Smog(visibility=60.0), 0.0), float(field.centre[2])
+    snow = bake_snow(field, Snow(depth=0.1), places, np.full(3, 0.6))
+    snowy = World(field, 0.1, air, snow)
+    wet = World(field, 0.1, air, None, flooded(ground + 0.3))
+    o = (field.centre + torch.tensor([0.0, -1.0, 1.5])).expand(600, 3).contiguous()
+    d = directions(600)
+    d[:, 2] = -d[:, 2].abs()
+    angle = torch.full((600,), 1 / 60)
+    whole = trace(snowy, o, d, angle), trace(wet, o, d, angle)
+    monkeypatch.setattr(module, "RAYS_AT_ONCE", 77)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        parts = trace(snowy, o, d, angle), trace(wet, o, d, angle)
+    finally:
+        numba.set_num_threads(threads)
+    assert (whole[0].mask_snow > 0.5).sum() > 50 and (whole[1].mask_water > 0.5).sum() > 50
+    for one, other in zip(whole, parts, strict=True):
+        for name in ("rgb", "mask_water", "mask_snow", "snow_thickness"):
+            assert (getattr(one, name) - getattr(other, name)).abs().max() < 1e-4, name
 
 
 def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):

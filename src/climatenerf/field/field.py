@@ -281,8 +281,10 @@ class Field(nn.Module):
         """The same field without what no training image has seen (shares all parameters).
 
         Photos say nothing about space that they do not show; haze left there would shelter the
-        ground from snow and sun.
+        ground from snow and sun. Early in a fit all is haze and nothing is seen: all is trusted.
         """
+        if not bool(self.occupancy.seen.any()):
+            return self
         twin = copy.copy(self)
         twin.__dict__["_modules"] = dict(self._modules)
         twin.occupancy = Occupancy(self.size.cascades, self.occupancy.side)

@@ -313,17 +313,20 @@ def _water_light(
     reflected = (seen.rgb.view(n, count, 3) * parts[:, None]).sum(1)
 
     # --- What is on the other side ------------------------------------------------------------
+    direction, total = water_physics.refract(rays_d, normal, water.flood.ior, below)
+    direction = direction * ~total[:, None]  # nothing goes on
     behind, through = _other_side(
         world,
         water,
         start - 2 * side[:, None] * torch.tensor([0.0, 0.0, 1.0]),
-        rays_d,
-        normal,
+        direction,
         below,
         pixel_angle,
         depth,
         bounces,
     )
+    # From below the mean over slopes lets a little through even where the facet seen reflects all.
+    share = torch.where(total, torch.ones_like(share), share)
     body = water_physics.body_colour(water.flood, water.irradiance)
     return water_physics.shade(reflected, share, behind, through, body), normal
 
@@ -332,21 +335,19 @@ def _other_side(
     world: World,
     water: Water,
     start: Float[Tensor, "n 3"],
-    rays_d: Float[Tensor, "n 3"],
-    normal: Float[Tensor, "n 3"],
+    direction: Float[Tensor, "n 3"],
     below: Bool[Tensor, "n"],
     pixel_angle: Float[Tensor, "n"],
     depth: Float[Tensor, "n"],
     bounces: int,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Radiance beyond the surface, and how much of it the water lets through.
+    """Radiance beyond the surface along the refracted ray, and how much the water lets through.
 
-    From above: the bed along the refracted ray, converted to a wet bed, and the water's
-    transmittance. From below: the air's light, and 1.
+    From above: the bed, converted to a wet bed, and the water's transmittance. From below: the
+    air's light, and 1.
     """
     n = start.shape[0]
     behind, through = torch.zeros(n, 3), torch.zeros(n, 3)
-    direction, total = water_physics.refract(rays_d, normal, water.flood.ior, below)
     beta = torch.tensor(water_physics.attenuation(water.flood))
     # Under the straight ray's depth of opaque water no bed shows: no ray is spent on it. Light
     # comes down through the depth and goes up through at least as much.
@@ -374,11 +375,12 @@ def _other_side(
         passed = water_physics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
         behind[down] = water_physics.bed_radiance(dry, water.irradiance, water.flood.ior)
         through[down] = passed * (1 - left)[:, None]
-    up = (below & ~total & (direction[:, 2] > 0)).nonzero()[:, 0]
+    through[below] = 1.0
+    up = (below & (direction[:, 2] > 0)).nonzero()[:, 0]
     if up.numel():
         zero = torch.zeros(up.shape[0])
         seen = _trace(world, start[up], direction[up], pixel_angle[up], None, zero, bounces - 1)
-        behind[up], through[up] = seen.rgb, 1.0
+        behind[up] = seen.rgb
     return behind, through
 
 
