@@ -79,7 +79,78 @@ def test_fit_refuses_a_folder_that_holds_a_run(run_folder, capsys):
     assert "--resume" in said
 
 
+def kept(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--camera-height", "3 m"], "keeps its scale"),
+        (["--metric-input"], "keeps its scale"),
+        (["--downscale", "3"], "--downscale 6"),
+        (["--downscale", "6", "--holdout", "0"], "other photos"),
+    ],
+)
+def test_a_run_is_resumed_as_it_was_begun_or_not_at_all(run_folder, capsys, words, expected):
+    before = kept(run_folder)
+    said = complaint(capsys, "fit", STREET, "-o", run_folder, "--resume", *words)
+    assert expected in said
+    assert kept(run_folder) == before
+
+
+def test_the_command_to_go_on_with_repeats_the_flags():
+    from climatenerf.cli.fit import Fit, resuming
+
+    begun = Fit(Path("my photos"), Path("run"), minutes=60, downscale=2, camera_height=3.0, seed=4)
+    assert resuming(begun) == (
+        "climatenerf fit 'my photos' -o run --resume --minutes 60 --downscale 2 --seed 4"
+    )
+
+
+@pytest.mark.parametrize("left", ["optimiser.safetensors", "metrics.json"])
+def test_a_finished_run_is_not_overwritten_whatever_was_deleted(run_folder, tmp_path, capsys, left):
+    (tmp_path / "run").mkdir()
+    shutil.copy(run_folder / left, tmp_path / "run" / left)
+    complaint(capsys, "fit", STREET, "-o", tmp_path / "run", "--steps", "1")
+    assert [p.name for p in (tmp_path / "run").iterdir()] == [left]
+
+
+def test_a_capture_is_never_written_into(tmp_path, capsys):
+    scene = tmp_path / "scene"
+    shutil.copytree(STREET, scene)
+    before = kept(scene)
+    assert "capture itself" in complaint(capsys, "fit", scene, "-o", scene, "--steps", "1")
+    shutil.copytree(scene, tmp_path / "other")
+    said = complaint(capsys, "fit", scene, "-o", tmp_path / "other", "--steps", "1")
+    assert "overwritten" in said
+    assert kept(scene) == kept(tmp_path / "other") == before
+
+
 # --- render -----------------------------------------------------------------------------------
+
+
+def test_a_shorter_render_leaves_nothing_of_the_longer_one_before_it(run_folder, tmp_path):
+    words = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--layers", "depth"]
+    assert status(*words, "--frames", "3") == 0
+    (tmp_path / "frames" / "mine.png").write_bytes(b"not a frame")
+    assert status(*words, "--frames", "1", "--smog.visibility", "50 m") == 0
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["0000.png", "mine.png"]
+    assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["0000.npz"]
+    told = json.loads((tmp_path / "movie.json").read_text())
+    assert len(told["frames"]) == 1 and told["weather"]["smog"]["visibility"] == "50 m"
+
+
+def test_frames_keep_their_sidecar_when_there_is_no_movie(
+    run_folder, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "absent"))
+    said = complaint(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL)
+    assert "ffmpeg" in said
+    sidecar = json.loads((tmp_path / "out" / "movie.json").read_text())
+    assert len(sidecar["frames"]) == 2 and sidecar["frames_wanted"] == 2
+    assert "lowest_ground_z" in sidecar
+    assert not (tmp_path / "out" / "movie.mp4").exists()
 
 
 def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypatch):
@@ -223,11 +294,29 @@ def test_a_truncated_picture(tmp_path, capsys, keep):
 
 
 @pytest.mark.parametrize(
-    "words", [["--minutes", "0"], ["--steps", "0"], ["--downscale", "0"], ["--downscale", "99"]]
+    "words",
+    [
+        ["--minutes", "0"],
+        ["--minutes", "nan"],
+        ["--steps", "0"],
+        ["--downscale", "0"],
+        ["--downscale", "2"],  # 16 x 12: too small to measure
+        ["--downscale", "99"],
+    ],
 )
 def test_fit_options_out_of_range(tmp_path, capsys, words):
     capture(tmp_path / "scene")
     complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", *words)
+
+
+def test_masks_that_leave_nothing(tmp_path, capsys):
+    capture(tmp_path / "scene")
+    (tmp_path / "scene" / "masks").mkdir()
+    for i in range(6):
+        path = tmp_path / "scene" / "masks" / f"{i}.png"
+        Image.fromarray(np.zeros((24, 32), np.uint8)).save(path)
+    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
+    assert "masks" in said and not (tmp_path / "run").exists()
 
 
 def test_unknown_names_to_hold_out(tmp_path, capsys):
@@ -281,6 +370,11 @@ def test_a_run_from_a_newer_schema(run_folder, tmp_path, capsys):
     write_safetensors(path, arrays, {"climatenerf": json.dumps(about)})
     said = complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
     assert "newer" in said and "99" in said
+    shutil.copy(run_folder / "field.safetensors", path)
+    config = tmp_path / "run" / "config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "schema_version": 98}))
+    said = complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
+    assert "newer" in said and "98" in said
 
 
 def test_a_damaged_run(run_folder, tmp_path, capsys):

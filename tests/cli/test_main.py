@@ -76,9 +76,9 @@ def test_no_verb_and_wrong_verbs(capsys):
 
 def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):
     seen = []
-    verb.run = lambda options: seen.append((options, os.environ["NUMBA_THREADING_LAYER"]))
+    verb.run = lambda options: seen.append((options, os.environ["NUMBA_THREADING_LAYER_PRIORITY"]))
     assert cli.main(["fit", "--scene", "a", "--minutes", "2"]) == 0
-    assert seen == [(Options("a", 2.0), "omp")]
+    assert seen == [(Options("a", 2.0), "omp tbb workqueue")]
     assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     cli.main(["fit", "--scene", "a"])

@@ -127,6 +127,22 @@ def test_metric_input_is_kept_exactly(tmp_path):
     assert max(v for k, v in out.up_report.items() if k != "used") < 4
 
 
+def test_map_coordinates_come_near_the_origin_and_keep_their_metres(tmp_path):
+    points, posts = street()
+    away = np.array([500_250.0, 4_999_800.0, 12.0])
+    poses = [p.copy() for p in ring(9)]
+    for p in poses:
+        p[:3, 3] += away
+    views = scene_from(tmp_path, ring(9), None, posts)[0].views
+    views = tuple(replace(v, c2w=p) for v, p in zip(views, poses, strict=True))
+    out = level(Scene(tmp_path, "test", (CAMERA,), views, points + away), metric_input=True)
+    centre = np.mean([out.c2w_world(v)[:3, 3] for v in out.views], axis=0)
+    assert np.abs(centre[:2]).max() < 1001 and centre[2] > 10
+    np.testing.assert_array_equal(out.world_from_input[:3, :3], np.eye(3))
+    assert (out.world_from_input[:2, 3] % 1000 == 0).all()
+    assert any("far from their origin" in w for w in out.warnings)
+
+
 def test_metric_input_with_another_up_is_reported(tmp_path):
     points, posts = street()
     scene, _ = scene_from(tmp_path, ring(9), points, posts, seed=2)

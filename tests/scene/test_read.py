@@ -192,3 +192,14 @@ def test_distortion_without_inverse_is_a_warning(tmp_path):
     assert any("cannot be undone" in w for w in read_scene(tmp_path).warnings)
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(PINHOLE,))
     assert not any("cannot be undone" in w for w in read_scene(tmp_path).warnings)
+
+
+def test_absolute_names_do_not_make_photos_their_own_labels(tmp_path):
+    names = names_of(9)
+    write_images(tmp_path / "images", names)
+    absolute = [str(tmp_path / "images" / name) for name in names]
+    write_transforms(
+        tmp_path / "transforms.json", ring(9), absolute, w=32, h=24, fl_x=30.0, fl_y=30.0
+    )
+    for view in read_scene(tmp_path).views:
+        assert view.label_path is None and view.mask_path is None

@@ -53,6 +53,11 @@ def test_the_points_that_each_view_shows_are_kept(scene, tmp_path):
     file.write_bytes(b"PK\x03\x04 not a zip")
     with pytest.raises(UserError, match="delete it"):
         load_scene(tmp_path / "run")
+    file.write_bytes(b"")
+    with pytest.raises(UserError, match="delete it"):
+        load_scene(tmp_path / "run")
+    file.unlink()  # the advice is followed
+    assert load_scene(tmp_path / "run").views[3].seen is None
     unknown = tuple(replace(v, seen=None) for v in scene.views)
     save_scene(replace(scene, views=unknown), tmp_path / "run")
     assert not file.exists() and load_scene(tmp_path / "run").views[0].seen is None

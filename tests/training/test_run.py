@@ -187,6 +187,42 @@ def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):
     assert again["steps"] == 9 and again["interrupted"] is False
 
 
+def test_a_checkpoint_in_the_middle_knows_what_photos_see(scene, tmp_path):
+    """A run left by a crash must carry snow and light like a finished one."""
+    fitting = begin(scene, steps=40)
+    with pytest.raises(KeyboardInterrupt):
+        fitting.run(stop_at(20))
+    checkpoint(fitting, tmp_path)
+    early = load_field(tmp_path)
+    assert early.trusted().occupancy.occupied.any(), "all is haze: nothing is seen, all is trusted"
+    with torch.no_grad():
+        fitting.field.geometry_net[-1].add_(8.0)  # surfaces, as a longer fit would find
+    checkpoint(fitting, tmp_path)
+    field = load_field(tmp_path)
+    assert field.occupancy.seen.sum() > 10
+    assert 0 < field.trusted().occupancy.occupied.sum() < field.occupancy.occupied.sum()
+
+
+def test_a_resumed_run_stays_in_its_own_metres(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=2)
+    before = load_scene(tmp_path / "run")
+    bigger = np.diag([2.0, 2.0, 2.0, 1.0]) @ scene.world_from_input
+    again = dataclasses.replace(scene, world_from_input=bigger, ground_z=7.0)
+    fitted(again, tmp_path / "run", steps=4, resume=True)
+    after = load_scene(tmp_path / "run")
+    assert np.array_equal(after.world_from_input, before.world_from_input)
+    assert after.ground_z == before.ground_z
+
+
+def test_a_damaged_held_out_picture_is_found_before_fitting(tmp_path):
+    scene = with_split(make_scene(tmp_path / "toy"), {"00.png"})
+    path = scene.of_split("heldout")[0].path
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(UserError, match="00.png"):
+        fitted(scene, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_resuming_where_there_is_nothing(scene, tmp_path):
     with pytest.raises(UserError, match="no run to resume"):
         fitted(scene, tmp_path / "run", resume=True)

@@ -129,3 +129,11 @@ def test_a_flag_replaces_keyframes(film):
 
 def test_flags_alone():
     assert combine(None, Weather(seed=3), frozenset()).at(1) == Weather(seed=3)
+
+
+def test_a_flag_for_clarity_replaces_the_files_attenuation():
+    film = weather_from_table({"flood": {"level": "0 m", "attenuation": [0.1, 0.2, 0.3]}})
+    flags, given = Weather(flood=Flood(clarity=2.0)), frozenset({"flood.clarity"})
+    mixed = combine(film, flags, given).at(0)
+    assert mixed.flood.attenuation is None and mixed.flood.clarity == 2.0
+    assert combine(film, flags, frozenset()).at(0).flood.attenuation == (0.1, 0.2, 0.3)

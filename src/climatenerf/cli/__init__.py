@@ -18,12 +18,12 @@ from climatenerf.errors import UserError
 # Before torch and Numba are imported, unless the user has chosen otherwise. Both bring an OpenMP
 # run time of their own, and by default the idle threads of the one spin for a while after each
 # parallel region and so take the cores from the other. Numba's OpenMP layer is asked for because
-# it may be entered from several threads at once, which its fallback may not.
+# it may be entered from several threads at once, which its last fallback may not.
 THREADING = {
     "OMP_WAIT_POLICY": "PASSIVE",
     "GOMP_SPINCOUNT": "0",
     "KMP_BLOCKTIME": "0",
-    "NUMBA_THREADING_LAYER": "omp",
+    "NUMBA_THREADING_LAYER_PRIORITY": "omp tbb workqueue",
 }
 
 
@@ -76,6 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             where = f" while writing {error.filename}" if error.filename else ""
             return _complain(f"the disk is full{where}; free some space and run it again")
+        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and error.filename:
+            return _complain(f"{error.filename} may not be read or written; change its permissions")
         raise
 
 

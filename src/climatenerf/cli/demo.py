@@ -39,19 +39,22 @@ class Demo:
 
 def run(options: Demo) -> int:
     """Fits, renders four movies and a contact sheet, and says where they are."""
-    if options.minutes <= 0 or options.frames < 1:
+    if not options.minutes > 0 or options.frames < 1:
         raise UserError("--minutes and --frames must be above 0")
     size = parse_size(options.size)
     run_folder = options.out / "run"
-    if (run_folder / "config.json").exists():
-        raise UserError(
-            f"{options.out} already holds a demo; choose another folder with -o, or remove it"
-        )
     with as_file(files("climatenerf") / "assets" / "street") as street:
         from climatenerf.scene import read_scene
 
         scene = read_scene(street)
-        metrics = fit_with_bars(scene, Fit(street, run_folder, options.minutes))
+        begun = (run_folder / "optimiser.safetensors").exists()
+        if begun:
+            progress.say(f"Going on with the run in {run_folder}; remove it to begin anew")
+        metrics = fit_with_bars(scene, Fit(street, run_folder, options.minutes, resume=begun))
+    if metrics["interrupted"]:
+        raise UserError(
+            f"stopped while fitting; run it again to go on, the fit so far is in {run_folder}"
+        )
 
     from climatenerf.field.checkpoint import load_field
     from climatenerf.render.camera_path import camera_path

@@ -1,6 +1,7 @@
 """``climatenerf fit SCENE -o RUN``: a radiance field from posed photographs."""
 
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -21,7 +22,7 @@ class Fit:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Run folder to make."""
     minutes: float = 5.0
-    """Time for fitting; reading and measuring come on top."""
+    """Time for fitting steps; reading, previews, saving and measuring come on top."""
     steps: int | None = None
     """Stop after this many steps, if that is sooner."""
     downscale: int = 1
@@ -43,10 +44,15 @@ class Fit:
 
 def run(options: Fit) -> int:
     """Reads the capture, fits, and says where the run is and how good."""
-    if options.minutes <= 0 or (options.steps is not None and options.steps < 1):
+    if not options.minutes > 0 or (options.steps is not None and options.steps < 1):
         raise UserError("--minutes and --steps must be above 0; try --minutes 5")
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
+    if options.resume and (options.camera_height is not None or options.metric_input):
+        raise UserError(
+            "a resumed run keeps its scale; leave --camera-height and --metric-input out,"
+            " or fit anew"
+        )
     scene = read_scene(
         options.scene,
         holdout=options.holdout,
@@ -55,15 +61,39 @@ def run(options: Fit) -> int:
     )
     for warning in scene.warnings:
         progress.warn(warning)
+    progress.say(frame_line(scene))
     metrics = fit_with_bars(scene, options)
     if metrics["interrupted"]:
-        progress.say(
-            f"Stopped early; continue with: climatenerf fit {options.scene}"
-            f" -o {options.out} --resume"
-        )
+        progress.say(f"Stopped early; continue with: {resuming(options)}")
     progress.result(summary(metrics))
     progress.result(f"run: {options.out}")
     return 0
+
+
+def frame_line(scene) -> str:
+    """How the scene stands in the world, in one line."""
+    views = scene.of_split("train")
+    heights = sorted(float(scene.c2w_world(view)[2, 3]) - scene.ground_z for view in views)
+    up = scene.up_report.get("used", "the scene file")
+    return (
+        f"Scene: {len(scene.views)} photos; up from {up},"
+        f" scale from {scene.scale_source} (+-{scene.scale_error:.0%}); cameras"
+        f" {heights[len(heights) // 2]:.1f} m above the ground datum, lowest ground"
+        f" {scene.lowest_ground_z - scene.ground_z:+.1f} m from it"
+    )
+
+
+def resuming(options: Fit) -> str:
+    """The command that continues a run: with the flags that it was begun with."""
+    words = ["climatenerf", "fit", str(options.scene), "-o", str(options.out), "--resume"]
+    for option in fields(Fit)[2:]:
+        value = getattr(options, option.name)
+        # The run keeps its scale itself.
+        if option.name not in ("resume", "camera_height", "metric_input") and (
+            value != option.default
+        ):
+            words += [f"--{option.name}", str(value)]
+    return shlex.join(words)
 
 
 def fit_with_bars(scene, options: Fit) -> dict:

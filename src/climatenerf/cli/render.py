@@ -4,7 +4,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -78,8 +78,10 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
     from climatenerf.field.checkpoint import load_field
     from climatenerf.render.camera_path import camera_path
     from climatenerf.scene import load_scene
+    from climatenerf.training.run import check_config
 
     field = load_field(options.run)
+    check_config(options.run)
     scene = load_scene(options.run)
     path = camera_path(options.path, scene, options.frames, size)
     for note in path.notes:
@@ -135,38 +137,56 @@ def render_movie(
     from climatenerf.storage import make_folder
 
     make_folder(out / "frames")
-    records = []
-    with progress.Bar(title, len(path)) as bar, MovieWriter(out / "movie.mp4", path.size, fps) as m:
-        for index in range(len(path)):
-            time = index / fps
-            world = stage.at(time)
-            camera, c2w = path.cameras[index], path.c2w[index]
-            picture, found = render_frame(world, camera, c2w, supersample, "normal" in layers)
-            name = f"{index:04d}"
-            write_png(out / "frames" / f"{name}.png", picture, SIMULATED)
-            m.add(picture)
-            kept = save_layers(out, name, {k: found[k] for k in layers}, tuple(formats))
-            records.append(
-                FrameRecord(
-                    file=f"frames/{name}.png",
-                    time=time,
-                    camera=camera,
-                    c2w=c2w,
-                    layers=kept,
-                    weather=weather_to_table(stage.weather.at(time)),
-                    measured=measured(found),
+    before = files_of_render(out)
+    records: list[FrameRecord] = []
+    about: dict[str, Any] = {"path": path.name, "notes": list(path.notes), "fps": fps}
+    about |= {"supersample": supersample, "frames_wanted": len(path)}
+    if stage.waves is not None:
+        about["significant_wave_height_m"] = stage.waves.significant_height
+    bar, writer = progress.Bar(title, len(path)), MovieWriter(out / "movie.mp4", path.size, fps)
+    try:
+        with bar, writer:
+            if writer.problem is not None:
+                progress.warn(str(writer.problem))
+            if writer.note is not None:
+                progress.say(writer.note)
+            for index in range(len(path)):
+                time = index / fps
+                camera, c2w = path.cameras[index], path.c2w[index]
+                picture, found = render_frame(
+                    stage.at(time), camera, c2w, supersample, "normal" in layers
                 )
-            )
-            bar.advance()
-    write_sidecar(
-        out / "movie.json",
-        stage.scene,
-        records,
-        weather_to_table(stage.weather),
-        stage.weather.base.seed,
-        {"path": path.name, "notes": list(path.notes), "fps": fps, "supersample": supersample},
-    )
+                name = f"{index:04d}"
+                (out / "movie.json").unlink(missing_ok=True)  # from here on it would be wrong
+                write_png(out / "frames" / f"{name}.png", picture, SIMULATED)
+                writer.add(picture)
+                kept = save_layers(out, name, {k: found[k] for k in layers}, tuple(formats))
+                weather = weather_to_table(stage.weather.at(time))
+                file = f"frames/{name}.png"
+                records.append(FrameRecord(file, time, camera, c2w, kept, weather, measured(found)))
+                bar.advance()
+    finally:
+        # Also of a render that was stopped, or that has no movie: frames without it are no data.
+        if records:
+            weather, seed = weather_to_table(stage.weather), stage.weather.base.seed
+            write_sidecar(out / "movie.json", stage.scene, records, weather, seed, about)
+    # A longer render before this one has left frames and layers that are not of this weather.
+    for path in before - files_of_render(out):
+        path.unlink(missing_ok=True)
     return out / "movie.mp4"
+
+
+def files_of_render(out: Path) -> set[Path]:
+    """Frames and layers that a folder's sidecar names; none if there is no sound one."""
+    from climatenerf.storage import read_json
+
+    try:
+        frames = read_json(out / "movie.json")["frames"]
+        names = [n for f in frames for n in [f["file"], *sum(f["layers"].values(), [])]]
+        paths = {(out / name).resolve() for name in names}
+    except (UserError, OSError, KeyError, TypeError, AttributeError):
+        return set()
+    return {path for path in paths if path.is_relative_to(out.resolve())}
 
 
 def measured(layers: dict[str, np.ndarray]) -> dict[str, float]:

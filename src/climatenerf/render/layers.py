@@ -214,6 +214,7 @@ def write_sidecar(
                 "assumed": "assumed" in scene.scale_source,
             },
             "ground_z": scene.ground_z,
+            "lowest_ground_z": scene.lowest_ground_z,
             "world_from_input": scene.world_from_input,
             "layers": {
                 name: {

@@ -19,6 +19,7 @@ ROLL_SIGMA = 2.5  # degrees: how level a photographer holds a camera from side t
 PITCH_SIGMA = 8.0  # degrees: how much cameras look up or down on average
 PLANE_SIGMA = 2.5  # degrees: how level open ground is
 LINES_SIGMA = 0.6  # degrees: how upright posts and walls are, at best
+FAR_ORIGIN = 10_000  # m: 32-bit numbers resolve a millimetre up to 16 km from the origin
 FOCUS_SHARE = 0.35  # camera height over distance to what is looked at, when no ground is seen
 
 
@@ -107,6 +108,12 @@ def level(scene: Scene, *, camera_height: float | None = None, metric_input: boo
         origin = np.append(positions[:, :2].mean(axis=0), under_path)
         world[:3, 3] = -scale * origin
         lowest, under_path = scale * (lowest - under_path), 0.0
+    elif np.abs(origin := np.round(positions[:, :2].mean(axis=0), -3)).max() > FAR_ORIGIN:
+        world[:2, 3] = -origin
+        warnings.append(
+            f"The poses are far from their origin; the world's is put at x {origin[0]:.0f} m,"
+            f" y {origin[1]:.0f} m of the input."
+        )
     return replace(
         scene,
         world_from_input=world,

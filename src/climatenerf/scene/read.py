@@ -180,6 +180,8 @@ def _find_extras(capture: Capture) -> tuple[View, ...]:
     """Views with `labels/NAME.png` and `masks/NAME.png` (or `NAME.jpg.png`) where they exist."""
 
     def find(folder: str, view: View) -> Path | None:
+        if Path(view.name).is_absolute():  # joined to a folder it would be the photo itself
+            return None
         base = capture.root / folder / view.name
         for candidate in (base.with_suffix(".png"), Path(f"{base}.png")):
             if candidate.is_file():

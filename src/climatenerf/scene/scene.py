@@ -6,6 +6,7 @@ import json
 import math
 import os
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -221,8 +222,9 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
     if any(v.split not in ("train", "heldout") for v in views):
         raise ValueError("a view's split is neither train nor heldout")
     points = None if data["points"] is None else read_points(folder / data["points"])
-    if points is not None and data.get("points_seen"):
-        views = _with_seen(views, len(points), folder / data["points_seen"])
+    seen = data.get("points_seen")
+    if points is not None and seen and (folder / seen).exists():
+        views = _with_seen(views, len(points), folder / seen)
     return Scene(
         root=root,
         source=_text(data["source"]),
@@ -257,7 +259,7 @@ def _with_seen(views: tuple[View, ...], points: int, path: Path) -> tuple[View, 
     try:
         with np.load(path) as data:
             view, point = data["view"].astype(np.int64), data["point"].astype(np.int64)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(
             f"{path} cannot be read ({error}); delete it to go on without it."
         ) from None

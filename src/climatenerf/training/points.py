@@ -37,7 +37,8 @@ def find_point_rays(scene: Scene) -> PointRays | None:
             eyes.append(np.broadcast_to(scene.c2w_world(view)[:3, 3], ends[-1].shape))
     eye, end = np.concatenate(eyes), np.concatenate(ends)
     depth = np.linalg.norm(end - eye, axis=-1)
-    kept = depth > 1e-6 * depth.max(initial=0.0)  # a point in the camera has no direction
+    # A point in the camera has no direction. The median, since stray points can be very far.
+    kept = depth > 1e-6 * np.median(depth) if depth.size else depth > 0
     if not kept.any():
         return None
     rays_d = (end - eye)[kept] / depth[kept, None]

@@ -38,13 +38,24 @@ OPTIMISER = "optimiser.safetensors"
 CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0
 PREVIEW_WIDTH = 240
+SMALLEST = 16  # pixels; the structural similarity looks at windows of 11
 
 
 def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
-    """All training pixels of a scene, reduced `downscale` times."""
+    """All training pixels of a scene, reduced `downscale` times.
+
+    Raises:
+        UserError: pictures too small to measure, or masks that leave nothing to learn from.
+    """
     views = scene.of_split("train")
     cameras = [downscaled_camera(camera, downscale) for camera in scene.cameras]
-    return TrainingPixels(
+    least = min(min(camera.width, camera.height) for camera in cameras)
+    if least < SMALLEST:
+        raise UserError(
+            f"the pictures are only {least} pixels wide or high at --downscale {downscale};"
+            f" at least {SMALLEST} are needed"
+        )
+    pixels = TrainingPixels(
         cameras,
         [view.camera for view in views],
         np.stack([scene.c2w_world(view) for view in views]),
@@ -52,6 +63,12 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         [load_labels(view, scene, downscale) for view in views],
         [load_mask(view, scene, downscale) for view in views],
     )
+    if pixels.allowed is not None and not pixels.allowed.numel():
+        raise UserError(
+            f"the masks of {scene.root} leave no pixel to learn from; what is to be ignored is"
+            " black in them, the rest white"
+        )
+    return pixels
 
 
 def fit_scene(
@@ -79,22 +96,21 @@ def fit_scene(
     Raises:
         UserError: the folder already holds a run (without resume) or none (with it).
     """
-    # Of a checkpoint's files this is written last: without it there is nothing to lose.
-    if not resume and (run / OPTIMISER).exists():
-        raise UserError(
-            f"{run} already holds a run; choose another -o, or continue it with --resume"
-        )
+    check_folder(scene, run, resume)
+    if resume:
+        scene = in_frame_of(scene, run, downscale)
+    for view in scene.of_split("heldout"):
+        load_image(view, scene, downscale)  # a damaged one is to be known now, not after the fit
     pixels = load_pixels(scene, downscale)
     views = scene.of_split("train")
     poses = np.stack([scene.c2w_world(view) for view in views])
     extent = find_extent(poses, scene.points_world())
     fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(scene))
     if resume:
-        check_same_photos(scene, run)
         restore(fitting, run)
     make_folder(run / "previews")
-    save_scene(scene, run)
     write_json(run / "config.json", _config(settings, downscale, fitting.field))
+    save_scene(scene, run)
 
     watch = views[len(views) // 2]
     last = {"checkpoint": time.monotonic(), "preview": time.monotonic()}
@@ -114,12 +130,7 @@ def fit_scene(
         fitting.run(after_step)
     except KeyboardInterrupt:
         interrupted = True
-    occupancy = fitting.field.occupancy
-    occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
-    occupancy.seen.zero_()
-    for _ in range(4):
-        batch = pixels.draw(16384, fitting.generator)
-        fitting.field.mark_seen(batch.rays_o, batch.rays_d)
+    fitting.field.occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
     checkpoint(fitting, run)
     save_preview(fitting.field, scene, watch, run / "previews", fitting.steps)
     metrics = {
@@ -163,6 +174,12 @@ def evaluate(
 
 def checkpoint(fitting: Fitting, run: Path) -> None:
     """Saves the field and all that continues the fit, each file atomically."""
+    # What photos see changes as the field does; snow and light ask for it.
+    fitting.field.occupancy.seen.zero_()
+    looks = torch.Generator().manual_seed(fitting.settings.seed)
+    for _ in range(4):
+        batch = fitting.pixels.draw(16384, looks)
+        fitting.field.mark_seen(batch.rays_o, batch.rays_d)
     save_field(fitting.field, run)
     state = {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
     for index, moments in fitting.net_adam.state_dict()["state"].items():
@@ -176,24 +193,60 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     write_safetensors(run / OPTIMISER, state, {})
 
 
-def check_same_photos(scene: Scene, run: Path) -> None:
-    """Refuses to resume on other photos: appearance belongs to photos, and held-out ones must not
-    have been trained on."""
-    if not (run / "scene.json").is_file():
-        return  # `restore` says that there is no run
-    before = [view.name for view in load_scene(run).of_split("train")]
-    if before != [view.name for view in scene.of_split("train")]:
+def check_folder(scene: Scene, run: Path, resume: bool) -> None:
+    """Refuses a folder in which a fit would destroy something, or could not go on."""
+    if run.resolve() == scene.root.resolve():
+        raise UserError(f"{run} is the capture itself; give another folder for the run with -o")
+    has_config = (run / "config.json").is_file()
+    if resume and not has_config:
+        raise UserError(f"{run} holds no run to resume; leave --resume out to begin one")
+    if not resume and (run / "scene.json").exists() and not has_config:
+        raise UserError(f"{run} holds a scene, which would be overwritten; choose another -o")
+    # Of a checkpoint's files the optimiser's is written last: before it there is nothing to lose.
+    if not resume and ((run / OPTIMISER).exists() or (run / "metrics.json").exists()):
+        raise UserError(
+            f"{run} already holds a run; choose another -o, or continue it with --resume"
+        )
+
+
+def check_config(run: Path) -> dict:
+    """The run's configuration; refuses one from a newer version."""
+    config = read_json(run / "config.json", "the run's configuration")
+    check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
+    return config
+
+
+def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
+    """The scene in the metres of a run that is to be resumed: its field knows no others.
+
+    Raises:
+        UserError: the run is of other photos (appearance belongs to photos, and held-out ones must
+            not have been trained on), of another size of them, or from a newer version.
+    """
+    config = check_config(run)
+    if config.get("downscale") != downscale:
+        raise UserError(
+            f"{run} was fitted at --downscale {config.get('downscale')}; resume it with the same"
+        )
+    before = load_scene(run)
+    names = [view.name for view in before.of_split("train")]
+    if names != [view.name for view in scene.of_split("train")]:
         raise UserError(
             f"{run} was fitted to other photos; resume it with the same scene and --holdout"
         )
+    return dataclasses.replace(
+        scene,
+        world_from_input=before.world_from_input,
+        scale_source=before.scale_source,
+        scale_error=before.scale_error,
+        ground_z=before.ground_z,
+        lowest_ground_z=before.lowest_ground_z,
+        up_report=before.up_report,
+    )
 
 
 def restore(fitting: Fitting, run: Path) -> None:
     """Puts a checkpoint back into a fit of the same scene and settings."""
-    if not (run / "config.json").is_file():
-        raise UserError(f"{run} holds no run to resume; leave --resume out to begin one")
-    config = read_json(run / "config.json", "the run's configuration")
-    check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
     field = load_field(run)
     if field.embeddings.shape != fitting.field.embeddings.shape or field.size != fitting.field.size:
         raise UserError(

@@ -146,12 +146,17 @@ def combine(
     weather = film.base
     for name in sorted(given):
         weather = _with(weather, name, _get(flags, name))
-    # Visibility and sigma are two words for one thing: the flag replaces the file's other word.
+    # Two words for one thing: the flag replaces the file's other word. (Attenuation alone decides
+    # where it is given, so a flag for it needs nothing dropped.)
     dropped = set(given)
-    for said, other in (("visibility", "sigma"), ("sigma", "visibility")):
-        if f"smog.{said}" in given and f"smog.{other}" not in given:
-            weather = _with(weather, f"smog.{other}", None)
-            dropped.add(f"smog.{other}")
+    for said, other in (
+        ("smog.visibility", "smog.sigma"),
+        ("smog.sigma", "smog.visibility"),
+        ("flood.clarity", "flood.attenuation"),
+    ):
+        if said in given and other not in given:
+            weather = _with(weather, other, None)
+            dropped.add(other)
     keyframes = {name: frames for name, frames in film.keyframes.items() if name not in dropped}
     return KeyframedWeather(check(weather), keyframes)
 

@@ -1,0 +1,71 @@
+"""The demo, in small: what it leaves, what it says, and what happens when it is stopped."""
+
+import dataclasses
+import functools
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from climatenerf import cli
+from climatenerf.cli import demo
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Small grids, large photos' pixels left out: a blurred street in seconds."""
+    from climatenerf.field.presets import PRESETS
+    from climatenerf.training import fit as fit_module
+    from climatenerf.training import run as run_module
+
+    tiny = dataclasses.replace(
+        PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
+    )
+    monkeypatch.setitem(PRESETS, "cpu", tiny)
+    settings = functools.partial(fit_module.FitSettings, samples_per_step=2**14)
+    monkeypatch.setattr(fit_module, "FitSettings", settings)
+    monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 64)
+    monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))
+
+
+def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
+    out = tmp_path / "demo"
+    words = ["demo", "-o", str(out), "--frames", "2", "--size", "64x36"]
+    assert cli.main(words) == 0
+    said = capsys.readouterr().out
+    assert "held-out PSNR" in said and str(out / "contact-sheet.jpg") in said
+    shows = {"flood": "water_share", "snow": "snow_share", "smog": "mean_transmittance"}
+    for name in ("clean", *shows):
+        assert str(out / name / "movie.mp4") in said
+        assert (out / name / "movie.mp4").stat().st_size > 500
+        frames = json.loads((out / name / "movie.json").read_text())["frames"]
+        assert len(frames) == 2
+        moved = np.array(frames[1]["c2w_world"]) - np.array(frames[0]["c2w_world"])
+        assert np.abs(moved[:3, 3]).max() > 0.1, "the camera moves"
+        for frame in frames:
+            got = frame["measured"]
+            assert (got["water_share"] > 0.02) == (name == "flood"), name
+            assert (got["snow_share"] > 0.02) == (name == "snow"), name
+            assert (got["mean_transmittance"] < 0.95) == (name == "smog"), name
+    assert Image.open(out / "contact-sheet.jpg").size[0] >= 2 * 64
+    # Again: it goes on with what is there instead of complaining.
+    assert cli.main(words) == 0
+    assert "Going on" in capsys.readouterr().err
+
+
+def test_ctrl_c_while_fitting_ends_it_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    from climatenerf.training.fit import Fitting
+
+    step = Fitting.step
+
+    def stopped(self, batch):
+        if self.steps == 3:
+            raise KeyboardInterrupt
+        return step(self, batch)
+
+    monkeypatch.setattr(Fitting, "step", stopped)
+    assert cli.main(["demo", "-o", str(tmp_path / "demo"), "--size", "64x36"]) == 2
+    assert "run it again to go on" in capsys.readouterr().err
+    assert (tmp_path / "demo" / "run" / "field.safetensors").exists()
+    assert not (tmp_path / "demo" / "clean").exists()
