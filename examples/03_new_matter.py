@@ -12,7 +12,6 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from climatenerf.field.checkpoint import load_field
@@ -51,7 +50,7 @@ class Ash:
 run = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/example")
 field, scene = load_field(run), load_scene(run)
 path = camera_path("still:0020", scene, frames=1, size=(192, 108))
-light = scene_irradiance(field, field.near, torch.from_numpy(path.c2w[:, :3, 3]).float()) / math.pi
+light = scene_irradiance(field, field.near, scene) / math.pi
 fall = Snow(depth=0.04, slope=math.radians(33))  # ash slides off earlier than snow
 layer = bake_snow(field.trusted(), fall, path.c2w[:, :3, 3], light.numpy())
 world = World(field, field.near, matter=None if layer is None else Ash(layer, light))

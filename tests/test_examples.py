@@ -1,0 +1,31 @@
+"""The examples of the library run as they are and make what they say."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_examples_run_one_after_the_other(tmp_path):
+    run = tmp_path / "run"
+    told = {}
+    for name, words in (
+        ("01_fit_and_flood", ["150", str(run)]),
+        ("02_weather_file", [str(run)]),
+        ("03_new_matter", [str(run)]),
+    ):
+        command = [sys.executable, str(EXAMPLES / f"{name}.py"), *words]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        assert done.returncode == 0, done.stderr
+        told[name] = done.stdout
+    assert (run / "flooded.png").stat().st_size > 1000
+    assert (run / "weather.jpg").stat().st_size > 1000
+    assert (run / "ash.png").stat().st_size > 1000
+    assert "water on 0%" not in told["01_fit_and_flood"]
+    assert told["02_weather_file"].count("visibility") == 3
+    assert "ash on 0%" not in told["03_new_matter"]
