@@ -171,8 +171,8 @@ def render_movie(
             weather, seed = weather_to_table(stage.weather), stage.weather.base.seed
             write_sidecar(out / "movie.json", stage.scene, records, weather, seed, about)
     # A longer render before this one has left frames and layers that are not of this weather.
-    for path in before - files_of_render(out):
-        path.unlink(missing_ok=True)
+    for stale in before - files_of_render(out):
+        stale.unlink(missing_ok=True)
     return out / "movie.mp4"
 
 
