@@ -64,7 +64,7 @@ def linear(world, direction=(0.0, 1.0, -0.2), eye=(0.0, -3.0, 1.6)):
     from climatenerf.render.view import camera_rays
 
     o, d = camera_rays(CAMERA, looking(direction, eye))
-    return trace(world, o, d, torch.full((o.shape[0],), 1 / 60), normals=False)
+    return trace(world, o, d, torch.full((o.shape[0],), 1 / 60))
 
 
 # --- smog ---------------------------------------------------------------------------------------

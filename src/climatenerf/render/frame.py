@@ -5,11 +5,13 @@ from dataclasses import fields
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
+from climatenerf.render.normals import plane_normals
 from climatenerf.render.trace import trace
 from climatenerf.render.view import camera_rays
-from climatenerf.render.world import Seen, World
+from climatenerf.render.world import World
 from climatenerf.scene.cameras import Camera
 from climatenerf.weather.flood import pixel_roll
 
@@ -38,21 +40,24 @@ def render_frame(
     angle = torch.full((rays_o.shape[0],), 1.0 / fine.fx)
     row, column = torch.meshgrid(torch.arange(fine.height), torch.arange(fine.width), indexing="ij")
     roll = pixel_roll(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
-    seen = trace(world, rays_o, rays_d, angle, roll, normals)
+    seen = trace(world, rays_o, rays_d, angle, roll)
     linear = seen.rgb.view(height, supersample, width, supersample, 3).mean((1, 3))
     display = (encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
-    return display, _layers(seen, height, width, supersample, normals)
+    shape = (height, supersample, width, supersample)
+    layers = {
+        each.name: _middle(getattr(seen, each.name), shape)
+        for each in fields(seen)
+        if each.name != "rgb" and (each.name != "normal" or normals)
+    }
+    if normals:
+        directions, angle = _middle(rays_d, shape), 1.0 / camera.fx
+        solid = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
+        known = (layers["normal"] != 0).any(-1, keepdims=True)  # of water and snow
+        layers["normal"] = np.where(known, layers["normal"], solid)
+    return display, layers
 
 
-def _layers(
-    seen: Seen, height: int, width: int, supersample: int, normals: bool
-) -> dict[str, np.ndarray]:
-    layers = {}
-    middle = supersample // 2
-    for each in fields(seen):
-        if each.name == "rgb" or (each.name == "normal" and not normals):
-            continue
-        values = getattr(seen, each.name)
-        grid = values.view(height, supersample, width, supersample, *values.shape[1:])
-        layers[each.name] = grid[:, middle, :, middle].numpy()
-    return layers
+def _middle(values: Tensor, shape: tuple[int, int, int, int]) -> np.ndarray:
+    """Of each pixel's sub-pixels the one next to its centre."""
+    middle = shape[1] // 2
+    return values.view(*shape, *values.shape[1:])[:, middle, :, middle].numpy()

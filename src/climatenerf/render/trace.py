@@ -35,7 +35,6 @@ def trace(
     rays_d: Float[Tensor, "n 3"],
     pixel_angle: Float[Tensor, "n"],
     roll: Float[Tensor, "n"] | None = None,
-    normals: bool = False,
 ) -> Seen:
     """What camera rays see. Independent of how rays are grouped.
 
@@ -45,7 +44,6 @@ def trace(
         rays_d: unit directions.
         pixel_angle: angle a pixel spans, rad.
         roll: turn of each ray's glossy reflection, rad; see `flood.pixel_roll`.
-        normals: also find the normals (six more densities a ray).
     """
     parts = []
     for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
@@ -59,7 +57,6 @@ def trace(
                 None if roll is None else roll[some],
                 torch.full_like(pixel_angle[some], world.near),
                 bounces=BOUNCES,
-                normals=normals,
             )
         )
     return Seen(
@@ -75,7 +72,6 @@ def _trace(
     roll: Float[Tensor, "n"] | None,
     t_min: Float[Tensor, "n"],
     bounces: int,
-    normals: bool = False,
 ) -> Seen:
     """See `trace`; at most `bounces` more meetings with the water, then the plain field."""
     n = rays_o.shape[0]
@@ -108,10 +104,11 @@ def _trace(
     rgb = dispatch.accumulate(front[keep], colour, offsets)
 
     # --- Sky ---------------------------------------------------------------------------------
-    everyone = torch.arange(n)
     endless = torch.full((n,), torch.inf)
-    sky = _through(world, water, below, world.field.sky(rays_d), rays_o, rays_d, everyone, endless)
-    rgb = rgb + sky_share[:, None] * sky
+    skyward = (sky_share > LEAST_WEIGHT).nonzero()[:, 0]
+    sky = world.field.sky(rays_d[skyward])
+    sky = _through(world, water, below[skyward], sky, rays_o, rays_d, skyward, endless[skyward])
+    rgb = rgb.index_add(0, skyward, sky_share[skyward, None] * sky)
 
     # --- Water ---------------------------------------------------------------------------------
     water_depth = torch.zeros(n)
@@ -158,11 +155,10 @@ def _trace(
             :, 0
         ]
         thickness = thickness / snow_share.clamp_min(TINY) * (snow_share > LEAST_SHARE)
-    normal = torch.zeros(n, 3)
-    if normals:
-        normal = _normals(world, rays_o, rays_d, depth, snow_share)
-        normal = torch.where((water_share > 0.5)[:, None], wave_normal, normal)
-        normal = normal * torch.isfinite(depth)[:, None]
+    normal = torch.where((water_share > 0.5)[:, None], wave_normal, torch.zeros(n, 3))
+    if world.matter is not None and bounces == BOUNCES:
+        mine = ((snow_share > 0.5) & (water_share <= 0.5)).nonzero()[:, 0]
+        normal[mine] = world.matter.normal(rays_o[mine] + depth[mine, None] * rays_d[mine])
     return Seen(
         rgb=rgb,
         depth=depth,
@@ -382,26 +378,6 @@ def _other_side(
         seen = _trace(world, start[up], direction[up], pixel_angle[up], None, zero, bounces - 1)
         behind[up] = seen.rgb
     return behind, through
-
-
-def _normals(
-    world: World,
-    rays_o: Float[Tensor, "n 3"],
-    rays_d: Float[Tensor, "n 3"],
-    depth: Float[Tensor, "n"],
-    snow_share: Float[Tensor, "n"],
-) -> Float[Tensor, "n 3"]:
-    """Unit normals where rays end: of matter if it shows, else down the field's density."""
-    x = (
-        rays_o
-        + torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))[:, None] * rays_d
-    )
-    step = (0.004 * depth).clamp(0.005, 10.0)  # about two pixels: finer is the field's noise
-    normal = _field_normal(world, x, step, rays_d)
-    if world.matter is not None:
-        mine = (snow_share > 0.5).nonzero()[:, 0]
-        normal[mine] = world.matter.normal(x[mine])
-    return normal
 
 
 def _field_normal(
