@@ -1,8 +1,10 @@
 """The main job on real photographs, through the command line; what must be seen, from the layers.
 
-pytest -m slow tests/test_captures_end_to_end.py      (about ten minutes on two cores)
+pytest -m slow tests/test_captures_end_to_end.py      (about a quarter of an hour on two cores)
 
-One minute of fitting: a soft picture, but where things are is settled.
+A few hundred steps of fitting: a soft picture, but where things are is settled. After half as many
+haze still hangs over the ground and takes the snow. Steps, not minutes: a busy machine takes longer
+and finds the same.
 """
 
 import dataclasses
@@ -37,7 +39,7 @@ def fitted(request, captures, tmp_path_factory):
     """Name of the capture and its run."""
     name = request.param
     run = tmp_path_factory.mktemp(name) / "run"
-    words = ["fit", str(captures / name), "-o", str(run), "--minutes", "1"]
+    words = ["fit", str(captures / name), "-o", str(run), "--steps", "700", "--minutes", "30"]
     assert cli.main([*words, "--downscale", str(CAPTURES[name]["downscale"])]) == 0
     return name, run
 
@@ -90,9 +92,10 @@ def test_smog_takes_the_contrast_that_distance_asks_for(rendered):
     white = np.array([0.8394, 0.8034, 0.5363])  # .925 .906 .758 in display values
     expected = passed * clean["linear"] + (1 - passed) * white
     off = np.abs(smog["linear"] - expected).max(-1)
-    assert np.median(off[seen]) < 0.02 and np.quantile(off[seen], 0.9) < 0.1
-    assert off[~seen].size == 0 or np.median(off[~seen]) < 0.02
-    assert np.median(np.abs(clean["linear"] - expected).max(-1)) > 0.03, "it changes the picture"
+    # Not exact: a ray's light comes from a spread of depths, and the clean picture is clipped.
+    assert np.median(off[seen]) < 0.04 and np.quantile(off[seen], 0.9) < 0.15
+    changed = np.abs(clean["linear"] - expected).max(-1)
+    assert np.median(changed) > 2 * np.median(off), "it changes the picture by far more than that"
     # The layer tells the same, and what is far away is gone.
     assert np.allclose(smog["transmittance"], passed[..., 0], atol=2e-3)
     assert np.allclose(smog["mask_smog"], 1 - smog["transmittance"], atol=1e-5)
@@ -120,18 +123,22 @@ def test_water_covers_what_lies_low(fitted, rendered, weather):
     assert (layers["depth"][wet] <= clean[wet] + 0.05 * np.abs(clean[wet]) + 0.1).mean() > 0.9
 
 
-def test_the_water_mirrors_the_place(fitted):
+def test_the_water_mirrors_the_place(fitted, monkeypatch):
     """Still water that reflects all shows what a camera mirrored in its surface sees."""
     import torch
+
+    from climatenerf.render import trace as tracing
 
     from climatenerf.field.checkpoint import load_field
     from climatenerf.render.camera_path import camera_path
     from climatenerf.render.stage import prepare
     from climatenerf.render.trace import trace
-    from climatenerf.render.view import camera_rays
+    from climatenerf.render.view import RENDER_STEP, camera_rays
     from climatenerf.scene import load_scene
     from climatenerf.weather.description import weather_from_table
 
+    # Else reflected rays march in coarser steps, in which leaves come out differently.
+    monkeypatch.setattr(tracing, "SECONDARY_STEP", RENDER_STEP)
     name, run = fitted
     field, scene = load_field(run), load_scene(run)
     path = camera_path("still", scene, 1, (160, 90))
@@ -151,8 +158,7 @@ def test_the_water_mirrors_the_place(fitted):
     turned = (d * torch.tensor([1.0, 1.0, -1.0]))[wet]
     clean = trace(dataclasses.replace(world, near=0.0, water=None), start, turned, angle[wet])
     error = (clean.rgb.clamp(0, 1) - seen.rgb[wet].clamp(0, 1)).square().mean()
-    # Reflected rays march in coarser steps than camera rays do.
-    assert -10 * np.log10(float(error)) > 28
+    assert -10 * np.log10(float(error)) > 35
 
 
 def test_snow_lies_as_deep_as_asked_for(rendered):
