@@ -127,9 +127,8 @@ def test_the_water_mirrors_the_place(fitted, monkeypatch):
     """Still water that reflects all shows what a camera mirrored in its surface sees."""
     import torch
 
-    from climatenerf.render import trace as tracing
-
     from climatenerf.field.checkpoint import load_field
+    from climatenerf.render import trace as tracing
     from climatenerf.render.camera_path import camera_path
     from climatenerf.render.stage import prepare
     from climatenerf.render.trace import trace
