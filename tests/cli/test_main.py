@@ -71,7 +71,7 @@ def test_no_verb_and_wrong_verbs(capsys):
     complaint = "climatenerf: there is no verb 'rendr'; did you mean render?\n"
     assert capsys.readouterr().err == complaint
     assert cli.main(["xyzzy"]) == 2
-    assert "use one of fit, render, demo" in capsys.readouterr().err
+    assert "use one of capture, fit, render, export, demo" in capsys.readouterr().err
 
 
 def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):

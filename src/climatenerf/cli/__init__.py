@@ -43,8 +43,10 @@ class Verb:
 
 
 VERBS = {
+    "capture": Verb("climatenerf.cli.capture", "Capture", "find the poses of photos or a video"),
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
+    "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),
     "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the street that comes along"),
 }
 

@@ -1,0 +1,81 @@
+"""Why pictures got no pose, and what to do about it."""
+
+import contextlib
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from climatenerf.sfm.intake import Intake
+
+ENOUGH_MATCHES = 30  # verified ones that a picture needs with a posed one
+BLURRED = 0.3  # of the median sharpness
+DARK, BRIGHT = 0.08, 0.92  # mean grey value
+_PAIR = 2147483647  # COLMAP numbers the pair (a, b), a < b, as a * _PAIR + b
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A picture without pose.
+
+    Attributes:
+        name: of the picture.
+        source: the file it came from.
+        reason: probable reason, one clause.
+        remedy: what to photograph again, one clause.
+        neighbours: the pictures that it fits best, with the number of verified matches.
+    """
+
+    name: str
+    source: str
+    reason: str
+    remedy: str
+    neighbours: tuple[tuple[str, int], ...]
+
+
+def verified_matches(database: Path) -> dict[tuple[str, str], int]:
+    """Number of geometrically verified matches of each pair of pictures that has any."""
+    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        rows = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
+        pairs = {}
+        for pair, count in rows:
+            first, second = divmod(pair, _PAIR)
+            pairs[names[first], names[second]] = int(count)
+    return pairs
+
+
+def diagnose(intake: Intake, registered: tuple[str, ...], database: Path) -> list[Lost]:
+    """The probable reason for each picture without pose, the likeliest first."""
+    pairs = verified_matches(database)
+    partners: dict[str, list[tuple[str, int]]] = {}
+    for (a, b), count in pairs.items():
+        partners.setdefault(a, []).append((b, count))
+        partners.setdefault(b, []).append((a, count))
+    typical = float(np.median([picture.sharpness for picture in intake.pictures]))
+    posed = set(registered)
+    lost = []
+    for picture in intake.pictures:
+        if picture.name in posed:
+            continue
+        best = sorted(partners.get(picture.name, []), key=lambda pair: -pair[1])[:3]
+        to_posed = max((n for other, n in best if other in posed), default=0)
+        near = f" (best: {best[0][0]}, {best[0][1]} matches)" if best else ""
+        if picture.brightness < DARK or picture.brightness > BRIGHT:
+            side = "dark" if picture.brightness < DARK else "bright"
+            reason, remedy = f"far too {side}", "take it again with the exposure locked"
+        elif picture.sharpness < BLURRED * typical:
+            reason = f"blurred ({picture.sharpness / max(typical, 1e-9):.0%} of the usual detail)"
+            remedy = "take it again, holding still"
+        elif to_posed >= ENOUGH_MATCHES:
+            reason = f"fits others{near} but its place stays ambiguous"
+            remedy = "take two more from beside it, a step apart"
+        elif best and best[0][1] >= ENOUGH_MATCHES:
+            reason = f"fits only pictures that are cut off from the rest{near}"
+            remedy = "take pictures that lead from these to the others, two thirds in common"
+        else:
+            reason = f"too little in common with any other{near}"
+            remedy = "take pictures between it and its neighbours, two thirds in common"
+        lost.append(Lost(picture.name, picture.source, reason, remedy, tuple(best)))
+    return lost

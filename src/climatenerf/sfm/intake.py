@@ -1,0 +1,240 @@
+"""Photos of any kind, or a video, as upright pictures in a work folder, with what EXIF says."""
+
+import json
+import math
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageOps
+
+from climatenerf.errors import UserError
+from climatenerf.sfm.exif import Exif, read_exif
+from climatenerf.storage import atomic_path, make_folder, write_json
+
+PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}
+VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp"}
+LONGEST = 2000  # pixels: more than a radiance field of a place resolves, and features need less
+MOST_PIXELS = 400_000_000  # of a picture that is decoded at all: 1.2 GB
+FEWEST = 3
+JPEG_QUALITY = 96
+VIDEO_FRAMES = 100  # frames taken from a video, the sharpest of as many intervals
+CANDIDATES = 5  # looked at in each interval
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One upright picture in the work folder.
+
+    Attributes:
+        name: File name in `pictures/`.
+        source: File it was made from, relative to what the user gave.
+        width: Pixels, as shown.
+        height: Pixels, as shown.
+        exif: What its EXIF says; the focal length is for the picture as shown.
+        sharpness: Variance of the Laplacian of grey values at 640 pixels' width.
+        brightness: Mean grey value, [0,1].
+    """
+
+    name: str
+    source: str
+    width: int
+    height: int
+    exif: Exif
+    sharpness: float
+    brightness: float
+
+
+@dataclass(frozen=True)
+class Intake:
+    """All usable pictures, and what could not be used with the reason."""
+
+    folder: Path
+    pictures: tuple[Picture, ...]
+    unusable: dict[str, str]
+    is_video: bool
+
+
+def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> Intake:
+    """Makes upright pictures of at most `LONGEST` pixels from photos or a video.
+
+    Finished pictures are kept, so that an interrupted run goes on where it was.
+
+    Args:
+        source: folder of photos, or a video file.
+        work: work folder; pictures go to `work/pictures`.
+        progress: told (done, all).
+
+    Raises:
+        UserError: nothing to read, a video that cannot be decoded, or fewer than three pictures.
+    """
+    if not source.exists():
+        raise UserError(f"{source} does not exist; give a folder of photos or a video")
+    folder = make_folder(work / "pictures")
+    if source.is_file():
+        if source.suffix.lower() not in VIDEO_SUFFIXES:
+            raise UserError(f"{source} is neither a folder of photos nor a video")
+        frames = take_frames(source, work / "frames", progress)
+        files, base, is_video = frames, work / "frames", True
+    else:
+        files = sorted(p for p in source.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES)
+        files = [p for p in files if not any(part.startswith(".") for part in p.parts)]
+        base, is_video = source, False
+        if not files:
+            raise UserError(f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP)")
+    pictures, unusable, taken = [], {}, set()
+    for index, path in enumerate(files):
+        name = _free_name(path.relative_to(base), taken)
+        try:
+            pictures.append(_picture(path, base, folder / name))
+        except UserError as error:
+            unusable[path.relative_to(base).as_posix()] = str(error)
+        progress(index + 1, len(files))
+    if len(pictures) < FEWEST:
+        why = f"; unusable: {next(iter(unusable.values()))}" if unusable else ""
+        raise UserError(
+            f"{source} holds {len(pictures)} usable pictures, and a place needs at least {FEWEST}"
+            f" (40 to 100 are good){why}"
+        )
+    return Intake(folder, tuple(pictures), unusable, is_video)
+
+
+def _free_name(path: Path, taken: set[str]) -> str:
+    """A flat JPEG name: folders become part of it; two photos never share one."""
+    stem = "_".join([*path.parts[:-1], path.stem]).replace(" ", "_")
+    name, number = f"{stem}.jpg", 1
+    while name.lower() in taken:
+        number += 1
+        name = f"{stem}_{number}.jpg"
+    taken.add(name.lower())
+    return name
+
+
+def _picture(path: Path, base: Path, out: Path) -> Picture:
+    record = out.with_suffix(".json")
+    stamp = [path.stat().st_size, path.stat().st_mtime_ns]
+    if out.is_file() and record.is_file():
+        try:
+            known = json.loads(record.read_text())
+            if known.pop("stamp") == stamp:
+                place = known["exif"]["place"]
+                known["exif"]["place"] = (
+                    None if place is None else tuple(math.nan if x is None else x for x in place)
+                )
+                return Picture(**{**known, "exif": Exif(**known["exif"])})
+        except (ValueError, KeyError, TypeError):
+            pass  # half written or of an older version: made again
+    image, exif = open_upright(path)
+    image.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS, reducing_gap=3.0)
+    with atomic_path(out) as temporary:
+        image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    grey = small_grey(image)
+    picture = Picture(
+        out.name,
+        path.relative_to(base).as_posix(),
+        *image.size,
+        exif,
+        sharpness(grey),
+        float(grey.mean() / 255),
+    )
+    write_json(record, {**asdict(picture), "stamp": stamp})
+    return picture
+
+
+def open_upright(path: Path) -> tuple[Image.Image, Exif]:
+    """A photo as it is meant to be seen, in RGB, with its EXIF.
+
+    Raises:
+        UserError: empty, damaged, no picture at all, or too large to decode.
+    """
+    if path.suffix.lower() in (".heic", ".heif"):
+        _register_heif(path)
+    if path.stat().st_size == 0:
+        raise UserError(f"{path.name} is empty")
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MOST_PIXELS
+    try:
+        with Image.open(path) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise UserError(f"{path.name} has {image.width}x{image.height} pixels: too large")
+            exif = read_exif(image)
+            image.draft("RGB", (LONGEST, LONGEST))  # a JPEG is decoded smaller at once
+            upright = ImageOps.exif_transpose(image)
+            return upright.convert("RGB"), exif
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise UserError(f"{path.name} is no readable picture ({error})") from error
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _register_heif(path: Path) -> None:
+    try:
+        import pi_heif
+    except ImportError as error:
+        raise UserError(
+            f'{path.name} is HEIC; run `pip install "climatenerf[capture]"` to read it'
+        ) from error
+    pi_heif.register_heif_opener()
+
+
+def small_grey(image: Image.Image) -> UInt8[np.ndarray, "h w"]:
+    """Grey values at 640 pixels' width, for measures that are to be comparable."""
+    height = max(8, round(640 * image.height / image.width))
+    return np.asarray(image.convert("L").resize((640, height), Image.Resampling.BILINEAR))
+
+
+def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """Variance of the Laplacian."""
+    g = grey.astype(np.float32)
+    around = g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:]
+    return float((around - 4 * g[1:-1, 1:-1]).var())
+
+
+def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None]) -> list[Path]:
+    """The sharpest frame of each of `VIDEO_FRAMES` intervals, as JPEG files named by number.
+
+    Raises:
+        UserError: ffmpeg is missing or cannot decode the video.
+    """
+    done = folder / "done.json"
+    stamp = [video.stat().st_size, video.stat().st_mtime_ns]
+    if done.is_file() and json.loads(done.read_text()).get("stamp") == stamp:
+        return sorted(folder.glob("*.jpg"))
+    try:
+        import imageio_ffmpeg
+
+        ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
+        _, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
+    except (ImportError, RuntimeError, OSError) as error:
+        raise UserError(
+            f"{video} cannot be decoded ({str(error).strip().splitlines()[-1]});"
+            " convert it to MP4 (H.264), or give photos"
+        ) from error
+    shutil.rmtree(folder, ignore_errors=True)
+    make_folder(folder)
+    if not seconds or seconds <= 0:
+        raise UserError(f"{video} holds no frames; record it again or give photos")
+    rate = VIDEO_FRAMES * CANDIDATES / seconds
+    scale = f"fps={rate:.6f},scale='min({LONGEST},iw)':-2"
+    command = [ffmpeg, "-y", "-loglevel", "error", "-nostdin", "-i", str(video), "-vf", scale]
+    command += ["-q:v", "2", str(folder / "candidate_%05d.jpg")]
+    result = subprocess.run(command, capture_output=True, text=True)
+    candidates = sorted(folder.glob("candidate_*.jpg"))
+    if not candidates:
+        words = (result.stderr.strip().splitlines() or ["no frame came out"])[-1]
+        raise UserError(f"{video} cannot be decoded ({words}); convert it to MP4, or give photos")
+    kept = []
+    for start in range(0, len(candidates), CANDIDATES):
+        some = candidates[start : start + CANDIDATES]
+        best = max(some, key=lambda path: sharpness(small_grey(Image.open(path))))
+        target = folder / f"{len(kept):04d}.jpg"
+        best.rename(target)
+        kept.append(target)
+        progress(start + len(some), len(candidates))
+    for path in folder.glob("candidate_*.jpg"):
+        path.unlink()
+    write_json(done, {"stamp": stamp})
+    return kept

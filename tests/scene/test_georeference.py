@@ -1,0 +1,110 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene_builders import look_at, ring
+
+from climatenerf.scene import Camera, Scene, View
+from climatenerf.scene.georeference import apply_georeference, east_north, find_georeference
+
+CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+HOME = np.array([47.3769, 8.5417])
+# Arc lengths at 47.3769 deg, m per degree, from the standard series in cosines of the latitude.
+LAT_M = (
+    111132.954
+    - 559.822 * math.cos(2 * math.radians(HOME[0]))
+    + 1.175 * math.cos(4 * math.radians(HOME[0]))
+)
+LON_M = 111412.84 * math.cos(math.radians(HOME[0])) - 93.5 * math.cos(3 * math.radians(HOME[0]))
+
+
+def scene_of(poses, tmp_path):
+    views = tuple(View(f"{i}.png", tmp_path / f"{i}.png", 0, p) for i, p in enumerate(poses))
+    return Scene(
+        tmp_path, "test", (CAMERA,), views, scale_source="camera-height-assumed",
+        scale_error=0.3, lowest_ground_z=-2.0,
+        warnings=("The scale is assumed: cameras 1.6 m.", "Something else."),
+    )  # fmt: skip
+
+
+def places_of(scene, scale, heading, noise=0.0, seed=0):
+    """GPS places of a scene that is `scale` times larger and turned by `heading` in truth."""
+    rng = np.random.default_rng(seed)
+    out = {}
+    for view in scene.views:
+        x, y = view.c2w[:2, 3]
+        east = scale * (math.cos(heading) * x - math.sin(heading) * y) + noise * rng.normal()
+        north = scale * (math.sin(heading) * x + math.cos(heading) * y) + noise * rng.normal()
+        out[view.name] = (HOME[0] + north / LAT_M, HOME[1] + east / LON_M, 400.0)
+    return out
+
+
+def test_metres_per_degree():
+    moved = HOME + np.array([[0.001, 0.0], [0.0, 0.001]])
+    flat = east_north(moved, HOME)
+    assert flat[0] == pytest.approx([0, LAT_M / 1000], abs=0.01)
+    assert flat[1] == pytest.approx([LON_M / 1000, 0], abs=0.01)
+    over = east_north(np.array([[0.0, -179.9995]]), np.array([0.0, 179.9995]))
+    assert over[0] == pytest.approx([111.32, 0], abs=0.01), "over the date line"
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0])
+def test_scale_and_heading(tmp_path, noise):
+    scene = scene_of(ring(24, radius=15.0), tmp_path)
+    places = places_of(scene, 1.7, 2.1, noise)
+    found = find_georeference(scene, places)
+    assert found is not None
+    assert found.scale == pytest.approx(1.7, rel=max(1e-3, 3 * found.scale_error))
+    assert found.scale_error < 0.06
+    assert found.heading == pytest.approx(2.1, abs=max(1e-3, 3 * found.scale_error))
+    out = apply_georeference(scene, found, keep_scale=False)
+    assert out.scale == pytest.approx(found.scale) and out.scale_source == "gps"
+    assert out.ground_z == 0 and out.lowest_ground_z == pytest.approx(-2 * found.scale)
+    assert out.warnings == ("Something else.",)
+    assert out.up_report["gps"]["photos"] == 24
+    # x is east, y is north.
+    origin = np.array(found.origin)
+    for view in out.views:
+        east, north = east_north(np.array([places[view.name][:2]]), origin)[0]
+        assert out.c2w_world(view)[:2, 3] == pytest.approx([east, north], abs=4 * noise + 0.02)
+
+
+def test_the_error_that_is_told_is_the_error_that_is_made(tmp_path):
+    scene = scene_of(ring(30, radius=20.0), tmp_path)
+    found = [find_georeference(scene, places_of(scene, 1.0, 0.3, 1.5, seed)) for seed in range(60)]
+    made = np.std([f.scale - 1 for f in found])
+    told = np.mean([f.scale_error for f in found])
+    assert told == pytest.approx(made, rel=0.35)
+
+
+def test_a_third_of_wild_fixes_does_no_harm(tmp_path):
+    scene = scene_of(ring(24, radius=15.0), tmp_path)
+    places = places_of(scene, 1.3, 0.5, 0.5)
+    for i in range(8):
+        lat, lon, alt = places[f"{i}.png"]
+        places[f"{i}.png"] = (lat + 0.002, lon - 0.001, alt)
+    found = find_georeference(scene, places)
+    assert found is not None and found.scale == pytest.approx(1.3, rel=0.05)
+
+
+def test_a_scale_that_is_known_better_is_kept(tmp_path):
+    scene = replace(scene_of(ring(24, radius=15.0), tmp_path), scale_source="camera-height")
+    found = find_georeference(scene, places_of(scene, 1.7, 2.1))
+    assert found is not None
+    out = apply_georeference(scene, found, keep_scale=True)
+    assert out.scale == pytest.approx(1.0) and out.scale_source == "camera-height"
+    assert out.up_report["gps"]["metres_by_gps_per_metre"] == pytest.approx(1.7, rel=1e-3)
+
+
+@pytest.mark.parametrize("what", ["few", "one spot", "noise"])
+def test_gps_that_says_nothing_is_left_alone(tmp_path, what):
+    if what == "one spot":
+        poses = [look_at((0, 0, 1.6), (math.cos(t), math.sin(t), 1.6)) for t in range(9)]
+    else:
+        poses = ring(24, radius=2.0)
+    scene = scene_of(poses, tmp_path)
+    places = places_of(scene, 1.0, 0.0, 8.0 if what == "noise" else 0.0)
+    if what == "few":
+        places = dict(list(places.items())[:4])
+    assert find_georeference(scene, places) is None

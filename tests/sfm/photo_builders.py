@@ -1,0 +1,45 @@
+"""Photos with EXIF, written by the tests themselves."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image
+
+Base, GPS = ExifTags.Base, ExifTags.GPS
+
+
+def degrees(value: float) -> tuple[float, float, float]:
+    value = abs(value)
+    minutes = (value % 1) * 60
+    return float(int(value)), float(int(minutes)), (minutes % 1) * 60
+
+
+def exif(orientation=1, focal=None, equivalent=None, place=None, camera=("Maker", "Model 5")):
+    """An EXIF block: mm, 35 mm equivalent, (latitude, longitude, altitude)."""
+    data = Image.Exif()
+    data[Base.Orientation] = orientation
+    if camera:
+        data[Base.Make], data[Base.Model] = camera
+    detail = data.get_ifd(ExifTags.IFD.Exif)
+    if focal is not None:
+        detail[Base.FocalLength] = focal
+    if equivalent is not None:
+        detail[Base.FocalLengthIn35mmFilm] = equivalent
+    if place is not None:
+        gps = data.get_ifd(ExifTags.IFD.GPSInfo)
+        gps[GPS.GPSLatitudeRef] = "N" if place[0] >= 0 else "S"
+        gps[GPS.GPSLatitude] = degrees(place[0])
+        gps[GPS.GPSLongitudeRef] = "E" if place[1] >= 0 else "W"
+        gps[GPS.GPSLongitude] = degrees(place[1])
+        gps[GPS.GPSAltitude] = place[2]
+    return data
+
+
+def photo(path: Path, size=(64, 48), data=None, seed=0, **options) -> Image.Image:
+    """Noise with a red block in the upper left corner as shown, stored as EXIF says."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pixels = np.random.default_rng(seed).integers(60, 200, (size[1], size[0], 3), dtype=np.uint8)
+    image = Image.fromarray(pixels)
+    image.paste((250, 10, 10), (0, 0, size[0] // 4, size[1] // 4))
+    image.save(path, **({"exif": data} if data is not None else {}), **options)
+    return image

@@ -1,0 +1,140 @@
+"""From bare photos to a scene, through the command line: the embedded street against its truth."""
+
+import json
+import math
+import re
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_builders import exif, photo
+from PIL import Image
+
+from climatenerf import cli
+from climatenerf.scene import load_scene, read_scene
+
+pytest.importorskip("pycolmap")
+STREET = Path(str(files("climatenerf") / "assets" / "street"))
+HOME = (47.3769, 8.5417)
+
+
+def status(*words):
+    try:
+        return cli.main([str(word) for word in words])
+    except SystemExit as left:
+        return left.code
+
+
+def similarity(a, b):
+    """Umeyama's scale, rotation and shift with b = s R a + t."""
+    ma, mb = a.mean(0), b.mean(0)
+    u, d, vt = np.linalg.svd((b - mb).T @ (a - ma))
+    sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ sign @ vt
+    scale = np.trace(np.diag(d) @ sign) / ((a - ma) ** 2).sum()
+    return scale, rotation, mb - scale * rotation @ ma
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """The street's photos with GPS in them, every third turned on its side, captured."""
+    truth = read_scene(STREET)
+    folder = tmp_path_factory.mktemp("photos")
+    lat_m = 111132.954 - 559.822 * math.cos(2 * math.radians(HOME[0]))
+    lon_m = 111412.84 * math.cos(math.radians(HOME[0]))
+    rng = np.random.default_rng(0)
+    for number, view in enumerate(truth.views):
+        x, y, z = truth.c2w_world(view)[:3, 3]
+        x, y = x + rng.normal(0, 0.15), y + rng.normal(0, 0.15)
+        place = (HOME[0] + y / lat_m, HOME[1] + x / lon_m, 400 + z)
+        turned = number % 3 == 0
+        image = Image.open(view.path)
+        image = image.transpose(Image.Transpose.ROTATE_90) if turned else image
+        data = exif(6 if turned else 1, place=place)
+        image.save(folder / f"{Path(view.name).stem}.jpg", quality=95, exif=data)
+    out = tmp_path_factory.mktemp("street") / "scene"
+    assert status("capture", folder, "-o", out) == 0
+    return truth, out
+
+
+@pytest.mark.slow
+def test_poses_scale_and_up_against_the_truth(captured):
+    truth, out = captured
+    scene = load_scene(out)
+    by_name = {Path(v.name).stem: v for v in truth.views}
+    assert len(scene.views) >= 0.95 * len(truth.views)
+    own = np.stack([scene.c2w_world(v) for v in scene.views])
+    true = np.stack([truth.c2w_world(by_name[Path(v.name).stem]) for v in scene.views])
+    scale, rotation, shift = similarity(own[:, :3, 3], true[:, :3, 3])
+    placed = scale * own[:, :3, 3] @ rotation.T + shift
+    extent = np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))
+    assert np.median(np.linalg.norm(placed - true[:, :3, 3], axis=-1)) < 0.01 * extent
+    between = rotation @ own[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
+    angles = np.degrees(np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert np.median(angles) < 0.5
+    # GPS: metres within 3 %, x to the east; up from the pictures.
+    assert scene.scale_source == "gps" and scale == pytest.approx(1, abs=0.03)
+    up = np.degrees(np.arccos(np.clip(rotation[2, 2], -1, 1)))
+    east = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
+    assert up < 3 and abs(east) < 3
+    assert scene.of_split("heldout"), "photos are kept for measuring"
+
+
+@pytest.mark.slow
+def test_the_report_and_the_next_command(captured, tmp_path, capsys):
+    _, out = captured
+    text = (out / "report.md").read_text()
+    assert re.search(r"Pictures with poses: 6\d of 64", text) and "GPS of 6" in text
+    assert Image.open(out / "report.png").size == (1280, 640)
+    assert (out / "sparse" / "0" / "images.bin").is_file()
+    run = tmp_path / "run"
+    assert status("fit", out, "-o", run, "--steps", "2", "--downscale", "4") == 0
+    assert json.loads((run / "scene.json").read_text())["scale_source"] == "gps"
+    assert status("export", out, "-o", tmp_path / "out") == 0
+    assert (tmp_path / "out" / "transforms.json").is_file()
+
+
+@pytest.mark.slow
+def test_a_second_run_goes_on_from_what_is_there(captured, tmp_path, capsys):
+    truth, out = captured
+    scene = tmp_path / "scene"
+    shutil.copytree(out, scene)
+    shutil.rmtree(scene / "images")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for view in truth.views:  # other files: the pictures are taken in anew, the rest is kept
+        shutil.copy(view.path, photos / f"{Path(view.name).stem}.jpg")
+    assert status("capture", photos, "-o", scene) == 0
+    assert len(list((scene / "images").iterdir())) >= 60
+
+
+def test_photos_that_fit_nowhere_are_one_clear_sentence(tmp_path, capsys):
+    for i in range(4):
+        photo(tmp_path / "in" / f"{i}.jpg", (320, 240), seed=i)
+    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+    err = capsys.readouterr().err
+    assert "fit together" in err and "Traceback" not in err
+    assert not (tmp_path / "scene" / "scene.json").exists()
+
+
+def test_two_photos_and_a_scene_that_is_there_already(tmp_path, capsys):
+    for i in range(2):
+        photo(tmp_path / "in" / f"{i}.jpg", seed=i)
+    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+    assert "2 usable" in capsys.readouterr().err
+    shutil.copytree(STREET, tmp_path / "mine")
+    before = (tmp_path / "mine" / "scene.json").read_bytes()
+    assert status("capture", tmp_path / "in", "-o", tmp_path / "mine") == 2
+    assert "already holds a scene" in capsys.readouterr().err
+    assert (tmp_path / "mine" / "scene.json").read_bytes() == before
+
+
+def test_without_pycolmap_the_remedy_is_told(tmp_path, capsys, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    photo(tmp_path / "in" / "0.jpg")
+    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+    assert "climatenerf[capture]" in capsys.readouterr().err
