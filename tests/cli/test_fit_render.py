@@ -108,6 +108,39 @@ def test_the_command_to_go_on_with_repeats_the_flags():
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("DOOR", "a name and a length"), ("DOOR=2 kg", "length"), ("DOOR=-1 m", "above 0"),
+     ("DOOR=2 m", "mark.html")],
+)  # fmt: skip
+def test_known_lengths_that_cannot_be_used(tmp_path, capsys, text, expected):
+    words = ["fit", STREET, "-o", tmp_path / "run", "--known-length", text]
+    assert expected in complaint(capsys, *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_known_length_sets_the_scale(tmp_path):
+    """The street's own metres say how long something is; told it is twice that, all doubles."""
+    from climatenerf.cli.fit import with_known_lengths
+    from climatenerf.scene import read_scene
+
+    scene = read_scene(STREET)
+    ends = {"from": np.array([2.0, 6.0, 0.5]), "to": np.array([2.0, 6.0, 2.5])}
+    lines = []
+    for end, place in ends.items():
+        lines.append(f"[POST.{end}]")
+        for view in scene.views:
+            c2w, camera = scene.c2w_world(view), scene.cameras[view.camera]
+            local = (place - c2w[:3, 3]) @ c2w[:3, :3]
+            x, y = camera.project(local)
+            if local[2] > 0.5 and 0 < x < camera.width and 0 < y < camera.height:
+                lines.append(f'"{view.name}" = [{x:.3f}, {y:.3f}]')
+    (tmp_path / "marks.toml").write_text("\n".join(lines))
+    out = with_known_lengths(scene, ("POST=4 m",), tmp_path / "marks.toml")
+    assert out.scale == pytest.approx(2 * scene.scale, rel=1e-3)
+    assert out.scale_source == "known-length" and out.scale_error < 0.01
+
+
 @pytest.mark.parametrize("left", ["optimiser.safetensors", "metrics.json"])
 def test_a_finished_run_is_not_overwritten_whatever_was_deleted(run_folder, tmp_path, capsys, left):
     (tmp_path / "run").mkdir()

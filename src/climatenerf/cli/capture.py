@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.fit import frame_line
+from climatenerf.cli.fit import frame_line, with_known_lengths
 from climatenerf.errors import UserError
 from climatenerf.scene import Scene, read_scene, save_scene
 from climatenerf.scene.georeference import apply_georeference, find_georeference
@@ -30,6 +30,10 @@ class Capture:
     """Most features looked for in a picture."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
+    known_length: tuple[str, ...] = ()
+    """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
+    marks: Path | None = None
+    """Where their ends are in the pictures; default: marks.toml in the scene folder."""
     seed: int = 0
     """Of all randomness."""
 
@@ -40,6 +44,7 @@ def run(options: Capture) -> int:
         raise UserError(f"--features must lie between 64 and 32768; got {options.features}")
     from climatenerf.sfm.diagnose import diagnose
     from climatenerf.sfm.intake import take_in
+    from climatenerf.sfm.mark_page import write_mark_page
     from climatenerf.sfm.reconstruct import load_pycolmap, reconstruct
     from climatenerf.sfm.report import write_report
 
@@ -65,7 +70,12 @@ def run(options: Capture) -> int:
     (options.out / "scene.json").unlink(missing_ok=True)
     scene = read_scene(options.out, camera_height=options.camera_height)
     scene = located(scene, intake, options.camera_height is not None)
-    save_scene(scene, options.out)
+    try:
+        scene = with_known_lengths(scene, options.known_length, options.marks)
+    finally:
+        # The poses are worth keeping, and the page is needed to make marks.
+        save_scene(scene, options.out)
+        write_mark_page(options.out / "mark.html", scene)
     for warning in scene.warnings:
         progress.warn(warning)
     progress.say(frame_line(scene))

@@ -9,8 +9,9 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.errors import UserError
-from climatenerf.scene import read_scene
-from climatenerf.weather.units import OptionalLength
+from climatenerf.scene import Scene, read_scene
+from climatenerf.scene.known_length import FILE_NAME, apply_known_lengths, measure, read_marks
+from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class Fit:
     """Size of the field."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
+    known_length: tuple[str, ...] = ()
+    """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
+    marks: Path | None = None
+    """Where their ends are in the pictures; default: marks.toml in the scene folder."""
     metric_input: bool = False
     """The capture is in metres with z up already."""
     seed: int = 0
@@ -48,10 +53,11 @@ def run(options: Fit) -> int:
         raise UserError("--minutes and --steps must be above 0; try --minutes 5")
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
-    if options.resume and (options.camera_height is not None or options.metric_input):
+    given = options.camera_height is not None or options.metric_input or options.known_length
+    if options.resume and given:
         raise UserError(
-            "a resumed run keeps its scale; leave --camera-height and --metric-input out,"
-            " or fit anew"
+            "a resumed run keeps its scale; leave --camera-height, --known-length and"
+            " --metric-input out, or fit anew"
         )
     scene = read_scene(
         options.scene,
@@ -59,6 +65,7 @@ def run(options: Fit) -> int:
         camera_height=options.camera_height,
         metric_input=options.metric_input,
     )
+    scene = with_known_lengths(scene, options.known_length, options.marks)
     for warning in scene.warnings:
         progress.warn(warning)
     progress.say(frame_line(scene))
@@ -70,7 +77,24 @@ def run(options: Fit) -> int:
     return 0
 
 
-def frame_line(scene) -> str:
+def with_known_lengths(scene: Scene, lengths: tuple[str, ...], marks: Path | None) -> Scene:
+    """The scene in the metres of lengths given as "NAME=2.0 m"."""
+    if not lengths:
+        return scene
+    known = []
+    for text in lengths:
+        name, equals, length = text.partition("=")
+        if not equals:
+            raise UserError(f'--known-length wants a name and a length, "DOOR=2.0 m"; got "{text}"')
+        metres = parse_quantity(length, LENGTH, "--known-length")
+        if not metres > 0:
+            raise UserError(f'--known-length must be above 0; got "{text}"')
+        known.append((name.strip(), metres))
+    placed = read_marks(marks or scene.root / FILE_NAME)
+    return apply_known_lengths(scene, [measure(scene, placed, *one) for one in known])
+
+
+def frame_line(scene: Scene) -> str:
     """How the scene stands in the world, in one line."""
     views = scene.of_split("train")
     heights = sorted(float(scene.c2w_world(view)[2, 3]) - scene.ground_z for view in views)
@@ -89,9 +113,8 @@ def resuming(options: Fit) -> str:
     for option in fields(Fit)[2:]:
         value = getattr(options, option.name)
         # The run keeps its scale itself.
-        if option.name not in ("resume", "camera_height", "metric_input") and (
-            value != option.default
-        ):
+        kept = ("resume", "camera_height", "metric_input", "known_length", "marks")
+        if option.name not in kept and value != option.default:
             words += [f"--{option.name}", str(value)]
     return shlex.join(words)
 

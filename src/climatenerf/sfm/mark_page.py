@@ -1,0 +1,74 @@
+"""A page to mark the ends of known lengths in a scene's pictures: click, copy, save."""
+
+import json
+from pathlib import Path
+
+from climatenerf.scene.scene import Scene
+from climatenerf.storage import write_bytes
+
+_PAGE = """<!doctype html>
+<meta charset="utf-8">
+<title>Mark known lengths</title>
+<style>
+body { font: 15px sans-serif; margin: 1em; }
+textarea { width: 100%; height: 14em; font: 13px monospace; }
+img { max-width: 100%; cursor: crosshair; display: block; margin: .3em 0 1em; }
+</style>
+<h1>Mark known lengths</h1>
+<p>Choose a name and an end, then click where that end is in two pictures or more, taken from places
+well apart. Save the text as <code>marks.toml</code> beside this page, then give
+<code>--known-length "NAME=2.0 m"</code>.</p>
+<p>Name <input id="name" value="DOOR"> end
+<select id="end"><option>from</option><option>to</option></select>
+<button onclick="marks = {}; show()">begin anew</button></p>
+<textarea id="toml" readonly></textarea>
+<div id="pictures"></div>
+<script>
+const pictures = PICTURES;
+let marks = {};
+function show() {
+  let text = "";
+  for (const [name, ends] of Object.entries(marks))
+    for (const [end, places] of Object.entries(ends)) {
+      text += "[" + JSON.stringify(name) + "." + end + "]\\n";
+      for (const [picture, [x, y]] of Object.entries(places))
+        text += JSON.stringify(picture) + " = [" + x + ", " + y + "]\\n";
+    }
+  document.getElementById("toml").value = text;
+}
+for (const picture of pictures) {
+  const title = document.createElement("div"), image = document.createElement("img");
+  title.textContent = picture.name;
+  image.src = picture.file;
+  image.loading = "lazy";
+  image.onclick = event => {
+    const scale = image.naturalWidth / image.clientWidth;
+    const name = document.getElementById("name").value;
+    const end = document.getElementById("end").value;
+    marks[name] ??= {};
+    marks[name][end] ??= {};
+    marks[name][end][picture.name] =
+      [event.offsetX, event.offsetY].map(v => Math.round(v * scale * 10) / 10);
+    show();
+  };
+  document.getElementById("pictures").append(title, image);
+}
+</script>
+"""
+
+
+def write_mark_page(path: Path, scene: Scene) -> None:
+    """Writes the page; pictures are named relative to it."""
+    root = path.parent.absolute()
+    pictures = [
+        {
+            "name": view.name,
+            "file": view.path.relative_to(root).as_posix()
+            if view.path.is_relative_to(root)
+            else view.path.as_uri(),
+        }
+        for view in scene.views
+    ]
+    # Names may hold anything: "</script>" in one must not end the script.
+    listed = json.dumps(pictures).replace("<", "\\u003c")
+    write_bytes(path, _PAGE.replace("PICTURES", listed, 1).encode())
