@@ -1,5 +1,6 @@
 import json
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def test_pictures_stand_as_they_are_meant_to_be_seen(tmp_path, orientation):
     assert r > 200 and g < 60
 
 
-def test_all_kinds_and_sizes_and_what_shares_a_camera(tmp_path):
+def test_all_kinds_and_sizes_and_what_shares_a_camera(tmp_path, monkeypatch):
     folder = tmp_path / "in"
     photo(folder / "a.jpg", (400, 300), exif(equivalent=26))
     photo(folder / "b.jpg", (400, 300), exif(equivalent=26), seed=1)
@@ -58,7 +59,9 @@ def test_all_kinds_and_sizes_and_what_shares_a_camera(tmp_path):
     photo(folder / "wide.webp", (500, 200), seed=4)
     photo(folder / "grey.png").convert("L").save(folder / "grey.png")
     (folder / "notes.txt").write_text("not a photo")
-    taken = take_in(folder, tmp_path / "work", quiet)
+    photo(folder / ".thumbnails" / "a.jpg")
+    monkeypatch.chdir(folder / "sub")
+    taken = take_in(Path(".."), tmp_path / "work", quiet)
     assert [p.source for p in taken.pictures] == [
         "a.jpg", "b.jpg", "c.jpg", "grey.png", "sub/a.png", "wide.webp",
     ]  # fmt: skip

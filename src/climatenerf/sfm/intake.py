@@ -82,7 +82,8 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
         files, base, is_video = frames, work / "frames", True
     else:
         files = sorted(p for p in source.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES)
-        files = [p for p in files if not any(part.startswith(".") for part in p.parts)]
+        hidden = (any(x.startswith(".") for x in p.relative_to(source).parts) for p in files)
+        files = [p for p, is_hidden in zip(files, hidden, strict=True) if not is_hidden]
         base, is_video = source, False
         if not files:
             raise UserError(f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP)")
