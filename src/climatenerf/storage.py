@@ -143,6 +143,8 @@ def read_json(path: Path | str, what: str = "file") -> dict[str, Any]:
         raise UserError(f"{what}: {path} is not text; it is damaged or not JSON") from error
     try:
         value = json.loads(text)
+    except RecursionError as error:
+        raise UserError(f"{what}: {path} is nested too deeply to be sound; restore it") from error
     except json.JSONDecodeError as error:
         raise UserError(
             f"{what}: {path} is not valid JSON (line {error.lineno}, column {error.colno}:"

@@ -52,6 +52,8 @@ def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
     # Again: it goes on with what is there instead of complaining.
     assert cli.main(words) == 0
     assert "Going on" in capsys.readouterr().err
+    (out / "run" / "optimiser.safetensors").unlink()  # as the documents allow
+    assert cli.main(words) == 0
 
 
 def test_ctrl_c_while_fitting_ends_it_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):

@@ -174,6 +174,27 @@ def test_a_shorter_render_leaves_nothing_of_the_longer_one_before_it(run_folder,
     assert len(told["frames"]) == 1 and told["weather"]["smog"]["visibility"] == "50 m"
 
 
+@pytest.mark.parametrize("name", ["frames/0000.png", "movie.mp4", "movie.json", "depth/0000.npz"])
+def test_a_render_overwrites_nothing_that_it_did_not_make(run_folder, tmp_path, capsys, name):
+    mine = tmp_path / "mine" / name
+    mine.parent.mkdir(parents=True)
+    mine.write_bytes(b'{"mine": 1}')
+    words = ["render", run_folder, "-o", tmp_path / "mine", "--layers", "depth", *SMALL]
+    assert mine.name in complaint(capsys, *words)
+    assert mine.read_bytes() == b'{"mine": 1}'
+    assert [p for p in (tmp_path / "mine").rglob("*") if p.is_file()] == [mine]
+
+
+def test_a_path_that_asks_for_huge_frames(run_folder, tmp_path, capsys):
+    entry = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 45}
+    path = {"render_width": 100000, "render_height": 100000, "fps": 5, "camera_path": [entry]}
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    words = ["render", run_folder, "-o", tmp_path / "out", "--path", tmp_path / "path.json"]
+    assert "too large" in complaint(capsys, *words)
+    (tmp_path / "path.json").write_text("[" * 100_000)
+    assert "deeply" in complaint(capsys, *words)
+
+
 def test_frames_keep_their_sidecar_when_there_is_no_movie(
     run_folder, tmp_path, capsys, monkeypatch
 ):
@@ -368,6 +389,9 @@ def test_unknown_names_to_hold_out(tmp_path, capsys):
         (["--path", "still:nobody.jpg"], "nobody.jpg"),
         (["--path", "absent.json"], "absent.json"),
         (["--frames", "0"], "--frames"),
+        (["--fps", "inf"], "frame rate"),
+        (["--supersample", "10000"], "--supersample"),
+        (["--size", "8192x8192", "--supersample", "4"], "too large"),
         (["--weather", "absent.toml"], "absent.toml"),
         (["--smog.visibility", "1 mm"], "smog.visibility"),
     ],

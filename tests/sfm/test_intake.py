@@ -10,7 +10,7 @@ from PIL import Image
 from climatenerf.errors import UserError
 from climatenerf.sfm import intake as module
 from climatenerf.sfm.intake import sharpness, small_grey, take_in
-from climatenerf.sfm.reconstruct import camera_groups
+from climatenerf.sfm.reconstruct import EXHAUSTIVE_UP_TO, camera_groups, pairs_of
 
 
 def quiet(*_):
@@ -180,3 +180,15 @@ def test_records_are_plain_json(tmp_path):
     taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
     record = json.loads((taken.folder / "0.json").read_text())
     assert record["source"] == "0.jpg" and record["width"] == 64
+
+
+def test_which_pictures_are_compared():
+    assert len(pairs_of(20, False)) == 190
+    assert len(pairs_of(EXHAUSTIVE_UP_TO, False)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) / 2
+    for n, is_video in ((500, False), (90, True)):
+        pairs = pairs_of(n, is_video)
+        assert len(set(pairs)) == len(pairs) and all(0 <= i < j < n for i, j in pairs)
+        assert len(pairs) < 0.5 * n * (n - 1) / 2
+        for i in range(n - 1):
+            assert (i, i + 1) in pairs
+        assert (0, n // 10 * 10 - 10) in pairs, "a loop from the end to the start is seen"

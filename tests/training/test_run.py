@@ -16,7 +16,7 @@ from climatenerf.field.presets import PRESETS
 from climatenerf.render.view import render_view
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import with_split
-from climatenerf.storage import read_json, write_json
+from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import run as run_module
 from climatenerf.training.fit import FitSettings
 from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
@@ -260,6 +260,18 @@ def test_a_damaged_run_is_one_clear_sentence(scene, tmp_path, name, damage):
     path = tmp_path / "run" / name
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(UserError):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+
+
+def test_a_run_without_its_optimisers_state_or_with_half_of_it(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=2)
+    path = tmp_path / "run" / "optimiser.safetensors"
+    arrays, about = read_safetensors(path)
+    write_safetensors(path, {k: v for k, v in arrays.items() if k != "generator"}, about)
+    with pytest.raises(UserError, match="damaged.*generator.*rendered but not resumed"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+    path.unlink()
+    with pytest.raises(UserError, match="rendered but not resumed"):
         fitted(scene, tmp_path / "run", steps=4, resume=True)
 
 

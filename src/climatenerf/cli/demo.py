@@ -11,6 +11,7 @@ from climatenerf.cli import progress
 from climatenerf.cli.fit import Fit, fit_with_bars, summary
 from climatenerf.cli.render import parse_size, prepare_stage, render_movie
 from climatenerf.errors import UserError
+from climatenerf.storage import read_json
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
 
@@ -47,10 +48,12 @@ def run(options: Demo) -> int:
         from climatenerf.scene import read_scene
 
         scene = read_scene(street)
+        metrics = finished(run_folder)
         begun = (run_folder / "optimiser.safetensors").exists()
-        if begun:
+        if begun or metrics:
             progress.say(f"Going on with the run in {run_folder}; remove it to begin anew")
-        metrics = fit_with_bars(scene, Fit(street, run_folder, options.minutes, resume=begun))
+        if metrics is None:
+            metrics = fit_with_bars(scene, Fit(street, run_folder, options.minutes, resume=begun))
     if metrics["interrupted"]:
         raise UserError(
             f"stopped while fitting; run it again to go on, the fit so far is in {run_folder}"
@@ -71,10 +74,19 @@ def run(options: Demo) -> int:
     sheet = contact_sheet(rows, SHEET_COLUMNS)
     write_jpeg(options.out / "contact-sheet.jpg", sheet, max_bytes=150_000)
     progress.result(summary(metrics))
+    progress.result(f"run: {run_folder}")
     for movie in movies:
         progress.result(f"movie: {movie}")
     progress.result(f"contact sheet: {options.out / 'contact-sheet.jpg'}")
     return 0
+
+
+def finished(run_folder: Path) -> dict | None:
+    """The metrics of a fit that came to its end, or None."""
+    if not (run_folder / "metrics.json").is_file():
+        return None
+    metrics = read_json(run_folder / "metrics.json", "the run's metrics")
+    return metrics if "psnr" in metrics and not metrics.get("interrupted") else None
 
 
 def _frames(folder: Path) -> list:

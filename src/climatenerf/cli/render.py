@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from climatenerf.render.camera_path import CameraPath
     from climatenerf.render.stage import Stage
 
+MOST_RAYS = 2**26  # in one frame: 6 GB
 LAYER_NAMES = ("depth", "normal", "water_depth", "transmittance", "snow_thickness",
                "mask_water", "mask_snow", "mask_smog")  # fmt: skip
 
@@ -63,8 +64,9 @@ class Render:
 def run(options: Render, arguments: Sequence[str] | None = None) -> int:
     """Renders and says where the result is."""
     size = parse_size(options.size)
-    if options.frames < 1 or options.supersample < 1 or not options.fps > 0:
-        raise UserError("--frames, --supersample and --fps must be above 0")
+    if options.frames < 1 or not 1 <= options.supersample <= 8:
+        raise UserError("--frames must be above 0, --supersample from 1 to 8")
+    check_fps(options.fps)
     film = None if options.weather is None else read_weather(options.weather)
     flags = Weather(options.smog, options.flood, options.snow, options.sun, options.seed)
     given = given_flags(sys.argv[1:] if arguments is None else arguments)
@@ -86,7 +88,9 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
     path = camera_path(options.path, scene, options.frames, size)
     for note in path.notes:
         progress.say(note)
-    fps = path.fps or options.fps
+    fps = check_fps(path.fps or options.fps)
+    check_amount(path.size, options.supersample)
+    check_place(options.out, len(path))
     stage = prepare_stage(field, scene, weather, path, fps)
     movie = render_movie(
         stage, path, fps, options.out, options.supersample, layers, options.layer_format
@@ -103,6 +107,38 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if len(parts) != 2 or not all(p.isdecimal() and 16 <= int(p) <= 8192 for p in parts):
         raise UserError(f'--size wants width x height such as 480x270, 16 to 8192; got "{text}"')
     return int(parts[0]), int(parts[1])
+
+
+def check_fps(fps: float) -> float:
+    """The frame rate itself, if a movie can have it."""
+    if not 0.1 <= fps <= 240:
+        raise UserError(f"the frame rate must lie between 0.1 and 240 per second; got {fps:g}")
+    return fps
+
+
+def check_amount(size: tuple[int, int], supersample: int) -> None:
+    """Refuses frames that would not fit into memory."""
+    rays = size[0] * size[1] * supersample**2
+    if max(size) > 8192 or rays > MOST_RAYS:
+        raise UserError(
+            f"a frame of {size[0]}x{size[1]} pixels with {supersample}x{supersample} rays each is"
+            f" too large; at most 8192 pixels a side and {MOST_RAYS / 1e6:.0f} million rays"
+        )
+
+
+def check_place(out: Path, frames: int) -> None:
+    """Refuses a folder in which a render would overwrite what is not an earlier render's."""
+    ours = files_of_render(out)
+    planned = [out / "frames" / f"{index:04d}.png" for index in range(frames)]
+    planned += [out / name for name in ("movie.mp4", "movie.json") if not ours]
+    for name in LAYER_NAMES:
+        planned += [p for p in (out / name).glob("*") if p.stem.isdecimal()]
+    for path in planned:
+        if path.exists() and path.resolve() not in ours:
+            raise UserError(
+                f"{path} was not made by the render that {out} holds, and would be overwritten;"
+                " choose another folder with -o, or remove it"
+            )
 
 
 def prepare_stage(field, scene, weather: KeyframedWeather, path: "CameraPath", fps: float):

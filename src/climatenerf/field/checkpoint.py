@@ -36,6 +36,8 @@ def load_field(run: Path) -> Field:
         UserError: there is none, it is damaged, or a newer version wrote it.
     """
     path = run / FILE_NAME
+    if not run.exists():
+        raise UserError(f"{run} does not exist; give a run folder made by `climatenerf fit`")
     if not path.is_file():
         raise UserError(
             f"{run} holds no {FILE_NAME}, so it is no finished run; make one with"

@@ -166,7 +166,7 @@ def _trace(
         transmittance=air,
         water_depth=water_depth * (water_share > LEAST_SHARE),
         snow_thickness=thickness,
-        mask_water=water_share,
+        mask_water=water_share.clamp_max(1.0),
         mask_snow=snow_share,
         mask_smog=1 - air,
     )

@@ -158,7 +158,7 @@ def load_scene(folder: Path | str) -> Scene:
         data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"There is no {FILE_NAME} in {path.parent}; give a scene folder.") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(
             f"{path} cannot be read ({error}); read the capture again to make a new one."
         ) from None

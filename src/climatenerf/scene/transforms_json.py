@@ -70,6 +70,11 @@ def read_transforms(root: Path) -> Capture:
         cloud = data.get("ply_file_path")
         if isinstance(cloud, str) and (base / cloud).is_file():
             points = read_points(base / cloud)
+    if unlisted and not views:
+        raise UserError(
+            f"The lists of {files[0].name} (train_filenames, ...) name none of its frames; correct"
+            " them, or remove them to have every 8th picture held out."
+        )
     return Capture(
         root=base,
         source="transforms",
@@ -88,7 +93,7 @@ def read_transforms(root: Path) -> Capture:
 def _load(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is not readable JSON ({error}); export it again.") from None
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:

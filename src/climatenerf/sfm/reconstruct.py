@@ -1,7 +1,6 @@
 """Poses by structure from motion: features, matches, incremental mapping, undistortion (COLMAP).
 
-Each stage leaves its result in the work folder, so that a run that was stopped goes on. pycolmap
-works in C++; how far it is, is read from its database meanwhile.
+Each stage leaves its result in the work folder, so that a run that was stopped goes on.
 """
 
 import contextlib
@@ -18,6 +17,8 @@ from climatenerf.storage import make_folder, read_json, write_json
 
 EXHAUSTIVE_UP_TO = 120  # photos; beyond, and for video, neighbours in time and loops are compared
 OVERLAP = 10  # neighbours in time to each side
+PICTURES_AT_ONCE = 6  # in one call for features: the bar moves in between
+TILE = 16  # pictures against as many in one call for matches
 ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
 LEAST_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
 
@@ -75,21 +76,8 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     _forget_if_changed(intake, database, features)
     names = [picture.name for picture in intake.pictures]
     _import(pycolmap, intake, database)
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.sift.max_num_features = features
-    _watched(
-        lambda token: pycolmap.extract_features(
-            database,
-            intake.folder,
-            names,
-            extraction_options=extraction,
-            cancellation_token=token,
-        ),
-        pycolmap,
-        lambda: _count(database, "keypoints") / len(names),
-        lambda share: tell("features", share),
-    )
-    _match(pycolmap, intake, database, seed, tell)
+    _extract(pycolmap, intake, database, names, features, tell)
+    _match(pycolmap, database, names, pairs_of(len(names), intake.is_video), seed, tell)
     models = _map(pycolmap, intake, database, work / "models", seed, tell)
     best = max(models, key=lambda m: m.num_reg_images())
     out = work / "undistorted"
@@ -151,43 +139,70 @@ def _import(pycolmap, intake: Intake, database: Path) -> None:
         pycolmap.import_images(database, intake.folder, pycolmap.CameraMode.SINGLE, new, options)
 
 
-def _match(pycolmap, intake: Intake, database: Path, seed: int, tell: Told) -> None:
-    n = len(intake.pictures)
+def _extract(
+    pycolmap, intake: Intake, database: Path, names: list[str], features: int, tell: Told
+) -> None:
+    options = pycolmap.FeatureExtractionOptions()
+    options.sift.max_num_features = features
+    for start in range(0, len(names), PICTURES_AT_ONCE):
+        tell("features", start / len(names))
+        some = names[start : start + PICTURES_AT_ONCE]
+
+        def work(token, some: list[str] = some) -> None:
+            pycolmap.extract_features(
+                database,
+                intake.folder,
+                some,
+                extraction_options=options,
+                cancellation_token=token,
+            )
+
+        _interruptible(pycolmap, work)
+    tell("features", 1.0)
+
+
+def pairs_of(n: int, is_video: bool) -> list[tuple[int, int]]:
+    """Which pictures are compared: all with all, or in long sequences neighbours and loops.
+
+    Neighbours are those up to `OVERLAP` apart, and 16, 32, ... apart; every tenth picture is
+    compared with every tenth, which closes loops without a vocabulary to download.
+    """
+    if n <= EXHAUSTIVE_UP_TO and not is_video:
+        return [(i, j) for i in range(n) for j in range(i + 1, n)]
+    steps = [*range(1, OVERLAP + 1), 16, 32]
+    near = {(i, i + step) for i in range(n) for step in steps if i + step < n}
+    some = range(0, n, OVERLAP)
+    return sorted(near | {(i, j) for i in some for j in some if i < j})
+
+
+def _match(
+    pycolmap,
+    database: Path,
+    names: list[str],
+    pairs: list[tuple[int, int]],
+    seed: int,
+    tell: Told,
+) -> None:
     pycolmap.set_random_seed(seed)
-    if n <= EXHAUSTIVE_UP_TO and not intake.is_video:
-        expected = n * (n - 1) / 2
-
-        def work(token) -> None:
-            pycolmap.match_exhaustive(database, cancellation_token=token)
-
-    else:
-        pairing = pycolmap.SequentialPairingOptions()
-        pairing.overlap = OVERLAP
-        expected = n * (OVERLAP + 5)
-
-        def work(token) -> None:
-            pycolmap.match_sequential(database, pairing_options=pairing, cancellation_token=token)
-            _match_loops(pycolmap, database, token)
-
-    _watched(
-        work,
-        pycolmap,
-        lambda: _count(database, "two_view_geometries") / expected,
-        lambda share: tell("matches", share),
-    )
-
-
-def _match_loops(pycolmap, database: Path, token) -> None:
-    """Every tenth picture against every tenth: closes loops without a vocabulary to download."""
-    names = sorted(_names(database))
-    some = names[:: max(1, OVERLAP)]
-    pairs = database.with_name("loops.txt")
-    lines = [f"{a} {b}" for i, a in enumerate(some) for b in some[i + 2 :]]
-    if lines:
-        pairs.write_text("\n".join(lines) + "\n")
+    # Tile by tile, so that a picture's features are read once for many comparisons.
+    tiles: dict[tuple[int, int], list[str]] = {}
+    for i, j in pairs:
+        key = (i // TILE, j // TILE)
+        tiles.setdefault(key, []).append(f"{names[i]} {names[j]}")
+    done = 0
+    listing = database.with_name("pairs.txt")
+    for key in sorted(tiles):
+        tell("matches", done / len(pairs))
+        listing.write_text("\n".join(tiles[key]) + "\n")
         options = pycolmap.ImportedPairingOptions()
-        options.match_list_path = pairs
-        pycolmap.match_image_pairs(database, pairing_options=options, cancellation_token=token)
+        options.match_list_path = listing
+
+        def work(token, options=options) -> None:
+            pycolmap.match_image_pairs(database, pairing_options=options, cancellation_token=token)
+
+        _interruptible(pycolmap, work)
+        done += len(tiles[key])
+    tell("matches", 1.0)
 
 
 def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell: Told) -> list:
@@ -241,19 +256,17 @@ def _map_once(
         )
         found.update(models)
 
-    _watched(
-        work,
-        pycolmap,
-        lambda: placed / len(intake.pictures),
-        lambda share: tell("poses", share),
-    )
+    _interruptible(pycolmap, work, lambda: tell("poses", min(0.99, placed / len(intake.pictures))))
+    tell("poses", 1.0)
     return found
 
 
-def _watched(
-    work: Callable, pycolmap, share: Callable[[], float], tell: Callable[[float], None]
-) -> None:
-    """Runs work in a thread and tells how far it is; Ctrl-C cancels it cleanly."""
+def _interruptible(pycolmap, work: Callable, meanwhile: Callable[[], None] = lambda: None) -> None:
+    """Runs work in a thread, so that Ctrl-C reaches it as a request to end, not as a crash.
+
+    Nothing else may open the database meanwhile: two SQLite libraries in one process break each
+    other's locks.
+    """
     token = pycolmap.CancellationToken()
     failure: list[BaseException] = []
 
@@ -268,32 +281,23 @@ def _watched(
     try:
         while thread.is_alive():
             thread.join(0.5)
-            with contextlib.suppress(sqlite3.Error):
-                tell(min(0.999, share()))
+            meanwhile()
     except KeyboardInterrupt:
         token.cancel()
         thread.join()
         raise
     if failure:
         raise failure[0]
-    tell(1.0)
-
-
-def _count(database: Path, table: str) -> int:
-    with contextlib.closing(_open(database)) as connection:
-        return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
 
 
 def _names(database: Path) -> list[str]:
     if not database.is_file():
         return []
     try:
-        with contextlib.closing(_open(database)) as connection:
+        with contextlib.closing(
+            sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=1.0)
+        ) as connection:
             return [row[0] for row in connection.execute("SELECT name FROM images")]
     except sqlite3.Error:
         database.unlink()  # half written: begun anew
         return []
-
-
-def _open(database: Path) -> sqlite3.Connection:
-    return sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=1.0)

@@ -200,6 +200,11 @@ def check_folder(scene: Scene, run: Path, resume: bool) -> None:
     has_config = (run / "config.json").is_file()
     if resume and not has_config:
         raise UserError(f"{run} holds no run to resume; leave --resume out to begin one")
+    if resume and not (run / OPTIMISER).is_file():
+        raise UserError(
+            f"{run} holds no {OPTIMISER}, without which it can be rendered but not resumed; fit"
+            " anew into another folder"
+        )
     if not resume and (run / "scene.json").exists() and not has_config:
         raise UserError(f"{run} holds a scene, which would be overwritten; choose another -o")
     # Of a checkpoint's files the optimiser's is written last: before it there is nothing to lose.
@@ -258,6 +263,16 @@ def restore(fitting: Fitting, run: Path) -> None:
         fitting.field.load_state_dict(field.state_dict())
     fitting.field.unit, fitting.field.near = field.unit, field.near
     arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    try:
+        _restore_state(fitting, arrays)
+    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+        raise UserError(
+            f"{run / OPTIMISER} is damaged ({type(error).__name__}: {error}); the run can be"
+            " rendered but not resumed, fit anew into another folder"
+        ) from error
+
+
+def _restore_state(fitting: Fitting, arrays: dict) -> None:
     state = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}
     fitting.grid_adam.load(
         {k.removeprefix("grid."): v for k, v in state.items() if k.startswith("grid.")}

@@ -56,9 +56,13 @@ def read_weather(path: Path) -> KeyframedWeather:
         with path.open("rb") as file:
             table = tomllib.load(file)
     except OSError as error:
-        raise UserError(f"cannot read the weather file {path}: {error.strerror}") from error
+        raise UserError(
+            f"cannot read the weather file {path}: {error.strerror}; check the path"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"the weather file {path} is not valid TOML: {error}") from error
+        raise UserError(
+            f"the weather file {path} is not valid TOML: {error}; correct it"
+        ) from error
     try:
         return weather_from_table(table)
     except UserError as error:
