@@ -23,10 +23,10 @@ SNOW = 0.15
 # Where each is flooded to (ditch: its datum is the street, the channel lies below), how much of
 # the picture must then show water, and from where it is looked at.
 CAPTURES = {
-    "ditch": {"level": "-1.5 m", "least_water": 0.05, "downscale": 2},
-    "stone_sign": {"level": "0.3 m", "least_water": 0.10, "downscale": 2},
-    "kitti_drive": {"level": "0.3 m", "least_water": 0.05, "downscale": 2},
-    "fox": {"level": "0.3 m", "least_water": 0.0, "downscale": 1},
+    "ditch": {"level": "-1.5 m", "least_water": 0.05, "least_snow": 0.05, "downscale": 2},
+    "stone_sign": {"level": "0.3 m", "least_water": 0.10, "least_snow": 0.15, "downscale": 2},
+    "kitti_drive": {"level": "0.3 m", "least_water": 0.05, "least_snow": 0.05, "downscale": 2},
+    "fox": {"level": "0.3 m", "least_water": 0.02, "least_snow": 0.0, "downscale": 1},
 }
 FLAGS = {
     "smog": ["--smog.visibility", f"{VISIBILITY} m"],
@@ -160,12 +160,15 @@ def test_the_water_mirrors_the_place(fitted, monkeypatch):
     assert -10 * np.log10(float(error)) > 35
 
 
-def test_snow_lies_as_deep_as_asked_for(rendered):
+def test_snow_lies_as_deep_as_asked_for(fitted, rendered):
     layers = rendered["snow"]
-    snowy = layers["mask_snow"] > 0.5  # a short fit's surfaces are soft and shine through
-    assert snowy.mean() > 0.01
-    assert np.median(layers["snow_thickness"][snowy]) == pytest.approx(SNOW, rel=0.35)
     assert (layers["snow_thickness"][layers["mask_snow"] == 0] == 0).all()
+    snowy = layers["mask_snow"] > 0.5  # a short fit's surfaces are soft and shine through
+    if CAPTURES[fitted[0]]["least_snow"] == 0:
+        pytest.skip("a wall: hardly anything lies level in this picture")
+    assert snowy.mean() > CAPTURES[fitted[0]]["least_snow"]
+    # Within 10 % over known planes (test_snow.py); here the ground is rough and soft.
+    assert np.median(layers["snow_thickness"][snowy]) == pytest.approx(SNOW, rel=0.45)
 
 
 def test_sheltered_places_stay_bare(fitted, rendered):
