@@ -1,44 +1,108 @@
 """How good are poses from bare photos, against a capture's given poses, and how long do they take?
 
-python benchmarks/capture_quality.py --captures ditch stone_sign --keep scenes
+python benchmarks/capture_quality.py --captures ditch stone_sign --keep scenes --fit-steps 1500
 
 Captures are names in ../shared/data; their images/ are taken as bare photos. Positions are compared
 after the similarity that fits best, rotations after the rotation that fits best; up is compared
 with the up that the reader finds from the given poses.
+
+With --exif the photos are copies: GPS places at the given cameras (in the given scene's metres,
+with an error of 0.5 % of the extent on each axis), every third stored on its side with the tag that
+turns it, every fourth at three quarters of the size. `scale` then is the found scene's metres over
+the given ones.
+
+With --fit-steps a field is fitted by as many steps to the given poses, to the found ones with the
+photos as they are (the capture's COLMAP model before undistortion, so the same pixels), and to the
+found scene (undistorted pictures); each is measured on its held-out photos, the same ones.
 """
 
 import argparse
+import json
+import math
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 from common import CAPTURES, command, report
+from PIL import ExifTags, Image
 
-from climatenerf.scene import load_scene, read_scene
+from climatenerf.scene import Scene, load_scene, read_scene
+
+HOME = (47.3769, 8.5417)  # degrees, where the copies are said to be taken
+GPS_NOISE = 0.005  # of the extent
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--captures", nargs="+", default=["ditch", "stone_sign"])
     parser.add_argument("--keep", type=Path, help="folder for the scenes; default: thrown away")
+    parser.add_argument("--exif", action="store_true", help="copies with GPS, turned, of two sizes")
+    parser.add_argument("--fit-steps", type=int, default=0, help="0: no fits")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         for name in options.captures:
             out = (options.keep or Path(temporary)) / name
-            start = time.perf_counter()
+            given = read_scene(CAPTURES / name)
             photos = CAPTURES / name / "images"
+            if options.exif:
+                photos = copies(given, Path(temporary) / f"{name}-copies", options.seed)
+            start = time.perf_counter()
             command("capture", str(photos), "-o", str(out), "--seed", str(options.seed))
             seconds = time.perf_counter() - start
-            rows.append({"capture": name, "seconds": round(seconds, 1), **compared(name, out)})
-    report("poses from bare photos against given ones", rows, options.seed)
+            row = {"capture": name, "seconds": round(seconds, 1)}
+            row |= compared(given, load_scene(out))
+            if options.fit_steps:
+                same = Path(temporary) / f"{name}-same"
+                model = str(out / "work" / "chosen")
+                command("capture", str(photos), "--from-colmap", model, "-o", str(same))
+                scenes = {"given": CAPTURES / name, "found": same, "found, undistorted": out}
+                row["heldout"] = {
+                    poses: fitted(scene, Path(temporary) / f"{name}-{poses}", options)
+                    for poses, scene in scenes.items()
+                }
+            rows.append(row)
+    question = "poses from bare photos against given ones"
+    report(question + (", copies with EXIF" if options.exif else ""), rows, options.seed)
 
 
-def compared(name: str, out: Path) -> dict:
-    """Registered share, and how far positions, rotations and up are from the given ones."""
-    given, found = read_scene(CAPTURES / name), load_scene(out)
+def copies(given: Scene, folder: Path, seed: int) -> Path:
+    """Photos of a scene with GPS, some turned, some smaller; see above."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir()
+    places = np.stack([given.c2w_world(view)[:3, 3] for view in given.views])
+    noise = GPS_NOISE * np.linalg.norm(np.ptp(places, axis=0))
+    north_m = 111132.954 - 559.822 * math.cos(2 * math.radians(HOME[0]))
+    east_m = 111412.84 * math.cos(math.radians(HOME[0]))
+    for number, (view, place) in enumerate(zip(given.views, places, strict=True)):
+        x, y = place[:2] + noise * rng.normal(size=2)
+        image = Image.open(view.path).convert("RGB")
+        if number % 4 == 3:
+            image = image.resize((image.width * 3 // 4, image.height * 3 // 4))
+        data = Image.Exif()
+        gps = data.get_ifd(ExifTags.IFD.GPSInfo)
+        gps[ExifTags.GPS.GPSLatitudeRef], gps[ExifTags.GPS.GPSLongitudeRef] = "N", "E"
+        gps[ExifTags.GPS.GPSLatitude] = (HOME[0] + y / north_m, 0.0, 0.0)
+        gps[ExifTags.GPS.GPSLongitude] = (HOME[1] + x / east_m, 0.0, 0.0)
+        if number % 3 == 0:
+            data[ExifTags.Base.Orientation] = 6
+            image = image.transpose(Image.Transpose.ROTATE_90)
+        image.save(folder / f"{Path(view.name).stem}.jpg", quality=95, exif=data)
+    return folder
+
+
+def fitted(scene: Path, run: Path, options: argparse.Namespace) -> dict:
+    """Quality of a fit of so many steps on held-out photos."""
+    words = ["--steps", str(options.fit_steps), "--minutes", "60", "--seed", str(options.seed)]
+    command("fit", str(scene), "-o", str(run), *words)
+    measured = json.loads((run / "metrics.json").read_text())
+    return {key: measured[key] for key in ("psnr", "psnr_cc", "ssim", "steps", "seconds")}
+
+
+def compared(given: Scene, found: Scene) -> dict:
+    """Registered share, and how far positions, rotations, up and scale are from the given ones."""
     by_stem = {Path(view.name).stem: view for view in given.views}
     own = np.stack([found.c2w_world(view) for view in found.views])
     true = np.stack([given.c2w_world(by_stem[Path(view.name).stem]) for view in found.views])
@@ -60,6 +124,9 @@ def compared(name: str, out: Path) -> dict:
         },
         "rotation_degrees": {"median": float(np.median(angle)), "most": float(angle.max())},
         "up_degrees": float(np.degrees(np.arccos(min(1.0, turn[2, 2])))),
+        "scale_source": found.scale_source,
+        "scale": float(1 / scale),
+        "scale_error_told": found.scale_error,
     }
 
 

@@ -7,6 +7,7 @@ from scene_builders import look_at, ring
 
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.scene.georeference import apply_georeference, east_north, find_georeference
+from climatenerf.scene.scale import scale_warnings
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
 HOME = np.array([47.3769, 8.5417])
@@ -62,7 +63,8 @@ def test_scale_and_heading(tmp_path, noise):
     assert out.scale == pytest.approx(found.scale) and out.scale_source == "gps"
     assert out.ground_z == 0 and out.lowest_ground_z == pytest.approx(-2 * found.scale)
     assert out.warnings == ("Something else.",)
-    assert out.up_report["gps"]["photos"] == 24
+    assert out.georeference["photos"] == 24
+    assert out.scale_report["camera-height-assumed"]["times"] == pytest.approx(1 / found.scale)
     # x is east, y is north.
     origin = np.array(found.origin)
     for view in out.views:
@@ -89,12 +91,14 @@ def test_a_third_of_wild_fixes_does_no_harm(tmp_path):
 
 
 def test_a_scale_that_is_known_better_is_kept(tmp_path):
-    scene = replace(scene_of(ring(24, radius=15.0), tmp_path), scale_source="camera-height")
+    scene = scene_of(ring(24, radius=15.0), tmp_path)
+    scene = replace(scene, scale_source="camera-height", scale_error=0.05)
     found = find_georeference(scene, places_of(scene, 1.7, 2.1))
     assert found is not None
     out = apply_georeference(scene, found, keep_scale=True)
     assert out.scale == pytest.approx(1.0) and out.scale_source == "camera-height"
-    assert out.up_report["gps"]["metres_by_gps_per_metre"] == pytest.approx(1.7, rel=1e-3)
+    assert out.scale_report["gps"]["times"] == pytest.approx(1.7, rel=1e-3)
+    assert scale_warnings(out) and "gps makes the scene 1.70 times" in scale_warnings(out)[0]
 
 
 @pytest.mark.parametrize("what", ["few", "one spot", "noise"])

@@ -57,7 +57,8 @@ def test_the_scene_is_scaled_about_its_ground(scene):
     height = scene.c2w_world(scene.views[0])[2, 3] - 0.5
     assert out.c2w_world(out.views[0])[2, 3] - 0.5 == pytest.approx(1.5 * height)
     assert out.warnings == ("Other.",)
-    assert out.up_report["known_lengths"]["DOOR"]["known_m"] == 3.0
+    said = out.scale_report["camera-height-assumed"]
+    assert said == {"times": pytest.approx(1 / 1.5), "error": 0.3}
 
 
 def test_several_lengths_and_their_disagreement(scene):

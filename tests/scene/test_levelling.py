@@ -111,6 +111,44 @@ def test_common_pitch_is_found_by_lines_and_reported(tmp_path):
     assert any("Up is uncertain: cameras" in w for w in out.warnings)
 
 
+def felt(scene, up, tilt=0.0):
+    """What accelerometers tell of cameras, alternately tilted by some degrees."""
+    down = {}
+    for i, view in enumerate(scene.views):
+        local = view.c2w[:3, :3].T @ -up
+        a = np.radians(tilt if i % 2 else -tilt)
+        turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        down[view.name] = tuple(turn @ local)
+    return down
+
+
+def test_gravity_leads_where_pictures_cannot_tell(tmp_path):
+    # From a drone: all cameras look straight down, so that their own axes say nothing of up.
+    poses = [look_at((x, 0, 20.0), (x, 0.001, 0.0)) for x in range(-4, 5)]
+    scene, up = scene_from(tmp_path, poses, None, street()[1], seed=2)
+    assert degrees(used_up(level(scene)), up) > 45
+    out = level(scene, gravity=felt(scene, up, tilt=2.0))
+    assert degrees(used_up(out), up) < 1 and out.up_report["used"].startswith("gravity")
+    assert out.up_report["cameras"] > 45
+    assert any("Up is uncertain: cameras" in w for w in out.warnings)
+
+
+def test_gravity_that_contradicts_itself_or_is_rare_is_left_out(tmp_path):
+    points, posts = street()
+    scene, up = scene_from(tmp_path, ring(9), points, posts)
+    wild = felt(scene, up)
+    rng = np.random.default_rng(0)
+    for name in wild:
+        v = rng.normal(size=3)
+        wild[name] = tuple(v / np.linalg.norm(v))
+    rare = dict(list(felt(scene, up).items())[:2])
+    for gravity in (wild, rare):
+        out = level(scene, gravity=gravity)
+        assert "gravity" not in out.up_report and degrees(used_up(out), up) < 1
+    one_wrong = felt(scene, up) | {scene.views[0].name: (0.0, 0.0, 1.0)}
+    assert level(scene, gravity=one_wrong).up_report["gravity"] < 1
+
+
 def test_metric_input_is_kept_exactly(tmp_path):
     points, posts = street()
     points = points + (0, 0, 42.0)

@@ -1,5 +1,6 @@
 """Photos with EXIF, written by the tests themselves."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,24 @@ def degrees(value: float) -> tuple[float, float, float]:
     return float(int(value)), float(int(minutes)), (minutes % 1) * 60
 
 
-def exif(orientation=1, focal=None, equivalent=None, place=None, camera=("Maker", "Model 5")):
-    """An EXIF block: mm, 35 mm equivalent, (latitude, longitude, altitude)."""
+def apple_note(vector):
+    """An iPhone's maker note with an acceleration vector, g, behind another entry."""
+    entries = struct.pack(">HHII", 1, 9, 1, 14) + struct.pack(">HHII", 8, 10, 3, 14 + 2 + 24 + 4)
+    numbers = [part for value in vector for part in (round(value * 10000), 10000)]
+    head = b"Apple iOS\0\0\1MM" + struct.pack(">H", 2)
+    return head + entries + struct.pack(">I", 0) + struct.pack(">6i", *numbers)
+
+
+def exif(
+    orientation=1,
+    focal=None,
+    equivalent=None,
+    place=None,
+    camera=("Maker", "Model 5"),
+    gravity=None,
+    lens=None,
+):
+    """An EXIF block: mm, 35 mm equivalent, (latitude, longitude, altitude), a phone's vector."""
     data = Image.Exif()
     data[Base.Orientation] = orientation
     if camera:
@@ -25,6 +42,10 @@ def exif(orientation=1, focal=None, equivalent=None, place=None, camera=("Maker"
         detail[Base.FocalLength] = focal
     if equivalent is not None:
         detail[Base.FocalLengthIn35mmFilm] = equivalent
+    if gravity is not None:
+        detail[Base.MakerNote] = apple_note(gravity)
+    if lens is not None:
+        detail[Base.LensModel] = lens
     if place is not None:
         gps = data.get_ifd(ExifTags.IFD.GPSInfo)
         gps[GPS.GPSLatitudeRef] = "N" if place[0] >= 0 else "S"

@@ -143,3 +143,53 @@ def test_without_pycolmap_the_remedy_is_told(tmp_path, capsys, monkeypatch):
     photo(tmp_path / "in" / "0.jpg")
     assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
     assert "climatenerf[capture]" in capsys.readouterr().err
+
+
+def street_photo(number, size):
+    """A large picture with as much detail as the street's photos have."""
+    view = sorted((STREET / "images").iterdir())[number]
+    return Image.open(view).convert("RGB").resize(size, Image.Resampling.BICUBIC)
+
+
+def turned(picture, focal, yaw, pitch, size=(320, 240), lens=350.0):
+    """What a camera sees that is turned in the centre of a picture of the surroundings."""
+    a, b = math.radians(yaw), math.radians(pitch)
+    about_y = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+    about_x = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
+    k0 = np.array([[focal, 0, picture.width / 2], [0, focal, picture.height / 2], [0, 0, 1]])
+    k1 = np.array([[lens, 0, size[0] / 2], [0, lens, size[1] / 2], [0, 0, 1]])
+    h = k0 @ about_y @ about_x @ np.linalg.inv(k1)
+    coefficients = (h / h[2, 2]).ravel()[:8]
+    return picture.transform(
+        size, Image.Transform.PERSPECTIVE, coefficients, Image.Resampling.BICUBIC
+    )
+
+
+def test_photos_from_one_spot_are_told_so(tmp_path, capsys):
+    around = street_photo(10, (1536, 864))
+    (tmp_path / "in").mkdir()
+    for i, (yaw, pitch) in enumerate([(-9, 0), (-5, 3), (0, 0), (4, -3), (8, 2), (2, 5)]):
+        turned(around, 1200, yaw, pitch).save(tmp_path / "in" / f"{i}.jpg", quality=95)
+    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+    err = capsys.readouterr().err
+    assert "from one spot" in err and "Traceback" not in err
+    assert not (tmp_path / "scene" / "scene.json").exists()
+
+
+@pytest.mark.slow
+def test_of_two_places_the_larger_is_kept(tmp_path, capsys):
+    """Mirrored photos are those of another place: nothing in them fits the others."""
+    views = sorted((STREET / "images").iterdir())
+    (tmp_path / "in").mkdir()
+    for path in views[:16]:
+        shutil.copy(path, tmp_path / "in" / f"here-{path.stem}{path.suffix}")
+    for path in views[:9]:
+        mirrored = Image.open(path).convert("RGB").transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+        mirrored.save(tmp_path / "in" / f"there-{path.stem}.jpg", quality=95)
+    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 0
+    told = capsys.readouterr()
+    assert re.search(r"2 groups that do not fit together \(1\d, [789] pictures\)", told.err)
+    assert "cut off from the rest" in told.err
+    names = [view.name for view in load_scene(tmp_path / "scene").views]
+    assert len(names) >= 12 and all(name.startswith("here-") for name in names)
+    assert "Groups that do not fit together" in (tmp_path / "scene" / "report.md").read_text()

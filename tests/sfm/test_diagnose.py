@@ -1,8 +1,13 @@
 import sqlite3
+from dataclasses import replace
 
-from climatenerf.sfm.diagnose import diagnose, verified_matches
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from climatenerf.sfm.diagnose import diagnose, turned_only, verified_matches
 from climatenerf.sfm.exif import Exif
 from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.reconstruct import groups_of
 
 PAIR = 2147483647
 
@@ -47,3 +52,50 @@ def test_each_reason(tmp_path):
     assert "ambiguous" in reasons["odd"].reason
     assert reasons["far2"].neighbours == (("far1.jpg", 200),)
     assert reasons["soft"].source == "soft.HEIC"
+
+
+def flat_pairs(path, maps, general=0):
+    """A database of pairs that one homography each explains, and some that none does."""
+    with sqlite3.connect(path) as connection:
+        connection.execute("CREATE TABLE images (image_id INTEGER, name TEXT)")
+        connection.execute(
+            "CREATE TABLE two_view_geometries"
+            " (pair_id INTEGER, rows INTEGER, config INTEGER, H BLOB)"
+        )
+        for i in range(len(maps) + general + 1):
+            connection.execute("INSERT INTO images VALUES (?, ?)", (i + 1, f"{i}.jpg"))
+        for i, h in enumerate(maps):
+            row = (PAIR + i + 2, 90, 6, np.ascontiguousarray(h).tobytes())
+            connection.execute("INSERT INTO two_view_geometries VALUES (?, ?, ?, ?)", row)
+        for i in range(len(maps), len(maps) + general):
+            row = (PAIR + i + 2, 90, 3, np.zeros((3, 3)).tobytes())
+            connection.execute("INSERT INTO two_view_geometries VALUES (?, ?, ?, ?)", row)
+    pictures = tuple(picture(str(i)) for i in range(len(maps) + general + 1))
+    pictures = tuple(replace(p, name=f"{i}.jpg") for i, p in enumerate(pictures))
+    return Intake(path.parent, pictures, {}, False), path
+
+
+def plane_maps(step, count=8, focal=1.3):
+    """Homographies between views of a plane 5 m away, from places `step` metres apart."""
+    rng = np.random.default_rng(0)
+    k = np.array([[focal * 640, 0, 320], [0, focal * 640, 240], [0, 0, 1.0]])
+    maps = []
+    for _ in range(count):
+        turn = Rotation.from_rotvec(rng.normal(0, 0.15, 3)).as_matrix()
+        away = rng.normal(size=3)
+        shift = np.outer(step * away / np.linalg.norm(away), [0, 0.3, 0.95]) / 5.0
+        maps.append(3.7 * k @ (turn + shift) @ np.linalg.inv(k))
+    return maps
+
+
+def test_turning_alone_is_told_from_walking_past_a_wall(tmp_path):
+    assert turned_only(*flat_pairs(tmp_path / "a.db", plane_maps(0.0)))
+    assert turned_only(*flat_pairs(tmp_path / "b.db", plane_maps(0.02)))
+    assert not turned_only(*flat_pairs(tmp_path / "c.db", plane_maps(0.5)))
+    assert not turned_only(*flat_pairs(tmp_path / "d.db", plane_maps(0.0), general=4))
+    assert not turned_only(*flat_pairs(tmp_path / "e.db", []))
+
+
+def test_a_group_is_what_no_larger_one_holds():
+    assert groups_of([set("abc"), set("abcdefg"), set("defgx"), set("uvwa")]) == [7, 3]
+    assert groups_of([set("abcd")]) == [4]

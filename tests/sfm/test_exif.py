@@ -36,3 +36,63 @@ def test_altitude_that_is_missing_is_nan(tmp_path):
     photo(tmp_path / "a.jpg", data=data)
     place = read_exif(Image.open(tmp_path / "a.jpg")).place
     assert place is not None and place[:2] == pytest.approx((10, 20)) and math.isnan(place[2])
+
+
+# Vectors as phones have written them, with what was held how: see docs/physics.md.
+@pytest.mark.parametrize(
+    ("vector", "size", "orientation", "shown"),
+    [
+        (
+            (-0.9878, -0.0050, 0.0294),
+            (400, 300),
+            1,
+            (0.005, 1.0, -0.03),
+        ),  # lying on its left side
+        ((0.0799, -0.8649, -0.4764), (400, 300), 6, (0.08, 0.87, 0.48)),  # upright, looking down
+        ((0.0799, -0.8649, -0.4764), (300, 400), 1, (0.08, 0.87, 0.48)),  # stored upright
+        ((0.99, 0.0, -0.1), (400, 300), 3, (0.0, 1.0, 0.1)),  # on its right side
+        ((0.0, 0.99, -0.1), (400, 300), 8, (0.0, 1.0, 0.1)),  # upside down
+    ],
+)
+def test_a_phones_sense_of_down(tmp_path, vector, size, orientation, shown):
+    photo(tmp_path / "a.jpg", size, exif(orientation, gravity=vector))
+    found = read_exif(Image.open(tmp_path / "a.jpg"))
+    assert found.orientation == orientation
+    assert found.down_as_shown == pytest.approx(shown, abs=0.02)
+    assert math.hypot(*found.down) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        exif(3, gravity=(-0.99, 0.0, 0.0)),  # would stand on its head
+        exif(1, gravity=(-0.6, 0.0, 0.0)),  # shaken
+        exif(1, gravity=(-0.99, 0.0, 0.0), lens="iPhone front camera 2.87mm f/2.2"),
+        exif(2, gravity=(-0.99, 0.0, 0.0)),  # mirrored
+        exif(1),
+    ],
+)
+def test_a_sense_of_down_that_is_not_to_be_trusted(tmp_path, data):
+    photo(tmp_path / "a.jpg", (400, 300), data)
+    assert read_exif(Image.open(tmp_path / "a.jpg")).down_as_shown is None
+
+
+def test_maker_notes_that_are_cut_or_wrong(tmp_path):
+    whole = exif(1, gravity=(-0.99, 0.0, 0.0))
+    note = whole.get_ifd(0x8769)[0x927C]
+    for damaged in (note[:20], note[:50], note[:16] + b"\xff" * 40, note.replace(b"MM", b"XX")):
+        whole.get_ifd(0x8769)[0x927C] = damaged
+        photo(tmp_path / "a.jpg", (400, 300), whole)
+        assert read_exif(Image.open(tmp_path / "a.jpg")).down is None
+
+
+def test_a_drones_gimbal(tmp_path):
+    words = '<rdf:Description drone-dji:GimbalRollDegree="{}" drone-dji:GimbalPitchDegree="{}"/>'
+    for roll, pitch, down in (
+        ("+0.00", "-90.00", (0, 0, 1)),
+        ("+0.00", "-30.00", (0, math.cos(math.radians(30)), 0.5)),
+        ("+25.00", "-30.00", None),
+    ):
+        photo(tmp_path / "a.jpg", xmp=words.format(roll, pitch).encode())
+        found = read_exif(Image.open(tmp_path / "a.jpg")).down_as_shown
+        assert found == (None if down is None else pytest.approx(down, abs=1e-6))

@@ -1,4 +1,5 @@
 import json
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -74,8 +75,19 @@ def test_heic(tmp_path):
     pi_heif.register_heif_opener()
     fill(tmp_path / "in", 3)
     (tmp_path / "in" / "bad.heic").write_bytes(b"\x00" * 100)
+    # Stored lying, with a tag that turns it and a phone's EXIF: written by pillow-heif 1.4.
+    shutil.copy(Path(__file__).with_name("upright.heic"), tmp_path / "in")
     taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
-    assert len(taken.pictures) == 3 and "bad.heic" in taken.unusable
+    assert len(taken.pictures) == 4 and "bad.heic" in taken.unusable
+    one = next(p for p in taken.pictures if p.source == "upright.heic")
+    assert (one.width, one.height) == (48, 64) and one.exif.camera == "Apple iPhone 12"
+    assert one.exif.focal == pytest.approx(26 / 43.2666 * 80 / 64, rel=1e-3)
+    assert one.exif.place == pytest.approx((47.3769, 8.5417, 410))
+    assert one.exif.down_as_shown == pytest.approx((0.08, 0.87, 0.48), abs=0.02)
+    r, g, _ = Image.open(taken.folder / one.name).getpixel((4, 4))
+    assert r > 200 and g < 60, "the red block is at the upper left"
+    again = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    assert again.pictures == taken.pictures, "the record keeps all of it"
 
 
 def test_what_is_no_picture_is_left_out_with_the_reason(tmp_path):
@@ -192,3 +204,11 @@ def test_which_pictures_are_compared():
         for i in range(n - 1):
             assert (i, i + 1) in pairs
         assert (0, n // 10 * 10 - 10) in pairs, "a loop from the end to the start is seen"
+
+
+def test_a_scene_among_the_photos_is_not_taken_for_photos(tmp_path):
+    fill(tmp_path / "in", 3)
+    work = tmp_path / "in" / "scene" / "work"
+    take_in(tmp_path / "in", work, quiet)
+    photo(tmp_path / "in" / "scene" / "images" / "x.jpg")
+    assert len(take_in(tmp_path / "in", work, quiet).pictures) == 3

@@ -11,6 +11,7 @@ from climatenerf.cli import progress
 from climatenerf.errors import UserError
 from climatenerf.scene import Scene, read_scene
 from climatenerf.scene.known_length import FILE_NAME, apply_known_lengths, measure, read_marks
+from climatenerf.scene.scale import scale_warnings, scale_words
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
 
@@ -66,7 +67,7 @@ def run(options: Fit) -> int:
         metric_input=options.metric_input,
     )
     scene = with_known_lengths(scene, options.known_length, options.marks)
-    for warning in scene.warnings:
+    for warning in dict.fromkeys((*scene.warnings, *scale_warnings(scene))):
         progress.warn(warning)
     progress.say(frame_line(scene))
     metrics = fit_with_bars(scene, options)
@@ -99,9 +100,11 @@ def frame_line(scene: Scene) -> str:
     views = scene.of_split("train")
     heights = sorted(float(scene.c2w_world(view)[2, 3]) - scene.ground_z for view in views)
     up = scene.up_report.get("used", "the scene file")
+    others = {k: v for k, v in scene.up_report.items() if isinstance(v, int | float)}
+    if others:
+        up += f" ({', '.join(f'{name} {angle:.1f} deg' for name, angle in others.items())} from it)"
     return (
-        f"Scene: {len(scene.views)} photos; up from {up},"
-        f" scale from {scene.scale_source} (+-{scene.scale_error:.0%}); cameras"
+        f"Scene: {len(scene.views)} photos; up from {up}; {scale_words(scene)}; cameras"
         f" {heights[len(heights) // 2]:.1f} m above the ground datum, lowest ground"
         f" {scene.lowest_ground_z - scene.ground_z:+.1f} m from it"
     )

@@ -61,6 +61,7 @@ def model_folders(root: Path) -> list[Path]:
         return [root]
     candidates = [root / "sparse", *_subfolders(root / "sparse")]
     candidates += [root / "colmap" / "sparse", *_subfolders(root / "colmap" / "sparse")]
+    candidates += _subfolders(root)
     return [c for c in candidates if _suffix(c)]
 
 
@@ -74,21 +75,7 @@ def read_colmap(root: Path) -> Capture:
     Raises:
         UserError: A file is damaged, the model is empty, or its camera model is not supported.
     """
-    models = model_folders(root)
-    if not models:
-        raise UserError(f"{root} holds no COLMAP model (sparse/0/cameras.bin or .txt).")
-    poses = [(m, _read_images(m)) for m in models]
-    # max keeps the first of equals, and folders come sorted.
-    model, chosen = max(poses, key=lambda p: len(p[1]))
-    if not chosen:
-        raise UserError(f"The COLMAP model {model} has no posed picture; run the mapper again.")
-    warnings = []
-    if len(models) > 1:
-        sizes = ", ".join(f"{m.name}: {len(p)}" for m, p in poses)
-        warnings.append(
-            f"COLMAP left {len(models)} separate models (pictures in each: {sizes}); "
-            f"{model.name} is used, the others are left out."
-        )
+    model, chosen, warnings = _largest(root)
     by_id = _read_cameras(model)
     missing = {image.camera for image in chosen} - set(by_id)
     if missing:
@@ -115,8 +102,37 @@ def read_colmap(root: Path) -> Capture:
         cameras=tuple(by_id[i] for i in ids),
         views=views,
         points=points if len(points) else None,
-        warnings=tuple(warnings),
+        warnings=warnings,
     )
+
+
+def largest_model(root: Path) -> Path:
+    """The folder that `read_colmap` reads.
+
+    Raises:
+        UserError: There is none, or it is empty or damaged.
+    """
+    return _largest(root)[0]
+
+
+def _largest(root: Path) -> tuple[Path, list[_Image], tuple[str, ...]]:
+    """The model folder with most pictures, its pictures, and a warning if there are others."""
+    models = model_folders(root)
+    if not models:
+        raise UserError(f"{root} holds no COLMAP model (sparse/0/cameras.bin or .txt).")
+    poses = [(m, _read_images(m)) for m in models]
+    # max keeps the first of equals, and folders come sorted.
+    model, chosen = max(poses, key=lambda p: len(p[1]))
+    if not chosen:
+        raise UserError(f"The COLMAP model {model} has no posed picture; run the mapper again.")
+    if len(models) == 1:
+        return model, chosen, ()
+    sizes = ", ".join(f"{m.name}: {len(p)}" for m, p in poses)
+    warning = (
+        f"COLMAP left {len(models)} separate models (pictures in each: {sizes}); "
+        f"{model.name} is used, the others are left out."
+    )
+    return model, chosen, (warning,)
 
 
 def _suffix(folder: Path) -> str | None:

@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Complex, Float
 
+from climatenerf.scene.scale import rescaled, with_witness
 from climatenerf.scene.scene import Scene
 
 FEWEST = 5
 MOST_PAIRS = 2000  # that are tried for a start
+LEAST_ERROR = 0.005  # of the scale: the map's and the fit's own
 WORST_SCALE = 0.2  # relative standard error from which GPS says nothing of use
 # WGS 84 (EPSG:4326): equatorial radius, m, and first eccentricity squared.
 RADIUS, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
@@ -98,33 +100,24 @@ def find_georeference(
 
 def apply_georeference(scene: Scene, found: Georeference, keep_scale: bool) -> Scene:
     """The scene with x to the east and y to the north, and GPS's scale unless a better is known."""
-    scale = 1.0 if keep_scale else found.scale
+    error = max(found.scale_error, LEAST_ERROR)
+    if keep_scale:
+        out = with_witness(scene, "gps", found.scale, error)
+    else:
+        out = rescaled(scene, found.scale, "gps", error)
     turn = np.eye(4)
     c, s = math.cos(found.heading), math.sin(found.heading)
-    turn[:2, :2] = scale * np.array([[c, -s], [s, c]])
-    turn[2, 2] = scale
+    turn[:2, :2] = [[c, -s], [s, c]]
     turn[:2, 3] = found.shift
-    turn[2, 3] = -(scale - 1) * scene.ground_z
-    report = {
-        **scene.up_report,
-        "gps": {
-            "photos": found.photos,
-            "spread_m": round(found.spread, 2),
-            "scale_error": round(found.scale_error, 4),
-            "metres_by_gps_per_metre": round(found.scale, 4),
-            "origin_latitude_longitude": list(found.origin),
-        },
-    }
-    out = replace(scene, world_from_input=turn @ scene.world_from_input, up_report=report)
-    if keep_scale:
-        return out
-    lowest = scene.ground_z + scale * (scene.lowest_ground_z - scene.ground_z)
     return replace(
         out,
-        scale_source="gps",
-        scale_error=max(found.scale_error, 0.005),
-        lowest_ground_z=lowest,
-        warnings=tuple(w for w in scene.warnings if not w.startswith("The scale is assumed")),
+        world_from_input=turn @ out.world_from_input,
+        georeference={
+            "latitude": found.origin[0],
+            "longitude": found.origin[1],
+            "photos": found.photos,
+            "spread_m": round(found.spread, 3),
+        },
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,7 +102,7 @@ def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray
         UserError: The picture is missing, truncated, or has another size than its camera.
     """
     camera = scene.cameras[view.camera]
-    values = _to_rgb(_decode(view.path, camera))
+    values = to_rgb(_decode(view.path, camera))
     if downscale == 1:
         return values
     # A larger pixel gathers light, so the mean is taken of linear values.
@@ -112,10 +114,8 @@ def load_labels(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarra
     """Cityscapes train ids (255 unknown) of a view, nearest neighbours; None if absent."""
     if view.label_path is None:
         return None
-    labels = np.asarray(_decode(view.label_path, scene.cameras[view.camera], resize=True))
-    if labels.ndim != 2 or labels.dtype != np.uint8:
-        raise UserError(f"The labels {view.label_path} are not an 8-bit grey picture of class ids.")
-    return _nearest(labels, downscale)
+    camera = scene.cameras[view.camera]
+    return _nearest(_fitting(read_labels(view.label_path), camera, view.label_path), downscale)
 
 
 def load_mask(view: View, scene: Scene, downscale: int = 1) -> Bool[np.ndarray, "h w"] | None:
@@ -125,11 +125,71 @@ def load_mask(view: View, scene: Scene, downscale: int = 1) -> Bool[np.ndarray, 
     """
     if view.mask_path is None:
         return None
-    mask = np.asarray(_decode(view.mask_path, scene.cameras[view.camera], resize=True))
-    usable = (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
+    usable = _fitting(read_mask(view.mask_path), scene.cameras[view.camera], view.mask_path)
     if downscale == 1:
         return usable
     return _area_average(usable[..., None].astype(np.float32), downscale)[..., 0] > 0.999
+
+
+def load_depth(view: View, scene: Scene, downscale: int = 1) -> Float[np.ndarray, "h w"] | None:
+    """Z-depths of a view in the file's own unit, NaN where unknown; None if it has none."""
+    if view.depth_path is None:
+        return None
+    camera = scene.cameras[view.camera]
+    return _nearest(_fitting(read_depth(view.depth_path), camera, view.depth_path), downscale)
+
+
+def read_labels(path: Path) -> UInt8[np.ndarray, "h w"]:
+    """An 8-bit picture of class ids.
+
+    Raises:
+        UserError: The file cannot be read or is of another kind.
+    """
+    labels = np.asarray(_opened(path))
+    if labels.ndim != 2 or labels.dtype != np.uint8:
+        raise UserError(f"The labels {path} are not an 8-bit grey picture of class ids.")
+    return labels
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
+    """A picture as True where it is not black.
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    mask = np.asarray(_opened(path))
+    return (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
+
+
+def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
+    """Z-depths: `.npy`, `.npz` (one array) in metres, or a 16-bit PNG in millimetres (0 unknown).
+
+    Returns:
+        float32; NaN where not finite or not above 0.
+
+    Raises:
+        UserError: The file cannot be read or holds no such picture.
+    """
+    try:
+        if path.suffix == ".npy":
+            depth = np.load(path)
+        elif path.suffix == ".npz":
+            with np.load(path) as data:
+                depth = data[data.files[0]]
+        else:
+            depth = np.asarray(_opened(path)) / 1000
+            if depth.ndim == 2 and _opened(path).mode == "L":
+                raise UserError(
+                    f"The depth {path} has 8 bits; give 16-bit PNG (millimetres), NPY or NPZ (m)."
+                )
+    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error) as error:
+        raise _unreadable(path, error) from None
+    if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
+        depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
+    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.number) or not depth.size:
+        raise UserError(f"The depth {path} is no picture of numbers; it must have height x width.")
+    depth = depth.astype(np.float32)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
 
 
 def downscaled_camera(camera: Camera, downscale: int) -> Camera:
@@ -153,12 +213,8 @@ def _unreadable(path: Path, error: Exception) -> UserError:
     )
 
 
-def _decode(path: Path, camera: Camera, resize: bool = False) -> Image.Image:
-    """The whole picture in memory, turned by EXIF only if that gives the camera's size.
-
-    Another size of the same shape is an error, or is mended with `resize` by taking nearest pixels
-    (labels and masks may have been made from larger or smaller pictures).
-    """
+def _decode(path: Path, camera: Camera) -> Image.Image:
+    """The whole picture in memory, turned by EXIF only if that gives the camera's size."""
     try:
         with Image.open(path) as image:
             image.load()
@@ -169,9 +225,6 @@ def _decode(path: Path, camera: Camera, resize: bool = False) -> Image.Image:
     except _BAD_IMAGE as error:
         raise _unreadable(path, error) from None
     wanted = (camera.width, camera.height)
-    stretch = decoded.width * wanted[1] / (decoded.height * wanted[0])
-    if resize and decoded.size != wanted and abs(stretch - 1) < 0.02:
-        return decoded.resize(wanted, Image.Resampling.NEAREST)
     if decoded.size != wanted:
         raise UserError(
             f"The picture {path} has {decoded.width}x{decoded.height} pixels but its camera "
@@ -180,7 +233,34 @@ def _decode(path: Path, camera: Camera, resize: bool = False) -> Image.Image:
     return decoded
 
 
-def _to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+def _opened(path: Path) -> Image.Image:
+    """A whole picture in memory, as it is stored."""
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image.copy()
+    except _BAD_IMAGE as error:
+        raise _unreadable(path, error) from None
+
+
+def _fitting(values: np.ndarray, camera: Camera, path: Path) -> np.ndarray:
+    """Values at the camera's pixels: the nearest ones of a file of another size, same shape.
+
+    Labels, masks and depths may have been made from larger or smaller pictures.
+    """
+    height, width = values.shape
+    if abs(width * camera.height / (height * camera.width) - 1) >= 0.02:
+        raise UserError(
+            f"The picture {path} has {width}x{height} pixels but its camera "
+            f"{camera.width}x{camera.height}; make them agree."
+        )
+    rows = (np.arange(camera.height) + 0.5) * height / camera.height
+    columns = (np.arange(camera.width) + 0.5) * width / camera.width
+    return values[rows.astype(np.int64)[:, None], columns.astype(np.int64)]
+
+
+def to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    """8-bit RGB values of a picture of any kind, without its alpha channel."""
     if image.mode in _ALPHA_MODES or "transparency" in image.info:
         # Going through RGBA, Pillow's conversion to RGB keeps the stored colours as they are.
         image = image.convert("RGBA")

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.errors import UserError
+from climatenerf.scene.scale import rescaled, with_witness
 from climatenerf.scene.scene import Scene
 
 FILE_NAME = "marks.toml"
@@ -151,32 +152,12 @@ def apply_known_lengths(scene: Scene, measured: list[Measured]) -> Scene:
     factor = float((ratio * weight).sum() / weight.sum())
     spread = float(np.abs(ratio / factor - 1).max())
     combined = max(float(1 / np.sqrt(weight.sum())), spread)
-    turn = np.diag([factor, factor, factor, 1.0])
-    turn[2, 3] = (1 - factor) * scene.ground_z
-    warnings = [w for w in scene.warnings if not w.startswith("The scale is assumed")]
+    out = rescaled(scene, factor, "known-length", combined)
+    for m, r in zip(measured, ratio, strict=True):
+        if len(measured) > 1:
+            out = with_witness(out, m.name, float(r) / factor, m.error)
     if spread > DISAGREEMENT:
         told = ", ".join(f"{m.name} x{r:.2f}" for m, r in zip(measured, ratio, strict=True))
-        warnings.append(f"The known lengths disagree ({told}); check their marks.")
-    before = 1 / factor
-    apart = abs(before - 1)
-    if apart > 2 * (scene.scale_error + combined):
-        warnings.append(
-            f"The known length makes the scene {factor:.2f} times as large as {scene.scale_source}"
-            " did; check the marks."
-        )
-    report = {
-        **scene.up_report,
-        "known_lengths": {
-            m.name: {"known_m": m.known, "before_m": round(m.found, 4), "error": round(m.error, 4)}
-            for m in measured
-        },
-    }
-    return replace(
-        scene,
-        world_from_input=turn @ scene.world_from_input,
-        scale_source="known-length",
-        scale_error=combined,
-        lowest_ground_z=scene.ground_z + factor * (scene.lowest_ground_z - scene.ground_z),
-        up_report=report,
-        warnings=tuple(warnings),
-    )
+        warning = f"The known lengths disagree ({told}); check their marks."
+        out = replace(out, warnings=(*out.warnings, warning))
+    return out

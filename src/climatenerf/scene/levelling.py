@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,8 @@ ROLL_SIGMA = 2.5  # degrees: how level a photographer holds a camera from side t
 PITCH_SIGMA = 8.0  # degrees: how much cameras look up or down on average
 PLANE_SIGMA = 2.5  # degrees: how level open ground is
 LINES_SIGMA = 0.6  # degrees: how upright posts and walls are, at best
+GRAVITY_SIGMA = 1.0  # degrees: how well a camera's accelerometer is aligned with its picture
+LEAST_READINGS = 3  # of gravity
 FAR_ORIGIN = 10_000  # m: 32-bit numbers resolve a millimetre up to 16 km from the origin
 FOCUS_SHARE = 0.35  # camera height over distance to what is looked at, when no ground is seen
 
@@ -38,14 +41,21 @@ class UpEstimate:
     method: str
 
 
-def level(scene: Scene, *, camera_height: float | None = None, metric_input: bool = False) -> Scene:
+def level(
+    scene: Scene,
+    *,
+    camera_height: float | None = None,
+    metric_input: bool = False,
+    gravity: Mapping[str, Sequence[float]] | None = None,
+) -> Scene:
     """Find up, scale and ground of a scene and return it with `world_from_input` set.
 
-    Up comes from three methods: *cameras* (their x axes are horizontal, their y axes point down on
-    average), *ground* (plane through the low sparse points) and *lines* (vertical vanishing point
-    of straight edges). Rule: the cameras give the first guess, and the two others are looked for
-    around it. The method with the smallest standard error leads, but if it is more than 10 degrees
-    from the cameras it must be backed by the remaining one. What lies within 10 degrees of the
+    Up comes from up to four methods: *gravity* (what the cameras' own sensors told), *cameras*
+    (their x axes are horizontal, their y axes point down on average), *ground* (plane through the
+    low sparse points) and *lines* (vertical vanishing point of straight edges). Rule: gravity, or
+    else the cameras, gives the first guess, and ground and lines are looked for around it. The
+    method with the smallest standard error leads, but if it is more than 10 degrees from the first
+    guess it must be backed by another one. What lies within 10 degrees of the
     leader is averaged with weights 1 / sigma^2. `up_report` tells how far each method is from the
     result, and a disagreement above 5 degrees is a warning.
 
@@ -58,11 +68,15 @@ def level(scene: Scene, *, camera_height: float | None = None, metric_input: boo
         scene: As a reader made it; its `world_from_input` is ignored.
         camera_height: Height of the cameras above the ground, metres, > 0.
         metric_input: The input frame is in metres with z up; it is kept exactly.
+        gravity: Down in the camera's axes (x right, y down, z forward) by picture name.
     """
     warnings = list(scene.warnings)
     poses = np.stack([v.c2w for v in scene.views])
-    guess = up_from_cameras(_upright_axes(scene, poses))
-    estimates = [guess]
+    estimates = [up_from_cameras(_upright_axes(scene, poses))]
+    felt = up_from_gravity(scene, gravity or {})
+    if felt is not None:
+        estimates.insert(0, felt)
+    guess = estimates[0]
     if (plane := _up_from_ground(scene, poses, guess.direction)) is not None:
         estimates.append(plane)
     lines = vertical_lines(scene, guess.direction)
@@ -167,14 +181,37 @@ def up_from_cameras(axes: Float[np.ndarray, "n 3 2"]) -> UpEstimate:
     return UpEstimate(direction, float(1 / np.sqrt(weakest)), "cameras")
 
 
+def up_from_gravity(scene: Scene, gravity: Mapping[str, Sequence[float]]) -> UpEstimate | None:
+    """Up from what accelerometers told, in the input frame; None where they do not agree.
+
+    The mean of those within `OUTLIER` degrees of the median direction, which most must be.
+    """
+    down = [v.c2w[:3, :3] @ np.asarray(gravity[v.name]) for v in scene.views if v.name in gravity]
+    if len(down) < LEAST_READINGS:
+        return None
+    up = -np.array(down)
+    middle = np.median(up, axis=0)
+    if np.linalg.norm(middle) < 0.5:
+        return None
+    apart = np.array([_degrees(u, middle / np.linalg.norm(middle)) for u in up])
+    near = apart < OUTLIER
+    if near.mean() < 0.5 or near.sum() < LEAST_READINGS:
+        return None
+    mean = up[near].mean(axis=0)
+    # The mean of many is sharper than one, but they share how the sensor sits in its camera.
+    scatter = float(np.sqrt((apart[near] ** 2).mean() / near.sum()))
+    sigma = float(np.hypot(GRAVITY_SIGMA, scatter))
+    return UpEstimate(mean / np.linalg.norm(mean), sigma, "gravity")
+
+
 def combine(estimates: list[UpEstimate]) -> tuple[Float[np.ndarray, " 3"], str]:
-    """The agreed up and the methods it rests on; the rule is in `level`. Cameras come first."""
-    cameras = estimates[0]
+    """The agreed up and the methods it rests on; the rule is in `level`. The first guess leads."""
+    first = estimates[0]
     ranked = sorted(estimates, key=lambda e: e.sigma)
     for leader in ranked:
-        others = [e for e in estimates if e is not leader and e is not cameras]
+        others = [e for e in estimates if e is not leader and e is not first]
         backed = any(_degrees(e.direction, leader.direction) < DISAGREEMENT for e in others)
-        if backed or _degrees(leader.direction, cameras.direction) < OUTLIER:
+        if backed or _degrees(leader.direction, first.direction) < OUTLIER:
             break
     agreeing = [e for e in ranked if _degrees(e.direction, leader.direction) < OUTLIER]
     total = np.sum([e.direction / e.sigma**2 for e in agreeing], axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from climatenerf.scene.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.colmap import model_folders, read_colmap
 from climatenerf.scene.images import Header, picture_header
 from climatenerf.scene.levelling import level
+from climatenerf.scene.scale import by_camera_height
 from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_split
 from climatenerf.scene.transforms_json import read_transforms, transforms_files
 
@@ -28,6 +30,7 @@ def read_scene(
     holdout: str | None = None,
     camera_height: float | None = None,
     metric_input: bool = False,
+    gravity: Mapping[str, Sequence[float]] | None = None,
 ) -> Scene:
     """Read a capture of any supported format and level it.
 
@@ -37,6 +40,7 @@ def read_scene(
             (first, ninth, ...); "0" for none; or names separated by commas.
         camera_height: Height of the cameras above the ground, metres, which sets the scale.
         metric_input: The poses are in metres with z up already; they are kept as they are.
+        gravity: Down in the camera's axes by picture name, where the cameras told.
 
     Returns:
         The scene; `warnings` has what the user should know.
@@ -66,6 +70,12 @@ def read_scene(
     if scene is not None and not relevel:
         kept = tuple(dict.fromkeys((*scene.warnings, *capture.warnings)))
         return replace(scene, cameras=capture.cameras, views=views, warnings=kept)
+    if scene is not None and camera_height is not None:
+        # Up and place are known already, maybe from what the pictures no longer tell.
+        known = replace(scene, cameras=capture.cameras, views=views)
+        scaled = by_camera_height(known, camera_height)
+        if scaled is not None:
+            return scaled
     scene = Scene(
         root=capture.root,
         source=capture.source,
@@ -74,7 +84,7 @@ def read_scene(
         points=capture.points,
         warnings=capture.warnings,
     )
-    return level(scene, camera_height=camera_height, metric_input=metric_input)
+    return level(scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity)
 
 
 def _read_foreign(path: Path) -> Capture:
@@ -177,24 +187,29 @@ def _round_trip(camera: Camera) -> float:
 
 
 def _find_extras(capture: Capture) -> tuple[View, ...]:
-    """Views with `labels/NAME.png` and `masks/NAME.png` (or `NAME.jpg.png`) where they exist."""
+    """Views with `labels/`, `masks/` and `depth/` files where they exist.
 
-    def find(folder: str, view: View) -> Path | None:
+    They are called `NAME.png` or `NAME.jpg.png`; depths may be `.npz` and `.npy` too.
+    """
+
+    def find(folder: str, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
         if Path(view.name).is_absolute():  # joined to a folder it would be the photo itself
             return None
         base = capture.root / folder / view.name
-        for candidate in (base.with_suffix(".png"), Path(f"{base}.png")):
-            if candidate.is_file():
-                return candidate
+        for suffix in suffixes:
+            for candidate in (base.with_suffix(suffix), Path(f"{base}{suffix}")):
+                if candidate.is_file():
+                    return candidate
         return None
 
     out = []
     for view in capture.views:
         label = view.label_path or find("labels", view)
         mask = view.mask_path or find("masks", view)
+        depth = view.depth_path or find("depth", view, (".npz", ".npy", ".png"))
         if mask is not None and not mask.is_file():
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
-        out.append(replace(view, label_path=label, mask_path=mask))
+        out.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
     return tuple(out)
 
 

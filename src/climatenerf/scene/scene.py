@@ -37,6 +37,7 @@ class View:
         split: "train", or "heldout" for measuring only.
         label_path: 8-bit picture of Cityscapes train ids (255 unknown), if there is one.
         mask_path: Picture whose black pixels are to be ignored, if there is one.
+        depth_path: Z-depths, as `images.load_depth` reads them, if there are any.
         seen: Which of the scene's sparse points the picture shows, if that is known.
     """
 
@@ -47,6 +48,7 @@ class View:
     split: Literal["train", "heldout"] = "train"
     label_path: Path | None = None
     mask_path: Path | None = None
+    depth_path: Path | None = None
     seen: Int[np.ndarray, " k"] | None = field(default=None, compare=False)
 
 
@@ -61,9 +63,12 @@ class Scene:
         views: Photographs, sorted by name.
         points: Sparse points in the input frame, or None.
         world_from_input: Similarity from the input frame to the world (metres, z up).
-        scale_source: Where the scale comes from: "camera-height", "metric-input" or
-            "camera-height-assumed".
+        scale_source: Where the scale comes from: "gps", "known-length", "camera-height",
+            "metric-input" or "camera-height-assumed".
         scale_error: Relative error of the scale, 0.3 for 30 %.
+        scale_report: What other evidence of scale says; see `scale.py`.
+        georeference: The origin's latitude and longitude, degrees, and how well GPS fits; empty
+            without GPS. Then x is east and y north.
         ground_z: Height of the ground datum, metres: the median ground under the camera path.
         lowest_ground_z: Height of the lowest ground, metres.
         up_report: How up was found: "used", then the degrees between it and each other method.
@@ -78,6 +83,8 @@ class Scene:
     world_from_input: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     scale_source: str = "metric-input"
     scale_error: float = 0.0
+    scale_report: dict[str, dict[str, float]] = field(default_factory=dict)
+    georeference: dict[str, float] = field(default_factory=dict)
     ground_z: float = 0.0
     lowest_ground_z: float = 0.0
     up_report: dict[str, Any] = field(default_factory=dict)
@@ -137,6 +144,8 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "scale_error": scene.scale_error,
         "ground_z": scene.ground_z,
         "lowest_ground_z": scene.lowest_ground_z,
+        "scale_report": scene.scale_report,
+        "georeference": scene.georeference,
         "up_report": scene.up_report,
         "warnings": list(scene.warnings),
     }
@@ -187,6 +196,7 @@ def _view_to_json(view: View, root: Path) -> dict[str, Any]:
         "split": view.split,
         "label_path": _relative(view.label_path, root),
         "mask_path": _relative(view.mask_path, root),
+        "depth_path": _relative(view.depth_path, root),
     }
 
 
@@ -214,6 +224,7 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
             split=v["split"],
             label_path=absolute(v["label_path"]),
             mask_path=absolute(v["mask_path"]),
+            depth_path=absolute(v.get("depth_path")),
         )
         for v in data["views"]
     )
@@ -234,6 +245,11 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
         world_from_input=_matrix(data["world_from_input"]),
         scale_source=_text(data["scale_source"]),
         scale_error=_number(data["scale_error"]),
+        scale_report={
+            _text(name): {key: _number(value) for key, value in said.items()}
+            for name, said in data.get("scale_report", {}).items()
+        },
+        georeference={k: _number(v) for k, v in data.get("georeference", {}).items()},
         ground_z=_number(data["ground_z"]),
         lowest_ground_z=_number(data["lowest_ground_z"]),
         up_report=dict(data["up_report"]),

@@ -6,12 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from climatenerf.sfm.intake import Intake
 
 ENOUGH_MATCHES = 30  # verified ones that a picture needs with a posed one
 BLURRED = 0.3  # of the median sharpness
 DARK, BRIGHT = 0.08, 0.92  # mean grey value
+TURNED = 0.02  # deviation from a rotation; a step of a hundredth of the distance makes as much
+FLAT_SHARE = 0.9  # of the pairs that one homography explains
+_FLAT = (4, 5, 6)  # COLMAP's planar, panoramic, and either
 _PAIR = 2147483647  # COLMAP numbers the pair (a, b), a < b, as a * _PAIR + b
 
 
@@ -79,3 +83,37 @@ def diagnose(intake: Intake, registered: tuple[str, ...], database: Path) -> lis
             remedy = "take pictures between it and its neighbours, two thirds in common"
         lost.append(Lost(picture.name, picture.source, reason, remedy, tuple(best)))
     return lost
+
+
+def turned_only(intake: Intake, database: Path) -> bool:
+    """Whether the pictures differ by turning the camera alone: then they hold no depth.
+
+    Two such pictures are mapped onto each other by K R K^-1 (Hartley & Zisserman 2004, 8.4.2): with
+    the right focal length what is left of the homography is a rotation. Of a plane seen from two
+    places it never is.
+    """
+    sizes = {picture.name: (picture.width, picture.height) for picture in intake.pictures}
+    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        rows = connection.execute(
+            "SELECT pair_id, config, H FROM two_view_geometries WHERE rows >= ?", (ENOUGH_MATCHES,)
+        ).fetchall()
+    pairs = [(*divmod(pair, _PAIR), h) for pair, config, h in rows if config in _FLAT and h]
+    if not pairs or len(pairs) < FLAT_SHARE * len(rows):
+        return False
+    shapes = np.array([[sizes[names[i]], sizes[names[j]]] for i, j, _ in pairs], float)
+    maps = np.array([np.frombuffer(h, np.float64).reshape(3, 3) for *_, h in pairs])
+    errors = [_from_rotation(maps, shapes, focal) for focal in np.geomspace(0.4, 6.0, 80)]
+    return min(float(np.median(error)) for error in errors) < TURNED
+
+
+def _from_rotation(
+    maps: Float[np.ndarray, "n 3 3"], shapes: Float[np.ndarray, "n 2 2"], focal: float
+) -> Float[np.ndarray, "n"]:
+    """|M M^T - I| of M = K2^-1 H K1, for a focal length over the longer side."""
+    k = np.zeros((len(shapes), 2, 3, 3))
+    k[..., 0, 0] = k[..., 1, 1] = focal * shapes.max(-1)
+    k[..., :2, 2], k[..., 2, 2] = shapes / 2, 1.0
+    m = np.linalg.inv(k[:, 1]) @ maps @ k[:, 0]
+    m = m / np.cbrt(np.linalg.det(m))[:, None, None]
+    return np.linalg.norm(m @ m.transpose(0, 2, 1) - np.eye(3), axis=(1, 2))

@@ -1,11 +1,22 @@
 """What a photo's EXIF tells of its camera and place."""
 
 import math
-from dataclasses import dataclass
+import re
+import struct
+from dataclasses import dataclass, replace
 
 from PIL import ExifTags, Image
 
 FULL_FRAME = math.hypot(36.0, 24.0)  # mm: the 35 mm equivalent keeps the diagonal's angle (CIPA)
+MOST_ROLL = 2.0  # degrees of a gimbal: beyond, the camera was being turned
+Down = tuple[float, float, float]
+# Where a direction (x right, y down) comes to lie when a picture is turned as EXIF's tag says.
+_TURNED = {
+    1: lambda x, y: (x, y),
+    3: lambda x, y: (-x, -y),
+    6: lambda x, y: (-y, x),
+    8: lambda x, y: (y, -x),
+}
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit in mm
 
 
@@ -17,11 +28,24 @@ class Exif:
         camera: Words that differ between cameras and lenses; "" if nothing is known.
         focal: Focal length over the longer side of the picture; None if unknown.
         place: (latitude deg, longitude deg, altitude m) by GPS; altitude NaN if unknown.
+        down: Direction of gravity as the camera's own sensor told, unit vector in the axes of the
+            picture as stored (x right, y down, z forward); None if unknown.
+        orientation: How the stored picture is turned to be shown, EXIF's 1 to 8.
     """
 
     camera: str = ""
     focal: float | None = None
     place: tuple[float, float, float] | None = None
+    down: tuple[float, float, float] | None = None
+    orientation: int = 1
+
+    @property
+    def down_as_shown(self) -> tuple[float, float, float] | None:
+        """`down` in the axes of the picture as shown; None for mirrored ones."""
+        turn = _TURNED.get(self.orientation)
+        if self.down is None or turn is None:
+            return None
+        return *turn(*self.down[:2]), self.down[2]
 
 
 def read_exif(image: Image.Image) -> Exif:
@@ -32,7 +56,75 @@ def read_exif(image: Image.Image) -> Exif:
     words += [detail.get(ExifTags.Base.LensModel)]
     words += [f"{f:g}mm" for f in [_number(detail.get(ExifTags.Base.FocalLength))] if f]
     camera = " ".join(str(word).strip("\0 ") for word in words if word)
-    return Exif(camera, _focal(detail, *image.size), _place(base.get_ifd(ExifTags.IFD.GPSInfo)))
+    place = _place(base.get_ifd(ExifTags.IFD.GPSInfo))
+    orientation = base.get(ExifTags.Base.Orientation, 1)
+    orientation = orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
+    down = _gimbal(image.info.get("xmp"))
+    if down is None and "front" not in camera.lower():  # selfies are mirrored
+        # A HEIC decoder turns the picture itself, and tells here which tag it obeyed.
+        decoder = image.info.get("original_orientation") or 1
+        down = _phone(detail.get(ExifTags.Base.MakerNote), decoder, image.size)
+    found = Exif(camera, _focal(detail, *image.size), place, down, orientation)
+    shown = found.down_as_shown
+    # A picture that would stand on its head has a stale tag: then the axes are not known.
+    return replace(found, down=None) if shown and shown[1] < -0.5 else found
+
+
+def _phone(note: object, decoder: object, size: tuple[int, int]) -> Down | None:
+    """Gravity from an iPhone's maker note, tag 8 (ExifTool's AccelerationVector), three numbers, g.
+
+    They follow Core Motion: x to the right of the screen, y to its top, z out of it, and the
+    vector points down. The sensor lies: its picture's right is the phone's bottom, its lower edge
+    the phone's left.
+
+    Args:
+        note: the maker note.
+        decoder: orientation tag that the decoder of the picture has obeyed.
+        size: width and height of the picture as decoded.
+    """
+    g = _apple_vector(note)
+    if g is None:
+        return None
+    x, y, z = -g[1], -g[0], -g[2]
+    if decoder == 1 and size[0] < size[1]:
+        decoder = 6  # a copy that was stored upright: the sensor's own pictures are wide
+    turn = _TURNED.get(decoder)  # type: ignore[call-overload]
+    length = math.hypot(x, y, z)
+    if turn is None or not 0.9 < length < 1.1:  # a hand that shakes adds to gravity
+        return None
+    x, y = turn(x, y)
+    return x / length, y / length, z / length
+
+
+def _apple_vector(note: object) -> list[float] | None:
+    """Tag 8 of Apple's maker note: a big-endian TIFF directory 14 bytes after its start."""
+    if not isinstance(note, bytes) or not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
+        return None
+    try:
+        (count,) = struct.unpack_from(">H", note, 14)
+        for entry in range(16, 16 + 12 * count, 12):
+            tag, kind, number, offset = struct.unpack_from(">HHII", note, entry)
+            if (tag, kind, number) == (8, 10, 3):
+                parts = struct.unpack_from(">6i", note, offset)
+                return [a / b for a, b in zip(parts[::2], parts[1::2], strict=True)]
+    except (struct.error, ZeroDivisionError):
+        pass
+    return None
+
+
+def _gimbal(xmp: object) -> Down | None:
+    """Gravity from the pitch that a DJI drone's gimbal keeps, where its roll is kept at 0."""
+    if not isinstance(xmp, bytes | str):
+        return None
+    text = xmp if isinstance(xmp, str) else xmp.decode(errors="replace")
+    found = {}
+    for name in ("Pitch", "Roll"):
+        match = re.search(rf"drone-dji:Gimbal{name}Degree(?:=.|>)([+-]?\d+(\.\d+)?)", text)
+        found[name] = _number(match.group(1)) if match else None
+    pitch, roll = found["Pitch"], found["Roll"]
+    if pitch is None or abs(pitch) > 90 or abs(roll or 0.0) > MOST_ROLL:
+        return None
+    return 0.0, math.cos(math.radians(pitch)), -math.sin(math.radians(pitch))
 
 
 def _focal(detail: dict, width: int, height: int) -> float | None:

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from climatenerf.errors import UserError
+from climatenerf.scene.images import to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
 from climatenerf.storage import atomic_path, make_folder, write_json
 
@@ -84,6 +85,9 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
         files = sorted(p for p in source.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES)
         hidden = (any(x.startswith(".") for x in p.relative_to(source).parts) for p in files)
         files = [p for p, is_hidden in zip(files, hidden, strict=True) if not is_hidden]
+        scene = work.resolve().parent
+        if scene.is_relative_to(source.resolve()):  # it holds pictures that this program has made
+            files = [p for p in files if not p.resolve().is_relative_to(scene)]
         base, is_video = source, False
         if not files:
             raise UserError(f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP)")
@@ -122,15 +126,15 @@ def _picture(path: Path, base: Path, out: Path) -> Picture:
         try:
             known = json.loads(record.read_text())
             if known.pop("stamp") == stamp:
-                place = known["exif"]["place"]
-                known["exif"]["place"] = (
-                    None if place is None else tuple(math.nan if x is None else x for x in place)
-                )
+                for key in ("place", "down"):
+                    told = known["exif"][key]
+                    known["exif"][key] = (
+                        None if told is None else tuple(math.nan if x is None else x for x in told)
+                    )
                 return Picture(**{**known, "exif": Exif(**known["exif"])})
         except (ValueError, KeyError, TypeError):
             pass  # half written or of an older version: made again
     image, exif = open_upright(path)
-    image.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS, reducing_gap=3.0)
     with atomic_path(out) as temporary:
         image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     grey = small_grey(image)
@@ -147,7 +151,7 @@ def _picture(path: Path, base: Path, out: Path) -> Picture:
 
 
 def open_upright(path: Path) -> tuple[Image.Image, Exif]:
-    """A photo as it is meant to be seen, in RGB, with its EXIF.
+    """A photo as it is meant to be seen, in RGB of at most `LONGEST` pixels, with its EXIF.
 
     Raises:
         UserError: empty, damaged, no picture at all, or too large to decode.
@@ -163,8 +167,11 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
                 raise UserError(f"{path.name} has {image.width}x{image.height} pixels: too large")
             exif = read_exif(image)
             image.draft("RGB", (LONGEST, LONGEST))  # a JPEG is decoded smaller at once
-            upright = ImageOps.exif_transpose(image)
-            return upright.convert("RGB"), exif
+            # Made smaller before all else: a copy of 200 megapixels takes 600 MB.
+            small = image if image.mode in ("RGB", "L") else Image.fromarray(to_rgb(image))
+            small.info = image.info  # the orientation is in it
+            small.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS, reducing_gap=3.0)
+            return ImageOps.exif_transpose(small).convert("RGB"), exif
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise UserError(f"{path.name} is no readable picture ({error})") from error
     finally:

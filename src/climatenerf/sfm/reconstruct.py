@@ -12,6 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from climatenerf.errors import UserError
+from climatenerf.scene.cameras import Camera
+from climatenerf.scene.colmap import read_colmap
+from climatenerf.sfm.diagnose import turned_only
 from climatenerf.sfm.intake import FEWEST, Intake, Picture
 from climatenerf.storage import make_folder, read_json, write_json
 
@@ -22,6 +25,8 @@ TILE = 16  # pictures against as many in one call for matches
 ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
 LEAST_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
 
+RESULT = "poses.json"
+
 Told = Callable[[str, float], None]
 
 
@@ -31,16 +36,18 @@ class Model:
 
     Attributes:
         folder: COLMAP model of the undistorted pictures (`sparse`), and the pictures (`images`).
+        lenses: the camera of each picture as it was taken in, before undistortion.
         registered: names of the pictures that have poses.
         groups: number of pictures in each connected group found, largest first.
-        reprojection_error: mean, pixels.
+        reprojection_error: mean, pixels; None if it is not known.
         points: number of sparse points.
     """
 
     folder: Path
+    lenses: dict[str, Camera]
     registered: tuple[str, ...]
     groups: tuple[int, ...]
-    reprojection_error: float
+    reprojection_error: float | None
     points: int
 
 
@@ -54,7 +61,7 @@ def load_pycolmap():
         import pycolmap
     except ImportError as error:
         raise UserError('poses need pycolmap; run `pip install "climatenerf[capture]"`') from error
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # errors are told in our words
     return pycolmap
 
 
@@ -73,11 +80,21 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     """
     pycolmap = load_pycolmap()
     database = work / "database.db"
+    made_of = {"pictures": _stamps(intake), "features": features, "seed": seed}
+    known = _known(work, made_of)
+    if known is not None:
+        return known
     _forget_if_changed(intake, database, features)
     names = [picture.name for picture in intake.pictures]
     _import(pycolmap, intake, database)
     _extract(pycolmap, intake, database, names, features, tell)
     _match(pycolmap, database, names, pairs_of(len(names), intake.is_video), seed, tell)
+    if turned_only(intake, database):
+        raise UserError(
+            "all pictures were taken from one spot: they differ by turning the camera alone and"
+            " hold no depth; walk around the place and take each photo a step further"
+        )
+    (work / RESULT).unlink(missing_ok=True)
     models = _map(pycolmap, intake, database, work / "models", seed, tell)
     best = max(models, key=lambda m: m.num_reg_images())
     out = work / "undistorted"
@@ -87,10 +104,53 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     tell("undistort", 0.0)
     pycolmap.undistort_images(out, chosen, intake.folder, jpeg_quality=95, output_type="COLMAP")
     tell("undistort", 1.0)
-    sizes = sorted((m.num_reg_images() for m in models), reverse=True)
-    registered = sorted(best.image(i).name for i in best.reg_image_ids())
-    error = float(best.compute_mean_reprojection_error())
-    return Model(out, tuple(registered), tuple(sizes), error, best.num_points3D())
+    result = {
+        "groups": groups_of([{m.image(i).name for i in m.reg_image_ids()} for m in models]),
+        "reprojection_error": float(best.compute_mean_reprojection_error()),
+        "points": best.num_points3D(),
+    }
+    write_json(work / RESULT, {"made_of": made_of, **result})
+    return _model(work, result)
+
+
+def groups_of(models: list[set[str]]) -> list[int]:
+    """Pictures in the largest model, then those that each further one has beyond the larger ones.
+
+    The mapper tries again with pictures that it has placed; a group is what no larger one holds.
+    """
+    seen: set[str] = set()
+    sizes = []
+    for names in sorted(models, key=len, reverse=True):
+        if len(names - seen) >= FEWEST:
+            sizes.append(len(names - seen))
+        seen |= names
+    return sizes
+
+
+def _known(work: Path, made_of: dict) -> Model | None:
+    """The result of an earlier run over the same pictures with the same settings."""
+    try:
+        result = read_json(work / RESULT)
+        return _model(work, result) if result["made_of"] == made_of else None
+    except (UserError, KeyError):
+        return None  # none yet, or damaged: found anew
+
+
+def _model(work: Path, result: dict) -> Model:
+    posed = read_colmap(work / "chosen")
+    return Model(
+        folder=work / "undistorted",
+        lenses={view.name: posed.cameras[view.camera] for view in posed.views},
+        registered=tuple(sorted(view.name for view in posed.views)),
+        groups=tuple(result["groups"]),
+        reprojection_error=result["reprojection_error"],
+        points=result["points"],
+    )
+
+
+def _stamps(intake: Intake) -> dict[str, int]:
+    """When each picture was written: a changed photo makes a new one."""
+    return {p.name: (intake.folder / p.name).stat().st_mtime_ns for p in intake.pictures}
 
 
 def _forget_if_changed(intake: Intake, database: Path, features: int) -> None:
@@ -99,7 +159,7 @@ def _forget_if_changed(intake: Intake, database: Path, features: int) -> None:
     Pictures that have come in are added to what is there.
     """
     record = database.with_name("database.json")
-    stamps = {p.name: (intake.folder / p.name).stat().st_mtime_ns for p in intake.pictures}
+    stamps = _stamps(intake)
     before = {}
     if record.is_file():
         with contextlib.suppress(UserError, ValueError):
@@ -214,8 +274,8 @@ def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell
             return good
     raise UserError(
         "no three of the pictures fit together: they show too little in common, are blurred, or"
-        " were all taken from one spot; walk around the place and take each photo a step further,"
-        " with two thirds of the view in common"
+        " were taken from nearly one spot; walk around the place and take each photo a step"
+        " further, with two thirds of the view in common"
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
+from climatenerf.scene.scale import scale_words
 from climatenerf.scene.scene import Scene
 from climatenerf.sfm.diagnose import Lost
 from climatenerf.sfm.intake import Intake
@@ -34,30 +35,36 @@ def report_text(
     scene: Scene, intake: Intake, model: Model, lost: list[Lost], ground: float, sky: float
 ) -> str:
     """What a user wants to know before fitting, in Markdown."""
+    error = model.reprojection_error
     lines = [
         "# Capture",
         "",
         "![Cameras (red) and points, from above and from the side](report.png)",
         "",
-        f"- Pictures with poses: {len(model.registered)} of {len(intake.pictures)}",
-        f"- Reprojection error: {model.reprojection_error:.2f} px; {model.points} points",
+        f"- Pictures with poses: {len(model.registered)} of {len(model.registered) + len(lost)}",
+        f"- Reprojection error: {'not known' if error is None else f'{error:.2f} px'};"
+        f" {model.points} points",
         f"- Ground within {GROUND_REACH:g} camera heights of the path that {SEEN_OFTEN} pictures"
         f" or more look at: {ground:.0%}",
         f"- Sky (directions more than 10 degrees up) that any picture looks at: {sky:.0%}",
-        f"- Up from {scene.up_report.get('used', '?')}; scale from {scene.scale_source}"
-        f" (+-{scene.scale_error:.0%}); lowest ground"
+        f"- Up from {scene.up_report.get('used', '?')}; {scale_words(scene)}; lowest ground"
         f" {scene.lowest_ground_z - scene.ground_z:+.2f} m from the datum",
     ]
     angles = {k: v for k, v in scene.up_report.items() if isinstance(v, int | float)}
     if angles:
         told = ", ".join(f"{name} {angle:.1f}" for name, angle in angles.items())
         lines.append(f"- Degrees between the up that is used and each method's: {told}")
-    gps = scene.up_report.get("gps")
-    if isinstance(gps, dict):
+    place = scene.georeference
+    if place:
         lines.append(
-            f"- GPS of {gps['photos']} photos: {gps['metres_by_gps_per_metre']:.3f} m in one metre"
-            f" of the camera-height scale, spread {gps['spread_m']} m"
+            f"- GPS of {place['photos']} photos: x east, y north; the origin is at"
+            f" {place['latitude']:.6f}, {place['longitude']:.6f} degrees; photos are"
+            f" {place['spread_m']:.2f} m from their GPS places"
         )
+    for kind in ("label", "mask", "depth"):
+        count = sum(getattr(view, f"{kind}_path") is not None for view in scene.views)
+        if count:
+            lines.append(f"- Pictures with {kind} files: {count}")
     if len(model.groups) > 1:
         lines.append(f"- Groups that do not fit together: {', '.join(map(str, model.groups))}")
     if lost or intake.unusable:

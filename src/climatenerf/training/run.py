@@ -247,6 +247,8 @@ def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
         ground_z=before.ground_z,
         lowest_ground_z=before.lowest_ground_z,
         up_report=before.up_report,
+        scale_report=before.scale_report,
+        georeference=before.georeference,
     )
 
 
