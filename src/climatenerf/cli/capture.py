@@ -114,7 +114,8 @@ def poses_by_motion(options: Capture):
     """The pictures, their poses by structure from motion, and those without with the reason."""
     from climatenerf.sfm.diagnose import diagnose
     from climatenerf.sfm.intake import take_in
-    from climatenerf.sfm.reconstruct import load_pycolmap, reconstruct
+    from climatenerf.sfm.reconstruct import load_pycolmap
+    from climatenerf.sfm.worker import reconstruct_apart
 
     load_pycolmap()  # its absence is to be known before anything is done
     work = options.out / WORK
@@ -122,20 +123,30 @@ def poses_by_motion(options: Capture):
         intake = take_in(options.photos, work, lambda done, total: bar.update(done / total))
     for name, reason in intake.unusable.items():
         progress.warn(f"{name} is left out: {reason}")
-    model = reconstruct(intake, work, options.features, options.seed, Stages())
+    model = reconstruct_apart(intake, work, options.features, options.seed, Stages())
     if len(model.groups) > 1:
         progress.warn(
             f"the pictures fall into {len(model.groups)} groups that do not fit together"
             f" ({', '.join(map(str, model.groups))} pictures); the largest is kept"
         )
-    try:
-        for source, target in (("images", "images"), ("sparse", "sparse/0")):
-            shutil.rmtree(options.out / target, ignore_errors=True)
-            make_folder((options.out / target).parent)
-            shutil.copytree(model.folder / source, options.out / target)
-    except OSError as error:
-        raise explain(error, options.out) from error
+    for source, target in (("images", "images"), ("sparse", "sparse/0")):
+        copy_files(model.folder / source, options.out / target)
     return intake, model, diagnose(intake, model.registered, work / "database.db")
+
+
+def copy_files(source: Path, target: Path) -> None:
+    """All files of a folder into another, whose former content goes.
+
+    Raises:
+        UserError: the disk is full, or the place cannot be written.
+    """
+    shutil.rmtree(target, ignore_errors=True)
+    try:
+        for path in sorted(source.iterdir()):
+            if path.is_file():
+                shutil.copyfile(path, make_folder(target) / path.name)
+    except OSError as error:
+        raise explain(error, target) from error
 
 
 def poses_of_colmap(options: Capture):
@@ -198,10 +209,11 @@ class Stages:
 
 
 def peak_gigabytes() -> float:
-    """Most memory that this process has held; 0 where the system does not tell."""
+    """Most memory that this process or one that it began has held; 0 where nobody tells."""
     try:
         import resource
     except ImportError:  # Windows
         return 0.0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    processes = resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN
+    peak = max(resource.getrusage(who).ru_maxrss for who in processes)
     return peak / (1e9 if sys.platform == "darwin" else 1e6)

@@ -1,5 +1,6 @@
 """Photos of any kind, or a video, as upright pictures in a work folder, with what EXIF says."""
 
+import errno
 import json
 import math
 import shutil
@@ -15,7 +16,7 @@ from PIL import Image, ImageOps
 from climatenerf.errors import UserError
 from climatenerf.scene.images import to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
-from climatenerf.storage import atomic_path, make_folder, write_json
+from climatenerf.storage import atomic_path, explain, make_folder, write_json
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp"}
@@ -94,10 +95,16 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
     pictures, unusable, taken = [], {}, set()
     for index, path in enumerate(files):
         name = _free_name(path.relative_to(base), taken)
-        try:
-            pictures.append(_picture(path, base, folder / name))
-        except UserError as error:
-            unusable[path.relative_to(base).as_posix()] = str(error)
+        picture = _known(path, folder / name)
+        if picture is None:
+            try:
+                image, exif = open_upright(path)
+            except UserError as error:
+                unusable[path.relative_to(base).as_posix()] = str(error)
+            else:
+                picture = _keep(path, base, folder / name, image, exif)
+        if picture is not None:
+            pictures.append(picture)
         progress(index + 1, len(files))
     if len(pictures) < FEWEST:
         why = f"; unusable: {next(iter(unusable.values()))}" if unusable else ""
@@ -119,35 +126,40 @@ def _free_name(path: Path, taken: set[str]) -> str:
     return name
 
 
-def _picture(path: Path, base: Path, out: Path) -> Picture:
+def _known(path: Path, out: Path) -> Picture | None:
+    """The picture that an earlier run has made of this very photo, if it has."""
     record = out.with_suffix(".json")
-    stamp = [path.stat().st_size, path.stat().st_mtime_ns]
     if out.is_file() and record.is_file():
         try:
             known = json.loads(record.read_text())
-            if known.pop("stamp") == stamp:
-                for key in ("place", "down"):
-                    told = known["exif"][key]
-                    known["exif"][key] = (
-                        None if told is None else tuple(math.nan if x is None else x for x in told)
-                    )
-                return Picture(**{**known, "exif": Exif(**known["exif"])})
+            return picture_from_json(known) if known.pop("stamp") == _stamp(path) else None
         except (ValueError, KeyError, TypeError):
             pass  # half written or of an older version: made again
-    image, exif = open_upright(path)
+    return None
+
+
+def _keep(path: Path, base: Path, out: Path, image: Image.Image, exif: Exif) -> Picture:
     with atomic_path(out) as temporary:
         image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     grey = small_grey(image)
-    picture = Picture(
-        out.name,
-        path.relative_to(base).as_posix(),
-        *image.size,
-        exif,
-        sharpness(grey),
-        float(grey.mean() / 255),
-    )
-    write_json(record, {**asdict(picture), "stamp": stamp})
+    source = path.relative_to(base).as_posix()
+    measured = sharpness(grey), float(grey.mean() / 255)
+    picture = Picture(out.name, source, *image.size, exif, *measured)
+    write_json(out.with_suffix(".json"), {**asdict(picture), "stamp": _stamp(path)})
     return picture
+
+
+def _stamp(path: Path) -> list[int]:
+    return [path.stat().st_size, path.stat().st_mtime_ns]
+
+
+def picture_from_json(data: dict) -> Picture:
+    """A picture from the JSON of its fields; numbers that were not finite come back as NaN."""
+    exif = dict(data["exif"])
+    for key in ("place", "down"):
+        if exif[key] is not None:
+            exif[key] = tuple(math.nan if x is None else x for x in exif[key])
+    return Picture(**{**data, "exif": Exif(**exif)})
 
 
 def open_upright(path: Path) -> tuple[Image.Image, Exif]:
@@ -208,7 +220,7 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
         UserError: ffmpeg is missing or cannot decode the video.
     """
     done = folder / "done.json"
-    stamp = [video.stat().st_size, video.stat().st_mtime_ns]
+    stamp = _stamp(video)
     if done.is_file() and json.loads(done.read_text()).get("stamp") == stamp:
         return sorted(folder.glob("*.jpg"))
     try:
@@ -231,6 +243,8 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
     command += ["-q:v", "2", str(folder / "candidate_%05d.jpg")]
     result = subprocess.run(command, capture_output=True, text=True)
     candidates = sorted(folder.glob("candidate_*.jpg"))
+    if "No space left" in result.stderr:
+        raise explain(OSError(errno.ENOSPC, ""), folder)
     if not candidates:
         words = (result.stderr.strip().splitlines() or ["no frame came out"])[-1]
         raise UserError(f"{video} cannot be decoded ({words}); convert it to MP4, or give photos")

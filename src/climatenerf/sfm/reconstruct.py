@@ -6,7 +6,6 @@ Each stage leaves its result in the work folder, so that a run that was stopped 
 import contextlib
 import shutil
 import sqlite3
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +67,8 @@ def load_pycolmap():
 def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told) -> Model:
     """Poses of as many pictures as possible; the largest connected group.
 
+    COLMAP may end the process (a full disk) and does not hear Ctrl-C: see `worker`.
+
     Args:
         intake: the pictures.
         work: work folder, with what earlier runs left there.
@@ -80,10 +81,6 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     """
     pycolmap = load_pycolmap()
     database = work / "database.db"
-    made_of = {"pictures": _stamps(intake), "features": features, "seed": seed}
-    known = _known(work, made_of)
-    if known is not None:
-        return known
     _forget_if_changed(intake, database, features)
     names = [picture.name for picture in intake.pictures]
     _import(pycolmap, intake, database)
@@ -109,7 +106,7 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
         "reprojection_error": float(best.compute_mean_reprojection_error()),
         "points": best.num_points3D(),
     }
-    write_json(work / RESULT, {"made_of": made_of, **result})
+    write_json(work / RESULT, {"made_of": _made_of(intake, features, seed), **result})
     return _model(work, result)
 
 
@@ -127,13 +124,19 @@ def groups_of(models: list[set[str]]) -> list[int]:
     return sizes
 
 
-def _known(work: Path, made_of: dict) -> Model | None:
-    """The result of an earlier run over the same pictures with the same settings."""
+def known_result(intake: Intake, work: Path, features: int, seed: int) -> Model | None:
+    """What a run over the same pictures with the same settings has found; None if none has."""
     try:
         result = read_json(work / RESULT)
-        return _model(work, result) if result["made_of"] == made_of else None
+        if result["made_of"] == _made_of(intake, features, seed):
+            return _model(work, result)
     except (UserError, KeyError):
-        return None  # none yet, or damaged: found anew
+        pass  # none yet, or damaged: found anew
+    return None
+
+
+def _made_of(intake: Intake, features: int, seed: int) -> dict:
+    return {"pictures": _stamps(intake), "features": features, "seed": seed}
 
 
 def _model(work: Path, result: dict) -> Model:
@@ -207,17 +210,7 @@ def _extract(
     for start in range(0, len(names), PICTURES_AT_ONCE):
         tell("features", start / len(names))
         some = names[start : start + PICTURES_AT_ONCE]
-
-        def work(token, some: list[str] = some) -> None:
-            pycolmap.extract_features(
-                database,
-                intake.folder,
-                some,
-                extraction_options=options,
-                cancellation_token=token,
-            )
-
-        _interruptible(pycolmap, work)
+        pycolmap.extract_features(database, intake.folder, some, extraction_options=options)
     tell("features", 1.0)
 
 
@@ -256,11 +249,7 @@ def _match(
         listing.write_text("\n".join(tiles[key]) + "\n")
         options = pycolmap.ImportedPairingOptions()
         options.match_list_path = listing
-
-        def work(token, options=options) -> None:
-            pycolmap.match_image_pairs(database, pairing_options=options, cancellation_token=token)
-
-        _interruptible(pycolmap, work)
+        pycolmap.match_image_pairs(database, pairing_options=options)
         done += len(tiles[key])
     tell("matches", 1.0)
 
@@ -299,55 +288,17 @@ def _map_once(
     # It places pictures that share hardly a point with the rest, and places some of them wrongly.
     options.structure_less_registration_fallback = False
     placed = 0
-    found: dict = {}
 
     def one_more() -> None:
         nonlocal placed
         placed += 1
+        tell("poses", min(0.99, placed / len(intake.pictures)))
 
-    def work(token) -> None:
-        models = pycolmap.incremental_mapping(
-            database,
-            intake.folder,
-            folder,
-            options,
-            next_image_callback=one_more,
-            cancellation_token=token,
-        )
-        found.update(models)
-
-    _interruptible(pycolmap, work, lambda: tell("poses", min(0.99, placed / len(intake.pictures))))
+    found = pycolmap.incremental_mapping(
+        database, intake.folder, folder, options, next_image_callback=one_more
+    )
     tell("poses", 1.0)
     return found
-
-
-def _interruptible(pycolmap, work: Callable, meanwhile: Callable[[], None] = lambda: None) -> None:
-    """Runs work in a thread, so that Ctrl-C reaches it as a request to end, not as a crash.
-
-    Nothing else may open the database meanwhile: two SQLite libraries in one process break each
-    other's locks.
-    """
-    token = pycolmap.CancellationToken()
-    failure: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            work(token)
-        except BaseException as error:
-            failure.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        while thread.is_alive():
-            thread.join(0.5)
-            meanwhile()
-    except KeyboardInterrupt:
-        token.cancel()
-        thread.join()
-        raise
-    if failure:
-        raise failure[0]
 
 
 def _names(database: Path) -> list[str]:

@@ -1,0 +1,121 @@
+"""Structure from motion in a process of its own.
+
+COLMAP ends its process where a disk is full or memory is short. Here that becomes a sentence,
+Ctrl-C takes effect at once, and what was finished stays in the work folder. The two sides speak
+JSON lines.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import asdict
+from pathlib import Path
+
+from climatenerf.errors import UserError
+from climatenerf.sfm.intake import Intake, picture_from_json
+from climatenerf.sfm.reconstruct import Model, Told, known_result, reconstruct
+from climatenerf.storage import plain
+
+NEARLY_FULL = 20_000_000  # bytes free, below which a crash is put down to the disk
+LOG = "colmap.log"
+
+
+def reconstruct_apart(intake: Intake, work: Path, features: int, seed: int, tell: Told) -> Model:
+    """`reconstruct` in another process; arguments, result and errors are its own.
+
+    Raises:
+        UserError: as `reconstruct`, or the process ended before its time.
+    """
+    known = known_result(intake, work, features, seed)
+    if known is not None:
+        return known
+    order = plain({"intake": asdict(intake), "work": work, "features": features, "seed": seed})
+    with (work / LOG).open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "climatenerf.sfm.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C is for this side, which ends the other one
+        )
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        # The pipe stays open: its end tells the worker that this side is gone.
+        process.stdin.write(json.dumps(order).encode() + b"\n")
+        process.stdin.flush()
+        for line in process.stdout:
+            words = json.loads(line)
+            if "error" in words:
+                raise UserError(words["error"])
+            if "stage" in words:
+                tell(words["stage"], words["share"])
+    except BrokenPipeError:
+        pass  # it ended at once; why is told below
+    finally:
+        process.kill()
+        process.wait()
+        with contextlib.suppress(OSError):
+            process.stdin.close()
+        process.stdout.close()
+    model = known_result(intake, work, features, seed)
+    if model is None:
+        raise UserError(_why(work, process.returncode))
+    return model
+
+
+def _why(work: Path, status: int) -> str:
+    """The probable cause of a worker's end, and the remedy."""
+    if shutil.disk_usage(work).free < NEARLY_FULL:
+        return (
+            f"the disk is full: could not go on in {work}; free some space or choose another folder"
+            " (what was already saved is unharmed)"
+        )
+    if status == -signal.SIGKILL:
+        return "finding poses was ended from outside, likely for memory; try --features 2048"
+    words = (work / LOG).read_text(errors="replace").strip().splitlines()
+    last = next((line for line in reversed(words) if "] " in line or "Error" in line), "no reason")
+    return f"finding poses failed ({last.strip()[:300]}); see {work / LOG}, and run it again"
+
+
+def main() -> None:
+    """The worker's side: an order on standard input, progress and errors on standard output."""
+    order = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_the_other_side, daemon=True).start()
+    # COLMAP, too, may write to standard output: it goes where errors go.
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+
+    def say(words: dict) -> None:
+        answers.write(json.dumps(words) + "\n")
+
+    told = order["intake"]
+    intake = Intake(
+        folder=Path(told["folder"]),
+        pictures=tuple(picture_from_json(picture) for picture in told["pictures"]),
+        unusable=told["unusable"],
+        is_video=told["is_video"],
+    )
+    try:
+        reconstruct(
+            intake,
+            Path(order["work"]),
+            order["features"],
+            order["seed"],
+            lambda stage, share: say({"stage": stage, "share": share}),
+        )
+    except UserError as error:
+        say({"error": str(error)})
+
+
+def _end_with_the_other_side() -> None:
+    sys.stdin.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main()
