@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shutil
+import subprocess
 from importlib.resources import files
 from pathlib import Path
 
@@ -193,3 +194,27 @@ def test_of_two_places_the_larger_is_kept(tmp_path, capsys):
     names = [view.name for view in load_scene(tmp_path / "scene").views]
     assert len(names) >= 12 and all(name.startswith("here-") for name in names)
     assert "Groups that do not fit together" in (tmp_path / "scene" / "report.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_video_of_the_street(tmp_path, capsys):
+    """The street's photos in their order as a film: compared with neighbours, not all with all."""
+    import imageio_ffmpeg
+
+    truth = read_scene(STREET)
+    video = tmp_path / "walk.mov"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo"]
+    command += ["-pix_fmt", "rgb24", "-s", "384x216", "-r", "4", "-i", "-", "-crf", "12", video]
+    frames = b"".join(Image.open(view.path).convert("RGB").tobytes() for view in truth.views)
+    subprocess.run([str(word) for word in command], input=frames, check=True)
+    assert status("capture", video, "-o", tmp_path / "scene") == 0
+    told = capsys.readouterr()
+    scene = load_scene(tmp_path / "scene")
+    assert len(scene.views) > 0.8 * len(truth.views), told.err
+    names = [Path(view.name).stem for view in truth.views]
+    true = np.stack([truth.c2w_world(truth.views[int(Path(v.name).stem)]) for v in scene.views])
+    assert len(set(names)) == len(names) and scene.scale_source == "camera-height-assumed"
+    own = np.stack([scene.c2w_world(view) for view in scene.views])
+    scale, rotation, shift = similarity(own[:, :3, 3], true[:, :3, 3])
+    away = np.linalg.norm(scale * own[:, :3, 3] @ rotation.T + shift - true[:, :3, 3], axis=-1)
+    assert np.median(away) < 0.02 * np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))

@@ -11,7 +11,12 @@ from PIL import Image
 from climatenerf.errors import UserError
 from climatenerf.sfm import intake as module
 from climatenerf.sfm.intake import sharpness, small_grey, take_in
-from climatenerf.sfm.reconstruct import EXHAUSTIVE_UP_TO, camera_groups, pairs_of
+from climatenerf.sfm.reconstruct import (
+    EXHAUSTIVE_UP_TO,
+    camera_groups,
+    pairs_of,
+    pairs_of_lost,
+)
 
 
 def quiet(*_):
@@ -212,3 +217,11 @@ def test_a_scene_among_the_photos_is_not_taken_for_photos(tmp_path):
     take_in(tmp_path / "in", work, quiet)
     photo(tmp_path / "in" / "scene" / "images" / "x.jpg")
     assert len(take_in(tmp_path / "in", work, quiet).pictures) == 3
+
+
+def test_pictures_without_pose_get_a_second_chance():
+    assert pairs_of_lost([True, False, True], [(0, 1)]) == [(1, 2)]
+    assert pairs_of_lost([True, True, True], [(0, 1)]) == []
+    assert pairs_of_lost([True, False, True], pairs_of(3, False)) == []
+    many = pairs_of_lost([i % 2 == 0 for i in range(400)], [])
+    assert 5_000 < len(many) <= 10_000 and len(set(many)) == len(many)

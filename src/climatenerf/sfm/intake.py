@@ -1,5 +1,6 @@
 """Photos of any kind, or a video, as upright pictures in a work folder, with what EXIF says."""
 
+import contextlib
 import errno
 import json
 import math
@@ -227,7 +228,7 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
         import imageio_ffmpeg
 
         ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-        _, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
     except (ImportError, RuntimeError, OSError) as error:
         raise UserError(
             f"{video} cannot be decoded ({str(error).strip().splitlines()[-1]});"
@@ -235,28 +236,54 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
         ) from error
     shutil.rmtree(folder, ignore_errors=True)
     make_folder(folder)
-    if not seconds or seconds <= 0:
+    if not count or not seconds or seconds <= 0:
         raise UserError(f"{video} holds no frames; record it again or give photos")
-    rate = VIDEO_FRAMES * CANDIDATES / seconds
-    scale = f"fps={rate:.6f},scale='min({LONGEST},iw)':-2"
+    wanted = min(count, VIDEO_FRAMES * CANDIDATES)
+    # Of a short video all frames are candidates: at a higher rate some would come twice.
+    rate = [] if wanted == count else [f"fps={wanted / seconds:.6f}"]
+    scale = ",".join([*rate, f"scale='min({LONGEST},iw)':-2"])
     command = [ffmpeg, "-y", "-loglevel", "error", "-nostdin", "-i", str(video), "-vf", scale]
-    command += ["-q:v", "2", str(folder / "candidate_%05d.jpg")]
-    result = subprocess.run(command, capture_output=True, text=True)
+    command += ["-fps_mode", "passthrough", "-q:v", "2", str(folder / "candidate_%05d.jpg")]
+    words = _run_ffmpeg(command, folder, lambda: progress(_count(folder), 2 * wanted))
     candidates = sorted(folder.glob("candidate_*.jpg"))
-    if "No space left" in result.stderr:
-        raise explain(OSError(errno.ENOSPC, ""), folder)
     if not candidates:
-        words = (result.stderr.strip().splitlines() or ["no frame came out"])[-1]
         raise UserError(f"{video} cannot be decoded ({words}); convert it to MP4, or give photos")
     kept = []
-    for start in range(0, len(candidates), CANDIDATES):
-        some = candidates[start : start + CANDIDATES]
+    for some in np.array_split(np.array(candidates), min(VIDEO_FRAMES, len(candidates))):
         best = max(some, key=lambda path: sharpness(small_grey(Image.open(path))))
         target = folder / f"{len(kept):04d}.jpg"
         best.rename(target)
         kept.append(target)
-        progress(start + len(some), len(candidates))
+        progress(wanted + len(kept), wanted + min(VIDEO_FRAMES, len(candidates)))
     for path in folder.glob("candidate_*.jpg"):
         path.unlink()
     write_json(done, {"stamp": stamp})
     return kept
+
+
+def _run_ffmpeg(command: list[str], folder: Path, meanwhile: Callable[[], None]) -> str:
+    """Runs ffmpeg to its end; returns its last words.
+
+    Raises:
+        UserError: the disk is full.
+    """
+    log = folder / "ffmpeg.log"
+    with log.open("wb") as file:
+        process = subprocess.Popen(command, stderr=file)
+    try:
+        while process.poll() is None:
+            meanwhile()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(0.5)
+    finally:
+        process.kill()
+        process.wait()
+    words = log.read_text(errors="replace").strip()
+    log.unlink()
+    if "No space left" in words or (process.returncode and shutil.disk_usage(folder).free < 1e6):
+        raise explain(OSError(errno.ENOSPC, ""), folder)
+    return words.splitlines()[-1] if words else "no frame came out"
+
+
+def _count(folder: Path) -> int:
+    return sum(1 for _ in folder.glob("candidate_*.jpg"))

@@ -22,6 +22,7 @@ OVERLAP = 10  # neighbours in time to each side
 PICTURES_AT_ONCE = 6  # in one call for features: the bar moves in between
 TILE = 16  # pictures against as many in one call for matches
 ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
+MORE_PAIRS = 10_000  # of the second chance: ten minutes or so
 LEAST_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
 
 RESULT = "poses.json"
@@ -85,7 +86,8 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     names = [picture.name for picture in intake.pictures]
     _import(pycolmap, intake, database)
     _extract(pycolmap, intake, database, names, features, tell)
-    _match(pycolmap, database, names, pairs_of(len(names), intake.is_video), seed, tell)
+    pairs = pairs_of(len(names), intake.is_video)
+    _match(pycolmap, database, names, pairs, seed, tell)
     if turned_only(intake, database):
         raise UserError(
             "all pictures were taken from one spot: they differ by turning the camera alone and"
@@ -94,6 +96,11 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     (work / RESULT).unlink(missing_ok=True)
     models = _map(pycolmap, intake, database, work / "models", seed, tell)
     best = max(models, key=lambda m: m.num_reg_images())
+    more = pairs_of_lost([name in _registered(best) for name in names], pairs)
+    if more:
+        _match(pycolmap, database, names, more, seed, tell, "more matches")
+        models = _map(pycolmap, intake, database, work / "models", seed, tell)
+        best = max(models, key=lambda m: m.num_reg_images())
     out = work / "undistorted"
     shutil.rmtree(out, ignore_errors=True)
     chosen = make_folder(work / "chosen")
@@ -102,12 +109,16 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
     pycolmap.undistort_images(out, chosen, intake.folder, jpeg_quality=95, output_type="COLMAP")
     tell("undistort", 1.0)
     result = {
-        "groups": groups_of([{m.image(i).name for i in m.reg_image_ids()} for m in models]),
+        "groups": groups_of([_registered(model) for model in models]),
         "reprojection_error": float(best.compute_mean_reprojection_error()),
         "points": best.num_points3D(),
     }
     write_json(work / RESULT, {"made_of": _made_of(intake, features, seed), **result})
     return _model(work, result)
+
+
+def _registered(model) -> set[str]:
+    return {model.image(i).name for i in model.reg_image_ids()}
 
 
 def groups_of(models: list[set[str]]) -> list[int]:
@@ -228,6 +239,15 @@ def pairs_of(n: int, is_video: bool) -> list[tuple[int, int]]:
     return sorted(near | {(i, j) for i in some for j in some if i < j})
 
 
+def pairs_of_lost(posed: list[bool], done: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Pictures without pose with all others, as far as they were not compared: a second chance."""
+    known = set(done)
+    n = len(posed)
+    every = ((i, j) for i in range(n) for j in range(i + 1, n) if not (posed[i] and posed[j]))
+    more = [pair for pair in every if pair not in known]
+    return more[:: -(-len(more) // MORE_PAIRS)] if more else []
+
+
 def _match(
     pycolmap,
     database: Path,
@@ -235,6 +255,7 @@ def _match(
     pairs: list[tuple[int, int]],
     seed: int,
     tell: Told,
+    stage: str = "matches",
 ) -> None:
     pycolmap.set_random_seed(seed)
     # Tile by tile, so that a picture's features are read once for many comparisons.
@@ -245,13 +266,13 @@ def _match(
     done = 0
     listing = database.with_name("pairs.txt")
     for key in sorted(tiles):
-        tell("matches", done / len(pairs))
+        tell(stage, done / len(pairs))
         listing.write_text("\n".join(tiles[key]) + "\n")
         options = pycolmap.ImportedPairingOptions()
         options.match_list_path = listing
         pycolmap.match_image_pairs(database, pairing_options=options)
         done += len(tiles[key])
-    tell("matches", 1.0)
+    tell(stage, 1.0)
 
 
 def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell: Told) -> list:
