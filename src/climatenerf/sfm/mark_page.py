@@ -12,12 +12,18 @@ _PAGE = """<!doctype html>
 <style>
 body { font: 15px sans-serif; margin: 1em; }
 textarea { width: 100%; height: 14em; font: 13px monospace; }
-img { max-width: 100%; cursor: crosshair; display: block; margin: .3em 0 1em; }
+figure { position: relative; width: fit-content; margin: .3em 0 1em; }
+/* Poses are of the pixels as stored, so no tag may turn the picture here. */
+img { max-width: 100%; cursor: crosshair; display: block; image-orientation: none; }
+figure span { position: absolute; color: #fff; background: #c22; font-size: 11px; padding: 0 3px;
+  transform: translate(6px, -6px); pointer-events: none; }
+figure span::before { content: ""; position: absolute; left: -9px; top: 3px; width: 6px;
+  height: 6px; border-radius: 3px; background: #c22; }
 </style>
 <h1>Mark known lengths</h1>
 <p>Choose a name and an end, then click where that end is in two pictures or more, taken from places
-well apart. Save the text as <code>marks.toml</code> beside this page, then give
-<code>--known-length "NAME=2.0 m"</code>.</p>
+well apart. A new click on a picture moves the mark. Save the text as <code>marks.toml</code> beside
+this page, then give <code>--known-length "NAME=2.0 m"</code>.</p>
 <p>Name <input id="name" value="DOOR"> end
 <select id="end"><option>from</option><option>to</option></select>
 <button onclick="marks = {}; show()">begin anew</button></p>
@@ -25,7 +31,7 @@ well apart. Save the text as <code>marks.toml</code> beside this page, then give
 <div id="pictures"></div>
 <script>
 const pictures = PICTURES;
-let marks = {};
+let marks = {}, images = {};
 function show() {
   let text = "";
   for (const [name, ends] of Object.entries(marks))
@@ -35,14 +41,27 @@ function show() {
         text += JSON.stringify(picture) + " = [" + x + ", " + y + "]\\n";
     }
   document.getElementById("toml").value = text;
+  for (const dot of document.querySelectorAll("figure span")) dot.remove();
+  for (const [name, ends] of Object.entries(marks))
+    for (const [end, places] of Object.entries(ends))
+      for (const [picture, [x, y]] of Object.entries(places)) {
+        const image = images[picture], dot = document.createElement("span");
+        dot.textContent = name + " " + end;
+        dot.style.left = 100 * x / image.marked.width + "%";
+        dot.style.top = 100 * y / image.marked.height + "%";
+        image.parentNode.append(dot);
+      }
 }
 for (const picture of pictures) {
   const title = document.createElement("div"), image = document.createElement("img");
+  const figure = document.createElement("figure");
+  images[picture.name] = image;
+  image.marked = picture;  // its naturalWidth is that of the picture as a tag turns it
   title.textContent = picture.name;
   image.src = picture.file;
   image.loading = "lazy";
   image.onclick = event => {
-    const scale = image.naturalWidth / image.clientWidth;
+    const scale = picture.width / image.clientWidth;
     const name = document.getElementById("name").value;
     const end = document.getElementById("end").value;
     marks[name] ??= {};
@@ -51,7 +70,8 @@ for (const picture of pictures) {
       [event.offsetX, event.offsetY].map(v => Math.round(v * scale * 10) / 10);
     show();
   };
-  document.getElementById("pictures").append(title, image);
+  figure.append(image);
+  document.getElementById("pictures").append(title, figure);
 }
 </script>
 """
@@ -66,6 +86,8 @@ def write_mark_page(path: Path, scene: Scene) -> None:
             "file": view.path.relative_to(root).as_posix()
             if view.path.is_relative_to(root)
             else view.path.as_uri(),
+            "width": scene.cameras[view.camera].width,
+            "height": scene.cameras[view.camera].height,
         }
         for view in scene.views
     ]
