@@ -80,6 +80,43 @@ def test_the_error_that_is_told_is_the_error_that_is_made(tmp_path):
     assert told == pytest.approx(made, rel=0.35)
 
 
+def drifting(scene, noise, correlation, seed):
+    """Places whose errors change slowly from photo to photo, as a receiver's do."""
+    rng = np.random.default_rng(seed)
+    error, out = rng.normal(size=2), {}
+    for view in scene.views:
+        x, y = view.c2w[:2, 3] + noise * error
+        out[view.name] = (HOME[0] + y / LAT_M, HOME[1] + x / LON_M, 400.0)
+        fresh = math.sqrt(1 - correlation**2) * rng.normal(size=2)
+        error = correlation * error + fresh
+    return out
+
+
+@pytest.mark.parametrize(("count", "noise", "correlation"), [(60, 3.0, 0.9), (8, 1.5, 0.0)])
+def test_the_error_is_honest_for_drift_and_for_few_photos(tmp_path, count, noise, correlation):
+    scene = scene_of(ring(count, radius=20.0), tmp_path)
+    found = [find_georeference(scene, drifting(scene, noise, correlation, s)) for s in range(80)]
+    ratio = [(f.scale - 1) / f.scale_error for f in found if f is not None]
+    assert len(ratio) > 20 and np.sqrt(np.mean(np.square(ratio))) < 2.2
+
+
+def test_drift_as_large_as_the_path_is_not_believed(tmp_path):
+    scene = scene_of(ring(48, radius=3.0), tmp_path)
+    found = [find_georeference(scene, drifting(scene, 4.0, 0.95, seed)) for seed in range(60)]
+    assert np.mean([f is None for f in found]) > 0.8
+
+
+def test_a_fix_that_is_given_to_several_photos_is_one(tmp_path):
+    scene = scene_of(ring(24, radius=15.0), tmp_path)
+    places = places_of(scene, 1.0, 0.0, 1.0)
+    names = [view.name for view in scene.views]
+    lagging = {name: places[names[i // 4 * 4]] for i, name in enumerate(names)}
+    found = find_georeference(scene, lagging)
+    assert found is not None and found.photos == 24
+    assert abs(found.scale - 1) < 3 * found.scale_error
+    assert found.scale_error > 1.5 * find_georeference(scene, places).scale_error
+
+
 def test_a_third_of_wild_fixes_does_no_harm(tmp_path):
     scene = scene_of(ring(24, radius=15.0), tmp_path)
     places = places_of(scene, 1.3, 0.5, 0.5)

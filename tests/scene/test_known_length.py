@@ -39,7 +39,9 @@ def marks_of(scene, names=("000.jpg", "002.jpg", "004.jpg"), noise=0.0, seed=0):
 
 def test_a_length_is_measured_through_the_lens(scene):
     found = measure(scene, marks_of(scene), "DOOR", 2.0)
-    assert found.found == pytest.approx(2.0, abs=1e-6) and found.error == 0.005
+    assert found.found == pytest.approx(2.0, abs=1e-6)
+    # Nobody clicks better than 2 pixels: here 2 cm, in three pictures, at either end.
+    assert 0.005 < found.error < 0.02
 
 
 def test_the_error_that_is_told_is_the_error_that_is_made(scene):
@@ -52,7 +54,7 @@ def test_the_scene_is_scaled_about_its_ground(scene):
     known = measure(scene, marks_of(scene), "DOOR", 3.0)
     out = apply_known_lengths(replace(scene, ground_z=0.5), [known])
     assert out.scale == pytest.approx(1.5) and out.scale_source == "known-length"
-    assert out.scale_error == pytest.approx(0.005)
+    assert out.scale_error == pytest.approx(known.error)
     assert out.lowest_ground_z == pytest.approx(0.5 - 1.5 * 1.5)
     height = scene.c2w_world(scene.views[0])[2, 3] - 0.5
     assert out.c2w_world(out.views[0])[2, 3] - 0.5 == pytest.approx(1.5 * height)

@@ -47,8 +47,8 @@ def test_each_reason(tmp_path):
     assert set(reasons) == {"soft", "dark", "lone", "far1", "far2", "odd"}
     assert "blurred (10%" in reasons["soft"].reason and "still" in reasons["soft"].remedy
     assert "dark" in reasons["dark"].reason and "exposure" in reasons["dark"].remedy
-    assert "too little in common" in reasons["lone"].reason and "b.jpg" in reasons["lone"].reason
-    assert "cut off" in reasons["far1"].reason and "far2.jpg" in reasons["far1"].reason
+    assert "too little in common" in reasons["lone"].reason and "b.HEIC" in reasons["lone"].reason
+    assert "cut off" in reasons["far1"].reason and "far2.HEIC" in reasons["far1"].reason
     assert "ambiguous" in reasons["odd"].reason
     assert reasons["far2"].neighbours == (("far1.jpg", 200),)
     assert reasons["soft"].source == "soft.HEIC"

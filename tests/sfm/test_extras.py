@@ -9,7 +9,7 @@ from PIL import Image
 from climatenerf.errors import UserError
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.scene.images import load_depth, load_labels, load_mask
-from climatenerf.sfm.extras import bring_along
+from climatenerf.sfm.extras import Photo, bring_along, turned
 
 LENS = Camera(160, 120, 130.0, 130.0, 80.0, 60.0, k1=-0.15)
 FLAT = Camera(150, 112, 128.0, 128.0, 75.0, 56.0)
@@ -31,12 +31,12 @@ def scene(tmp_path):
     return Scene(tmp_path / "scene", "test", (FLAT,), views)
 
 
-def brought(scene, kind, folder, orientation=1, lens=LENS):
-    names = [view.name for view in scene.views]
-    return bring_along(
-        scene, kind, folder, {n: f"sub/{n[0].upper()}.HEIC" for n in names},
-        dict.fromkeys(names, lens), dict.fromkeys(names, orientation),
-    )  # fmt: skip
+def brought(scene, kind, folder, orientation=1, lens=LENS, shown=True):
+    photos = {
+        view.name: Photo(f"sub/{view.name[0].upper()}.HEIC", lens, orientation, shown)
+        for view in scene.views
+    }
+    return bring_along(scene, kind, folder, photos)
 
 
 def edges(label):
@@ -74,6 +74,58 @@ def test_files_of_photos_as_stored_are_turned_as_the_photo_is(scene, tmp_path, o
     stored = shown if orientation == 1 else shown.transpose(turn[orientation])
     stored.save(tmp_path / "labels" / "A.png")
     out = brought(scene, "labels", tmp_path / "labels", orientation)
+    true = classes(FLAT)[0]
+    assert (load_labels(out.views[0], out) == true)[~edges(true)].all()
+
+
+def stored(values, orientation):
+    """What is stored when a picture is to be shown as `values`."""
+    return turned(values, {6: 8, 8: 6}.get(orientation, orientation))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_turning_is_what_pillow_does(tmp_path, orientation):
+    from PIL import ImageOps
+
+    data = Image.Exif()
+    data[0x0112] = orientation
+    values = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    Image.fromarray(values).save(tmp_path / "a.png", exif=data)
+    shown = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
+    np.testing.assert_array_equal(turned(values, orientation), shown)
+    np.testing.assert_array_equal(turned(stored(values, orientation), orientation), values)
+
+
+@pytest.mark.parametrize("as_stored", [False, True])
+def test_photos_turned_by_half_follow_those_on_edge(scene, tmp_path, as_stored):
+    """The shape of a file tells how it was made only where the photo is on edge."""
+    (tmp_path / "labels").mkdir()
+    true, orientations = classes(FLAT)[0], {"a.jpg": 3, "b.jpg": 6, "c.jpg": 1}
+    photos = {}
+    for name, orientation in orientations.items():
+        values = classes(LENS)[0]
+        values = stored(values, orientation) if as_stored else values
+        Image.fromarray(values).save(tmp_path / "labels" / f"{name[0]}.png")
+        photos[name] = Photo(name, LENS, orientation, True)
+    out = bring_along(scene, "labels", tmp_path / "labels", photos)
+    for view in out.views:
+        assert (load_labels(view, out) == true)[~edges(true)].all(), view.name
+    assert out.warnings == ()
+    # Without any on edge nothing tells, and that is said.
+    alone = {**photos, "b.jpg": Photo("b.jpg", LENS, 1, True)}
+    Image.fromarray(classes(LENS)[0]).save(tmp_path / "labels" / "b.png")
+    fresh = replace(scene, root=tmp_path / "other")
+    out = bring_along(fresh, "labels", tmp_path / "labels", alone)
+    assert any("turned by half" in w for w in out.warnings)
+
+
+@pytest.mark.parametrize("as_stored", [False, True])
+def test_poses_of_pixels_as_stored_want_files_of_them(scene, tmp_path, as_stored):
+    (tmp_path / "labels").mkdir()
+    of_pixels = classes(LENS)[0]
+    values = of_pixels if as_stored else turned(of_pixels, 6)
+    Image.fromarray(values).save(tmp_path / "labels" / "A.png")
+    out = brought(scene, "labels", tmp_path / "labels", orientation=6, shown=False)
     true = classes(FLAT)[0]
     assert (load_labels(out.views[0], out) == true)[~edges(true)].all()
 
@@ -124,8 +176,6 @@ def test_one_lens_for_both_changes_nothing(scene, tmp_path):
 
 def test_files_that_cannot_be_used(scene, tmp_path):
     folder = tmp_path / "labels"
-    with pytest.raises(UserError, match="no folder"):
-        brought(scene, "labels", folder)
     folder.mkdir()
     with pytest.raises(UserError, match="name the files like"):
         brought(scene, "labels", folder)

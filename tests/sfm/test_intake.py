@@ -10,7 +10,7 @@ from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.sfm import intake as module
-from climatenerf.sfm.intake import sharpness, small_grey, take_in
+from climatenerf.sfm.intake import open_upright, sharpness, small_grey, take_in
 from climatenerf.sfm.reconstruct import (
     EXHAUSTIVE_UP_TO,
     camera_groups,
@@ -225,3 +225,45 @@ def test_pictures_without_pose_get_a_second_chance():
     assert pairs_of_lost([True, False, True], pairs_of(3, False)) == []
     many = pairs_of_lost([i % 2 == 0 for i in range(400)], [])
     assert 5_000 < len(many) <= 10_000 and len(set(many)) == len(many)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", ["jpg", "webp", "tif"])
+def test_odd_exif_is_no_reason_to_fail(tmp_path, kind):
+    """Bytes of the EXIF block changed at random: the photo is read, or left out with a reason."""
+    data = exif(6, 4.2, 26, (47.0, 8.0, 400.0), gravity=(0.0, -1.0, 0.0), lens="back")
+    photo(tmp_path / f"whole.{kind}", (40, 30), data)
+    whole = bytearray((tmp_path / f"whole.{kind}").read_bytes())
+    start = whole.find(b"Maker") - 200
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        changed = whole.copy()
+        for at in rng.integers(max(start, 12), start + 500, 3):
+            changed[at % len(changed)] = rng.integers(256)
+        (tmp_path / f"a.{kind}").write_bytes(changed)
+        try:
+            image, found = open_upright(tmp_path / f"a.{kind}")
+        except UserError:
+            continue
+        assert image.mode == "RGB" and 1 <= found.orientation <= 8
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "CMYK", "I;16", "P"])
+@pytest.mark.parametrize("kind", ["tif", "png", "jpg"])
+def test_pictures_of_every_mode_are_turned_once(tmp_path, kind, mode):
+    if kind == "jpg" and mode in ("RGBA", "I;16", "P"):
+        pytest.skip("JPEG knows no such mode")
+    if kind == "png" and mode == "CMYK":
+        pytest.skip("PNG knows no such mode")
+    bright = 60000 if mode == "I;16" else 230
+    values = np.zeros((30, 40), np.uint16 if mode == "I;16" else np.uint8)
+    values[:10, :10] = bright  # upper left as stored: upper right when turned by tag 6
+    image = Image.fromarray(values)
+    image = image if mode == "I;16" else image.convert(mode)
+    data = Image.Exif()
+    data[0x0112] = 6
+    image.save(tmp_path / f"a.{kind}", exif=data)
+    shown, _ = open_upright(tmp_path / f"a.{kind}")
+    assert shown.size == (30, 40)
+    assert min(shown.getpixel((26, 3))) > 200 and max(shown.getpixel((3, 3))) < 60
+    assert max(shown.getpixel((26, 36))) < 60

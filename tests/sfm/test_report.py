@@ -52,12 +52,17 @@ def test_the_report_names_what_to_do(tmp_path):
     scene = scene_of([look((0, 1, -0.1), (x, 0, 1.6)) for x in range(5)], tmp_path)
     pictures = tuple(Picture(f"{i}.jpg", f"{i}.jpg", 100, 100, Exif(), 1.0, 0.5) for i in range(6))
     intake = Intake(tmp_path, pictures, {"bad.png": "bad.png is empty"}, False)
-    model = Model(tmp_path, {}, tuple(v.name for v in scene.views), (5, 3), 0.71, 200)
-    lost = [Lost("5.jpg", "5.jpg", "blurred (9% of the usual detail)", "take it again", ())]
+    model = Model({}, tuple(v.name for v in scene.views), (5, 3), 0.71, 200)
+    lost = [
+        Lost(
+            "5.jpg", "5.jpg", "blurred (9% of the usual detail)", "take it again", (("4.jpg", 12),)
+        )
+    ]
     text, picture = write_report(tmp_path, scene, intake, model, lost)
     words = text.read_text()
     assert "5 of 6" in words and "0.71 px" in words and "5, 3" in words
-    assert "| 5.jpg | blurred (9% of the usual detail) | take it again |" in words
+    row = "| 5.jpg | blurred (9% of the usual detail) | take it again | 4.jpg (12) |"
+    assert row in words
     assert "bad.png is empty" in words
     pixels = np.asarray(Image.open(picture)).reshape(-1, 3)
     assert (pixels == (200, 40, 30)).all(-1).sum() > 50, "cameras are drawn"

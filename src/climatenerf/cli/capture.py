@@ -1,5 +1,6 @@
 """``climatenerf capture PHOTOS|VIDEO -o SCENE``: a posed scene from bare photos or a video."""
 
+import os
 import shutil
 import sys
 from dataclasses import dataclass, replace
@@ -9,15 +10,23 @@ from typing import Annotated
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.fit import frame_line, with_known_lengths
+from climatenerf.cli.fit import check_known_lengths, frame_line, with_known_lengths
 from climatenerf.errors import UserError
-from climatenerf.scene import Scene, read_scene, save_scene
+from climatenerf.scene import Camera, Scene, load_scene, read_scene, save_scene
+from climatenerf.scene.colmap import read_colmap
 from climatenerf.scene.georeference import apply_georeference, find_georeference
+from climatenerf.scene.images import picture_header
+from climatenerf.scene.known_length import FILE_NAME as MARKS
 from climatenerf.scene.scale import by_depth, scale_warnings, with_witness
-from climatenerf.storage import explain, make_folder
+from climatenerf.storage import explain, make_folder, write_json
 from climatenerf.weather.units import OptionalLength
 
 WORK = "work"  # folder in the scene: may be deleted when all is well
+MADE = "made-by-capture.json"  # in it: what bears our names beside it is ours
+PLACES = (
+    "images", "sparse", "labels", "masks", "depth", "scene.json", "points.ply", "points_seen.npz",
+    "report.md", "report.png", "mark.html",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,7 +49,7 @@ class Capture:
     """Folder of z-depths (16-bit PNG in mm; NPY or NPZ in m), named like the photos."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
-    known_length: tuple[str, ...] = ()
+    known_length: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
     marks: Path | None = None
     """Where their ends are in the pictures; default: marks.toml in the scene folder."""
@@ -54,32 +63,36 @@ def run(options: Capture) -> int:
     from climatenerf.sfm.mark_page import write_mark_page
     from climatenerf.sfm.report import write_report
 
+    new = begin(options.out)
     find = poses_of_colmap if options.from_colmap else poses_by_motion
-    intake, model, lost = find(options)
-    scene = in_metres(options, intake)
+    intake, model, lost = find(options, new)
+    scene = with_files(options, in_metres(options, new, intake), intake, model)
+    refused = None
     try:
-        scene = with_known_lengths(scene, options.known_length, options.marks)
-    finally:
-        # The poses are worth keeping, and the page is needed to make marks.
-        save_scene(scene, options.out)
-        write_mark_page(options.out / "mark.html", scene)
-    scene = with_files(options, scene, intake, model)
+        scene = with_known_lengths(scene, options.known_length, options.marks or marks_of(options))
+    except UserError as error:
+        refused = error  # the poses are worth keeping, and the page is needed to make marks
     told = dict.fromkeys((*scene.warnings, *scale_warnings(scene)))
     scene = replace(scene, warnings=tuple(told))
-    save_scene(scene, options.out)
+    save_scene(scene, new)
+    write_mark_page(new / "mark.html", scene)
+    write_report(new, scene, intake, model, lost)
+    take_place(options.out, new)
+    save_scene(load_scene(options.out), options.out)  # now it knows where it is
     for warning in scene.warnings:
         progress.warn(warning)
     progress.say(frame_line(scene))
     for one in lost:
         progress.warn(f"{one.source} has no pose: {one.reason}; {one.remedy}")
-    report, _ = write_report(options.out, scene, intake, model, lost)
+    if refused is not None:
+        raise UserError(f"{refused} (poses are kept in {options.out}, without this length)")
     error = model.reprojection_error
     progress.result(
         f"{len(scene.views)} of {len(scene.views) + len(lost)} pictures have poses"
         f"{'' if error is None else f', reprojection error {error:.2f} px'},"
         f" {model.points} points; peak memory {peak_gigabytes():.1f} GB"
     )
-    progress.result(f"report: {report}")
+    progress.result(f"report: {options.out / 'report.md'}")
     progress.result(f"scene: {options.out}")
     return 0
 
@@ -88,107 +101,162 @@ def check(options: Capture) -> None:
     """What can be known to be wrong before anything is done.
 
     Raises:
-        UserError: a flag out of its range, a folder that is absent, or a scene in the way.
+        UserError: a flag out of its range, a folder that is absent, or files in the way.
     """
     if not 64 <= options.features <= 32768:
         raise UserError(f"--features must lie between 64 and 32768; got {options.features}")
-    for kind in ("labels", "masks", "depth"):
-        folder = getattr(options, kind)
-        if folder is not None and not folder.is_dir():
-            raise UserError(f"--{kind} {folder} is no folder; give the folder of the files")
+    if not 0 <= options.seed < 2**31:
+        raise UserError(f"--seed must lie between 0 and 2147483647; got {options.seed}")
+    if options.camera_height is not None and not options.camera_height > 0:
+        raise UserError(f"--camera-height must be above 0; got {options.camera_height:g} m")
     if not options.photos.exists():
         raise UserError(f"{options.photos} does not exist; give a folder of photos or a video")
-    if options.out.resolve() == options.photos.resolve():
-        raise UserError(f"{options.out} holds the photos; choose another folder with -o")
-    if not (options.out / WORK).is_dir():
-        # Not made by an earlier run: what is there is the user's.
-        for name, what in (("scene.json", "a scene"), ("images", "images"), ("sparse", "sparse")):
-            if (options.out / name).exists():
+    for kind in ("labels", "masks", "depth"):
+        folder = getattr(options, kind)
+        if folder is not None and not (folder.is_dir() and any(folder.iterdir())):
+            raise UserError(f"--{kind} {folder} is no folder with files; give the folder of them")
+    out = options.out.resolve()
+    for name in ("photos", "labels", "masks", "depth", "from_colmap"):
+        path = getattr(options, name)
+        if path is not None and path.resolve().is_relative_to(out):
+            raise UserError(f"{path} lies in {options.out}; choose another folder with -o")
+    check_known_lengths(options.known_length, options.marks, marks_of(options))
+    if (options.out / WORK).is_symlink() or not (options.out / WORK / MADE).is_file():
+        for name in (*PLACES, WORK):
+            if (options.out / name).exists() or (options.out / name).is_symlink():
                 raise UserError(
-                    f"{options.out} already holds {what}; choose another folder with -o"
+                    f"{options.out} already holds {name}, which no earlier capture made; choose"
+                    " another folder with -o"
                 )
-    make_folder(options.out / WORK)
 
 
-def poses_by_motion(options: Capture):
+def marks_of(options: Capture) -> Path:
+    """Where marks are looked for if nothing is said."""
+    return options.out / MARKS
+
+
+def begin(out: Path) -> Path:
+    """The folder in which the scene is made before it takes its place, empty.
+
+    A record in the work folder says that what bears our names here is ours.
+    """
+    work = make_folder(out / WORK)
+    write_json(work / MADE, {"places": PLACES})
+    new = work / "new"
+    shutil.rmtree(new, ignore_errors=True)
+    return make_folder(new)
+
+
+def take_place(out: Path, new: Path) -> None:
+    """Moves a finished scene to its place; what an earlier capture made goes.
+
+    Raises:
+        UserError: a file cannot be moved.
+    """
+    try:
+        for name in PLACES:
+            old, fresh = out / name, new / name
+            if old.is_dir() and not old.is_symlink():
+                shutil.rmtree(old)
+            else:
+                old.unlink(missing_ok=True)
+            if fresh.exists():
+                os.replace(fresh, old)
+        shutil.rmtree(new, ignore_errors=True)
+    except OSError as error:
+        raise explain(error, out) from error
+
+
+def poses_by_motion(options: Capture, new: Path):
     """The pictures, their poses by structure from motion, and those without with the reason."""
     from climatenerf.sfm.diagnose import diagnose
     from climatenerf.sfm.intake import take_in
-    from climatenerf.sfm.reconstruct import load_pycolmap
+    from climatenerf.sfm.reconstruct import DATABASE, require_pycolmap
     from climatenerf.sfm.worker import reconstruct_apart
 
-    load_pycolmap()  # its absence is to be known before anything is done
+    require_pycolmap()  # its absence is to be known before anything is done
     work = options.out / WORK
     with progress.Bar("pictures", 1.0) as bar:
         intake = take_in(options.photos, work, lambda done, total: bar.update(done / total))
     for name, reason in intake.unusable.items():
         progress.warn(f"{name} is left out: {reason}")
-    model = reconstruct_apart(intake, work, options.features, options.seed, Stages())
+    flat = new / "flat"
+    with Stages() as tell:
+        model = reconstruct_apart(intake, work, flat, options.features, options.seed, tell)
     if len(model.groups) > 1:
         progress.warn(
             f"the pictures fall into {len(model.groups)} groups that do not fit together"
             f" ({', '.join(map(str, model.groups))} pictures); the largest is kept"
         )
-    for source, target in (("images", "images"), ("sparse", "sparse/0")):
-        copy_files(model.folder / source, options.out / target)
-    return intake, model, diagnose(intake, model.registered, work / "database.db")
-
-
-def copy_files(source: Path, target: Path) -> None:
-    """All files of a folder into another, whose former content goes.
-
-    Raises:
-        UserError: the disk is full, or the place cannot be written.
-    """
-    shutil.rmtree(target, ignore_errors=True)
     try:
-        for path in sorted(source.iterdir()):
-            if path.is_file():
-                shutil.copyfile(path, make_folder(target) / path.name)
+        make_folder(new / "sparse")
+        os.replace(flat / "images", new / "images")
+        os.replace(flat / "sparse", new / "sparse" / "0")
+        shutil.rmtree(flat)
     except OSError as error:
-        raise explain(error, target) from error
+        raise explain(error, new) from error
+    return intake, model, diagnose(intake, model.registered, work / DATABASE)
 
 
-def poses_of_colmap(options: Capture):
+def poses_of_colmap(options: Capture, new: Path):
     """The pictures, the poses that COLMAP found before, and the photos that it has none for."""
     from climatenerf.sfm.from_colmap import take_posed
 
     assert options.from_colmap is not None
-    return take_posed(options.photos, options.from_colmap, options.out, Stages())
+    with Stages() as tell:
+        return take_posed(options.photos, options.from_colmap, new, options.out, tell)
 
 
-def in_metres(options: Capture, intake) -> Scene:
+def in_metres(options: Capture, new: Path, intake) -> Scene:
     """The scene level and in metres, by all that photos and flags tell."""
-    # Poses of COLMAP's own model are of the pictures as stored, ours of those as shown.
-    stored = options.from_colmap is not None
-    gravity = {p.name: p.exif.down if stored else p.exif.down_as_shown for p in intake.pictures}
-    (options.out / "scene.json").unlink(missing_ok=True)
-    scene = read_scene(
-        options.out,
-        camera_height=options.camera_height,
-        gravity={name: down for name, down in gravity.items() if down is not None},
-    )
-    places = {p.name: p.exif.place for p in intake.pictures if p.exif.place is not None}
+    known = {picture.name: picture.exif for picture in intake.pictures}
+    # Only views with poses are in the model; which pixels they are of is known after reading.
+    posed = read_colmap(new / "sparse" / "0")
+    gravity = {}
+    for view in posed.views:
+        if view.name in known:
+            shown = as_shown(options, view.path, posed.cameras[view.camera])
+            down = known[view.name].down_as_shown if shown else known[view.name].down
+            if down is not None:
+                gravity[view.name] = down
+    scene = read_scene(new, camera_height=options.camera_height, gravity=gravity)
+    places = {name: exif.place for name, exif in known.items() if exif.place is not None}
     found = find_georeference(scene, places)
     if found is None:
         return scene
     return apply_georeference(scene, found, keep_scale=options.camera_height is not None)
 
 
+def as_shown(options: Capture, path: Path, camera: Camera) -> bool:
+    """Whether a camera is that of its photo as shown: ours always, COLMAP's if only so it fits."""
+    return options.from_colmap is None or picture_header(path).turned_for(camera)
+
+
 def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
     """The scene with the labels, masks and depths that the user has for the photos."""
-    from climatenerf.sfm.extras import bring_along
+    from climatenerf.sfm.extras import Photo, bring_along
 
-    sources = {picture.name: picture.source for picture in intake.pictures}
-    stored = options.from_colmap is not None
-    turned = {p.name: 1 if stored else p.exif.orientation for p in intake.pictures}
+    known = {picture.name: picture for picture in intake.pictures}
+    photos = {
+        view.name: Photo(
+            known[view.name].source,
+            model.lenses[view.name],
+            known[view.name].exif.orientation,
+            as_shown(options, view.path, scene.cameras[view.camera]),
+        )
+        for view in scene.views
+    }
     for kind in ("labels", "masks", "depth"):
         folder = getattr(options, kind)
         if folder is not None:
-            scene = bring_along(scene, kind, folder, sources, model.lenses, turned)
-    if options.depth is not None and (said := by_depth(scene)) is not None:
-        scene = with_witness(scene, "depth files", *said)
-    return scene
+            scene = bring_along(scene, kind, folder, photos)
+    if options.depth is None:
+        return scene
+    said = by_depth(scene)
+    if said is None:
+        progress.say("The depth files have no one scale; they say nothing of the scene's size.")
+        return scene
+    return with_witness(scene, "depth files", *said)
 
 
 class Stages:
@@ -196,6 +264,14 @@ class Stages:
 
     def __init__(self) -> None:
         self.bar: progress.Bar | None = None
+
+    def __enter__(self) -> "Stages":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.bar is not None:
+            self.bar.__exit__(None, None, None)  # gives the terminal its cursor back
+            self.bar = None
 
     def __call__(self, stage: str, share: float) -> None:
         """Tells that `share` of a stage is done."""

@@ -38,7 +38,7 @@ class Fit:
     """Size of the field."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
-    known_length: tuple[str, ...] = ()
+    known_length: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
     marks: Path | None = None
     """Where their ends are in the pictures; default: marks.toml in the scene folder."""
@@ -82,7 +82,18 @@ def with_known_lengths(scene: Scene, lengths: tuple[str, ...], marks: Path | Non
     """The scene in the metres of lengths given as "NAME=2.0 m"."""
     if not lengths:
         return scene
-    known = []
+    known = parse_known_lengths(lengths)
+    placed = read_marks(marks or scene.root / FILE_NAME)
+    return apply_known_lengths(scene, [measure(scene, placed, *one) for one in known])
+
+
+def parse_known_lengths(lengths: tuple[str, ...]) -> list[tuple[str, float]]:
+    """Names and metres of lengths given as "NAME=2.0 m".
+
+    Raises:
+        UserError: one is not of this form, not above 0, or given twice.
+    """
+    known: dict[str, float] = {}
     for text in lengths:
         name, equals, length = text.partition("=")
         if not equals:
@@ -90,9 +101,28 @@ def with_known_lengths(scene: Scene, lengths: tuple[str, ...], marks: Path | Non
         metres = parse_quantity(length, LENGTH, "--known-length")
         if not metres > 0:
             raise UserError(f'--known-length must be above 0; got "{text}"')
-        known.append((name.strip(), metres))
-    placed = read_marks(marks or scene.root / FILE_NAME)
-    return apply_known_lengths(scene, [measure(scene, placed, *one) for one in known])
+        if name.strip() in known:
+            raise UserError(f"--known-length gives {name.strip()} twice; give it once")
+        known[name.strip()] = metres
+    return list(known.items())
+
+
+def check_known_lengths(lengths: tuple[str, ...], marks: Path | None, default: Path) -> None:
+    """What is wrong with known lengths, as far as it shows without a scene.
+
+    Raises:
+        UserError: lengths or marks that cannot be used.
+    """
+    if marks is not None and not lengths:
+        raise UserError(
+            '--marks needs --known-length "NAME=2.0 m" to say how long what is marked is'
+        )
+    if not lengths:
+        return
+    placed = read_marks(marks or default)
+    for name, _ in parse_known_lengths(lengths):
+        if name not in placed:
+            raise UserError(f"the marks hold no {name!r}; they hold: {', '.join(placed) or 'none'}")
 
 
 def frame_line(scene: Scene) -> str:

@@ -23,6 +23,8 @@ def export_transforms(scene: Scene, folder: Path) -> Path:
     """
     path = make_folder(folder) / "transforms.json"
     _refuse(path)
+    if scene.points is not None:
+        _refuse(folder / "points.ply")
     data: dict[str, Any] = {"camera_model": "OPENCV", "frames": []}
     for view in scene.views:
         c2w = view.c2w.copy()

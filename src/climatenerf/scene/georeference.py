@@ -12,6 +12,8 @@ from climatenerf.scene.scene import Scene
 FEWEST = 5
 MOST_PAIRS = 2000  # that are tried for a start
 LEAST_ERROR = 0.005  # of the scale: the map's and the fit's own
+EXACT = 0.005  # of the extent: residuals below are not looked at for correlation
+LEAST_INDEPENDENT = 4.0  # fixes
 WORST_SCALE = 0.2  # relative standard error from which GPS says nothing of use
 # WGS 84 (EPSG:4326): equatorial radius, m, and first eccentricity squared.
 RADIUS, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
@@ -70,21 +72,24 @@ def find_georeference(
     Returns:
         None where fewer than five photos know their place or they lie too close together.
     """
-    views = [view for view in scene.views if view.name in places]
-    if len(views) < FEWEST:
+    own, where = _fixes(scene, places)
+    if len(own) < FEWEST:
         return None
-    origin = np.median([places[v.name][:2] for v in views], axis=0)
-    flat = east_north(np.array([places[v.name][:2] for v in views]), origin)
-    target = flat[:, 0] + 1j * flat[:, 1]
-    own = np.array([scene.c2w_world(v)[:2, 3] for v in views])
-    source = own[:, 0] + 1j * own[:, 1]
+    origin = np.median(where, axis=0)
+    flat = east_north(where, origin)
+    target, source = flat[:, 0] + 1j * flat[:, 1], own[:, 0] + 1j * own[:, 1]
     turn, shift, weight = _similarity(source, target)
-    away = np.abs(target - turn * source - shift)
-    spread = float(np.median(away)) / 1.1774  # median of Rayleigh's distribution in sigmas
-    extent = math.sqrt(float((weight * np.abs(source - source.mean()) ** 2).sum()))
-    if abs(turn) * extent < 1e-9:
+    sound = weight > 0
+    source, away = source[sound], (target - turn * source - shift)[sound]
+    extent = math.sqrt(float((np.abs(source - source.mean()) ** 2).mean()))
+    # What is left of places that fit all but exactly is rounding, not a receiver's drift.
+    exact = float(np.abs(away).max()) < EXACT * abs(turn) * extent
+    independent = float(len(away)) if exact else _independent(away)
+    # The fit takes 4 of the 2 n degrees of freedom; with two independent fixes none is left.
+    if independent < LEAST_INDEPENDENT or abs(turn) * extent < 1e-9:
         return None
-    error = spread / (abs(turn) * extent)
+    spread = math.sqrt(float((np.abs(away) ** 2).mean()) / 2 * independent / (independent - 2))
+    error = spread / (abs(turn) * extent * math.sqrt(independent))
     if error > WORST_SCALE:
         return None
     return Georeference(
@@ -94,8 +99,45 @@ def find_georeference(
         shift=(float(shift.real), float(shift.imag)),
         origin=(float(origin[0]), float(origin[1])),
         spread=spread,
-        photos=len(views),
+        photos=sum(view.name in places for view in scene.views),
     )
+
+
+def _fixes(
+    scene: Scene, places: dict[str, tuple[float, float, float]]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+    """Camera positions, m, and latitude and longitude of each fix, in the views' order.
+
+    A receiver that lags gives one fix to several photos: those are one, at their mean position.
+    """
+    own, where, count = [], [], []
+    for view in scene.views:
+        if view.name not in places:
+            continue
+        position, place = scene.c2w_world(view)[:2, 3], places[view.name][:2]
+        if where and place == where[-1]:
+            own[-1] = own[-1] + position
+            count[-1] += 1
+        else:
+            own.append(position)
+            where.append(place)
+            count.append(1)
+    return (np.array(own) / np.array(count)[:, None] if own else np.empty((0, 2))), np.array(where)
+
+
+def _independent(away: Complex[np.ndarray, "n"]) -> float:
+    """How many independent fixes these count for: a receiver's errors change slowly.
+
+    By the correlation r of neighbours, n (1 - r) / (1 + r) (Bartlett 1946), r being corrected for
+    what a short series and the fit take from it.
+    """
+    n = len(away)
+    power = float((np.abs(away) ** 2).sum())
+    if n < FEWEST:
+        return float(n)
+    r = float(np.real(away[1:] * away[:-1].conj()).sum()) / power
+    r = min(max(r + (2 + 4 * r) / n, 0.0), 0.99)
+    return n * (1 - r) / (1 + r)
 
 
 def apply_georeference(scene: Scene, found: Georeference, keep_scale: bool) -> Scene:
@@ -144,7 +186,9 @@ def _similarity(
     weight = np.ones(n)
     for _ in range(20):
         gap = np.abs(target - turn * source - shift)
-        sigma = max(float(np.median(gap)) / 1.1774, 1e-9)  # exact places: 0/0
+        # Of few places the best half fits by chance (Rousseeuw and Leroy 1987).
+        sigma = (1 + 5 / max(n - 2, 1)) * float(np.median(gap)) / 1.1774
+        sigma = max(sigma, 1e-9)  # exact places: 0/0
         weight = (gap < 4 * sigma).astype(float)
         ms, mt = np.average(source, weights=weight), np.average(target, weights=weight)
         p, q = source - ms, target - mt

@@ -17,12 +17,16 @@ from climatenerf.scene.scene import Scene, View
 
 UNKNOWN_LABEL = 255
 _ORIENTATION_TAG = 0x0112
-_TRANSPOSED = {
+EXIF_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
+_ON_EDGE = (5, 6, 7, 8)  # tags that exchange width and height
 # Where the shown picture's top is in stored pixels, (x, y) with y down, by EXIF orientation.
 _SHOWN_UP = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 _ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
@@ -61,7 +65,7 @@ class Header:
         the EXIF orientation is honoured in that one case.
         """
         stored, wanted = (self.width, self.height), (camera.width, camera.height)
-        return stored != wanted and stored[::-1] == wanted and self.orientation in _TRANSPOSED
+        return stored != wanted and stored[::-1] == wanted and self.orientation in _ON_EDGE
 
     def up_in_picture(self, camera: Camera) -> tuple[int, int]:
         """(x, y), y down: where the top of the picture as shown is, seen in the loaded pixels."""
@@ -157,7 +161,9 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     Raises:
         UserError: The file cannot be read.
     """
-    mask = np.asarray(_opened(path))
+    opened = _opened(path)
+    # A palette's numbers say nothing of black and white.
+    mask = np.asarray(opened.convert("RGB") if opened.mode == "P" else opened)
     return (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
 
 
@@ -183,7 +189,7 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
                     f"The depth {path} has 8 bits; give 16-bit PNG (millimetres), NPY or NPZ (m)."
                 )
     except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error) as error:
-        raise _unreadable(path, error) from None
+        raise UserError(f"The depth {path} cannot be read ({error}); replace it.") from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
         depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
     if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.number) or not depth.size:
@@ -220,7 +226,7 @@ def _decode(path: Path, camera: Camera) -> Image.Image:
             image.load()
             header = _header(image)
             if header.turned_for(camera):
-                return image.transpose(_TRANSPOSED[header.orientation])
+                return image.transpose(EXIF_TURNS[header.orientation])
             decoded = image.copy()
     except _BAD_IMAGE as error:
         raise _unreadable(path, error) from None

@@ -24,6 +24,7 @@ from climatenerf.scene.scene import Scene
 
 FILE_NAME = "marks.toml"
 LEAST_ANGLE = 1.0  # degrees between the rays to a mark: below, its distance is a guess
+CLICK = 2.0  # pixels: how well an end is marked, on each axis
 LEAST_ERROR = 0.005  # a mark is never better than this share of the length
 DISAGREEMENT = 0.1  # between two known lengths, from which the user is warned
 
@@ -108,7 +109,7 @@ def _meet(
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """The point closest to the rays through a mark, m, and its standard error, m."""
     by_name = {view.name: view for view in scene.views}
-    origins, directions = [], []
+    origins, directions, focals = [], [], []
     for picture, pixel in pictures.items():
         if picture not in by_name:
             raise UserError(
@@ -122,6 +123,7 @@ def _meet(
                 f"[{where}] lies outside {picture}, which has {camera.width}x{camera.height} pixels"
             )
         origins.append(c2w[:3, 3])
+        focals.append(camera.fx)
         directions.append(camera.directions(np.array(pixel)) @ c2w[:3, :3].T)
     o, d = np.array(origins), np.array(directions)
     widest = np.degrees(np.arccos(np.clip((d @ d.T).min(), -1, 1)))
@@ -136,8 +138,11 @@ def _meet(
     away = np.einsum("nij,nj->ni", across, place - o)
     if (((place - o) * d).sum(-1) <= 0).any():
         raise UserError(f"the rays through [{where}] meet behind a camera; mark it anew")
-    # Two rays have one degree of freedom beyond the point, each further ray two more.
+    # Two rays have one degree of freedom beyond the point, each further ray two more: so few may
+    # meet by chance, and nobody clicks better than some pixels.
     variance = (away**2).sum() / max(2 * len(o) - 3, 1)
+    clicks = CLICK / np.array(focals) * np.linalg.norm(place - o, axis=-1)
+    variance = max(variance, float((clicks**2).mean()))
     return place, float(np.sqrt(variance * np.trace(np.linalg.inv(information)) / 3))
 
 

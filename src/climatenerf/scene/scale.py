@@ -66,10 +66,15 @@ def by_camera_height(scene: Scene, height: float) -> Scene | None:
 
 def scale_words(scene: Scene) -> str:
     """What sets the scale and what the others say, in one clause."""
-    words = [f"scale from {scene.scale_source} (+-{scene.scale_error:.0%})"]
+    words = [f"scale from {scene.scale_source} (+-{percent(scene.scale_error)})"]
     for name, said in scene.scale_report.items():
-        words.append(f"{name} says {said['times']:.2f} times that (+-{said['error']:.0%})")
+        words.append(f"{name} says {said['times']:.2f} times that (+-{percent(said['error'])})")
     return "; ".join(words)
+
+
+def percent(share: float) -> str:
+    """A share as text: 30%, 0.5%."""
+    return f"{share:.0%}" if share >= 0.0095 else f"{share:.1%}"
 
 
 def scale_warnings(scene: Scene) -> list[str]:

@@ -57,6 +57,7 @@ def diagnose(intake: Intake, registered: tuple[str, ...], database: Path) -> lis
     for (a, b), count in pairs.items():
         partners.setdefault(a, []).append((b, count))
         partners.setdefault(b, []).append((a, count))
+    sources = {picture.name: picture.source for picture in intake.pictures}
     typical = float(np.median([picture.sharpness for picture in intake.pictures]))
     posed = set(registered)
     lost = []
@@ -65,7 +66,7 @@ def diagnose(intake: Intake, registered: tuple[str, ...], database: Path) -> lis
             continue
         best = sorted(partners.get(picture.name, []), key=lambda pair: -pair[1])[:3]
         to_posed = max((n for other, n in best if other in posed), default=0)
-        near = f" (best: {best[0][0]}, {best[0][1]} matches)" if best else ""
+        near = f" (best: {sources[best[0][0]]}, {best[0][1]} matches)" if best else ""
         if picture.brightness < DARK or picture.brightness > BRIGHT:
             side = "dark" if picture.brightness < DARK else "bright"
             reason, remedy = f"far too {side}", "take it again with the exposure locked"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from PIL import ExifTags, Image
 
 FULL_FRAME = math.hypot(36.0, 24.0)  # mm: the 35 mm equivalent keeps the diagonal's angle (CIPA)
+SUBSECONDS = ExifTags.Base.SubsecTimeOriginal
 MOST_ROLL = 2.0  # degrees of a gimbal: beyond, the camera was being turned
 Down = tuple[float, float, float]
 # Where a direction (x right, y down) comes to lie when a picture is turned as EXIF's tag says.
@@ -31,6 +32,7 @@ class Exif:
         down: Direction of gravity as the camera's own sensor told, unit vector in the axes of the
             picture as stored (x right, y down, z forward); None if unknown.
         orientation: How the stored picture is turned to be shown, EXIF's 1 to 8.
+        taken: When, as text that sorts by time; "" if unknown.
     """
 
     camera: str = ""
@@ -38,6 +40,7 @@ class Exif:
     place: tuple[float, float, float] | None = None
     down: tuple[float, float, float] | None = None
     orientation: int = 1
+    taken: str = ""
 
     @property
     def down_as_shown(self) -> tuple[float, float, float] | None:
@@ -63,14 +66,18 @@ def read_exif(image: Image.Image) -> Exif:
     if down is None and "front" not in camera.lower():  # selfies are mirrored
         # A HEIC decoder turns the picture itself, and tells here which tag it obeyed.
         decoder = image.info.get("original_orientation") or 1
-        down = _phone(detail.get(ExifTags.Base.MakerNote), decoder, image.size)
-    found = Exif(camera, _focal(detail, *image.size), place, down, orientation)
+        upright = decoder == orientation == 1 and image.width < image.height
+        # A copy that was stored upright: the sensor's own pictures are wide.
+        down = _phone(detail.get(ExifTags.Base.MakerNote), 6 if upright else decoder)
+    words = [detail.get(tag) for tag in (ExifTags.Base.DateTimeOriginal, SUBSECONDS)]
+    taken = ".".join(str(word).strip("\0 ") for word in words if word) if words[0] else ""
+    found = Exif(camera, _focal(detail, *image.size), place, down, orientation, taken)
     shown = found.down_as_shown
     # A picture that would stand on its head has a stale tag: then the axes are not known.
     return replace(found, down=None) if shown and shown[1] < -0.5 else found
 
 
-def _phone(note: object, decoder: object, size: tuple[int, int]) -> Down | None:
+def _phone(note: object, decoder: object) -> Down | None:
     """Gravity from an iPhone's maker note, tag 8 (ExifTool's AccelerationVector), three numbers, g.
 
     They follow Core Motion: x to the right of the screen, y to its top, z out of it, and the
@@ -79,15 +86,12 @@ def _phone(note: object, decoder: object, size: tuple[int, int]) -> Down | None:
 
     Args:
         note: the maker note.
-        decoder: orientation tag that the decoder of the picture has obeyed.
-        size: width and height of the picture as decoded.
+        decoder: orientation tag by which the picture was turned before it came here.
     """
     g = _apple_vector(note)
     if g is None:
         return None
     x, y, z = -g[1], -g[0], -g[2]
-    if decoder == 1 and size[0] < size[1]:
-        decoder = 6  # a copy that was stored upright: the sensor's own pictures are wide
     turn = _TURNED.get(decoder)  # type: ignore[call-overload]
     length = math.hypot(x, y, z)
     if turn is None or not 0.9 < length < 1.1:  # a hand that shakes adds to gravity

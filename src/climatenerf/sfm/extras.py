@@ -5,9 +5,8 @@ turned as its photo was, and looked up pixel by pixel through the photo's lens (
 since a class or a depth between two others means nothing).
 """
 
-import shutil
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,50 +25,107 @@ FIELDS = {"labels": "label_path", "masks": "mask_path", "depth": "depth_path"}
 SAME_SHAPE = 0.02  # relative difference of two pictures' width over height
 
 
-def bring_along(
-    scene: Scene,
-    kind: str,
-    folder: Path,
-    sources: Mapping[str, str],
-    lenses: Mapping[str, Camera],
-    orientations: Mapping[str, int],
-) -> Scene:
-    """The scene with the user's files of one kind for its views.
+@dataclass(frozen=True)
+class Photo:
+    """The photo that a view comes from.
+
+    Attributes:
+        source: path relative to the photos' folder.
+        lens: its camera, before undistortion.
+        orientation: EXIF's tag, 1 to 8.
+        shown: whether the lens is that of the picture as shown, not as stored.
+    """
+
+    source: str
+    lens: Camera
+    orientation: int
+    shown: bool
+
+
+def bring_along(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Photo]) -> Scene:
+    """The scene with the user's files of one kind for its views, written into its folder.
 
     Args:
-        scene: whose `root` the files are written into.
+        scene: whose `root` has none of this kind yet.
         kind: "labels", "masks" or "depth".
         folder: the user's files, named like the photos: `A/IMG_1.png` or `A/IMG_1.jpg.png`.
-        sources: the photo of each view, as a path relative to the photos' folder.
-        lenses: the camera of each view's photo as shown, before undistortion.
-        orientations: EXIF orientation of each photo.
+        photos: of each view, by its name.
 
     Raises:
-        UserError: no such folder, no file for any view, or a file that cannot be used.
+        UserError: no file for any view, or a file that cannot be used.
     """
-    if not folder.is_dir():
-        raise UserError(f"--{kind} {folder} is no folder; give the folder of the files")
-    found = {view.name: _find(folder, kind, sources[view.name], view.name) for view in scene.views}
+    found = {v.name: _find(folder, kind, photos[v.name].source, v.name) for v in scene.views}
     if not any(found.values()):
-        wanted = Path(sources[scene.views[0].name]).with_suffix(SUFFIXES[kind][0])
+        wanted = Path(photos[scene.views[0].name].source).with_suffix(SUFFIXES[kind][0])
         raise UserError(
             f"--{kind} {folder} holds nothing for any photo; name the files like {wanted}"
         )
-    out = scene.root / kind
-    shutil.rmtree(out, ignore_errors=True)
-    make_folder(out)
+    values = {name: READERS[kind](path) for name, path in found.items() if path is not None}
+    as_stored, sure = _made_as_stored(values, photos)
     views = []
     for view in scene.views:
-        path = found[view.name]
-        if path is None:
-            views.append(view)
-            continue
-        values = _as_shown(READERS[kind](path), lenses[view.name], orientations[view.name], path)
-        values = _through_lens(values, lenses[view.name], scene.cameras[view.camera], OUTSIDE[kind])
-        views.append(replace(view, **{FIELDS[kind]: _write(out, kind, view, values)}))
+        if view.name in values:
+            photo = photos[view.name]
+            one = _framed(values.pop(view.name), photo, as_stored, found[view.name])
+            one = _through_lens(one, photo.lens, scene.cameras[view.camera], OUTSIDE[kind])
+            view = replace(view, **{FIELDS[kind]: _write(scene.root / kind, kind, view, one)})
+        views.append(view)
+    warnings = list(scene.warnings)
     missing = sum(path is None for path in found.values())
-    told = (f"{missing} of {len(views)} pictures have no {kind}.",) if missing else ()
-    return replace(scene, views=tuple(views), warnings=(*scene.warnings, *told))
+    if missing:
+        warnings.append(f"{missing} of {len(views)} pictures have no {kind}.")
+    if not sure:
+        warnings.append(
+            f"Some photos are turned by half or mirrored by their EXIF; their {kind} are taken to"
+            " be made of the photos as shown, not as stored: look at them."
+        )
+    return replace(scene, views=tuple(views), warnings=tuple(warnings))
+
+
+def _made_as_stored(
+    values: Mapping[str, np.ndarray], photos: Mapping[str, Photo]
+) -> tuple[bool, bool]:
+    """Whether files are of photos as stored, told by the shapes of those on edge; and if surely."""
+    stored = shown = 0
+    for name, one in values.items():
+        photo = photos[name]
+        if photo.orientation >= 5 and photo.lens.width != photo.lens.height:
+            same = _same_shape(one, photo.lens)
+            stored += same != photo.shown
+            shown += same == photo.shown
+    unclear = any(photos[name].orientation in (2, 3, 4) for name in values)
+    return stored > shown, bool(stored or shown) or not unclear
+
+
+def _same_shape(values: np.ndarray, lens: Camera) -> bool:
+    stretch = values.shape[1] * lens.height / (values.shape[0] * lens.width)
+    return abs(stretch - 1) < SAME_SHAPE
+
+
+def _framed(values: np.ndarray, photo: Photo, as_stored: bool, path: Path | None) -> np.ndarray:
+    """The file in the frame of the photo's lens."""
+    on_edge = photo.orientation >= 5
+    if on_edge and photo.lens.width != photo.lens.height:
+        as_stored = _same_shape(values, photo.lens) != photo.shown
+    if as_stored and photo.shown:
+        values = turned(values, photo.orientation)
+    elif not as_stored and not photo.shown:
+        values = turned(values, {6: 8, 8: 6}.get(photo.orientation, photo.orientation))
+    if not _same_shape(values, photo.lens):
+        raise UserError(
+            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, another shape than its photo"
+            f" ({photo.lens.width}x{photo.lens.height}); make it from the whole photo"
+        )
+    return values
+
+
+def turned(values: np.ndarray, orientation: int) -> np.ndarray:
+    """An array of stored pixels as EXIF's tag wants it shown."""
+    turns = {
+        2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud, 5: np.transpose,
+        6: lambda a: np.rot90(a, -1), 7: lambda a: np.rot90(a, 2).T, 8: np.rot90,
+    }  # fmt: skip
+    return turns[orientation](values) if orientation in turns else values
 
 
 def _find(folder: Path, kind: str, source: str, name: str) -> Path | None:
@@ -79,20 +135,6 @@ def _find(folder: Path, kind: str, source: str, name: str) -> Path | None:
                 if candidate.is_file():
                     return candidate
     return None
-
-
-def _as_shown(values: np.ndarray, lens: Camera, orientation: int, path: Path) -> np.ndarray:
-    """The file turned as its photo is shown, if only so it has the photo's shape."""
-    shape = lens.width / lens.height
-    if abs(values.shape[1] / values.shape[0] / shape - 1) < SAME_SHAPE:
-        return values
-    turned = {5: values.T, 6: np.rot90(values, -1), 7: np.rot90(values, 2).T, 8: np.rot90(values)}
-    if orientation in turned and abs(values.shape[0] / values.shape[1] / shape - 1) < SAME_SHAPE:
-        return turned[orientation]
-    raise UserError(
-        f"{path} has {values.shape[1]}x{values.shape[0]} pixels, another shape than its photo"
-        f" ({lens.width}x{lens.height}); make it from the whole photo"
-    )
 
 
 def _through_lens(values: np.ndarray, lens: Camera, target: Camera, outside: float) -> np.ndarray:

@@ -10,18 +10,21 @@ from climatenerf.errors import UserError
 from climatenerf.scene.colmap import largest_model, read_colmap
 from climatenerf.sfm.diagnose import Lost
 from climatenerf.sfm.exif import Exif, read_exif
-from climatenerf.sfm.intake import FEWEST, PHOTO_SUFFIXES, Intake, Picture
+from climatenerf.sfm.intake import FEWEST, Intake, Picture, photos_in
 from climatenerf.sfm.reconstruct import Model, Told
 from climatenerf.storage import explain, make_folder
 
 
-def take_posed(photos: Path, root: Path, out: Path, tell: Told) -> tuple[Intake, Model, list[Lost]]:
+def take_posed(
+    photos: Path, root: Path, out: Path, besides: Path, tell: Told
+) -> tuple[Intake, Model, list[Lost]]:
     """Copies photos and model as they are into `out/images` and `out/sparse/0`.
 
     Args:
         photos: the folder that the model's picture names are relative to.
         root: COLMAP's folder: a model, or with `sparse/0`.
-        out: scene folder.
+        out: folder to write into.
+        besides: folder whose pictures are no photos of the user's.
         tell: told (stage, share of it that is done).
 
     Returns:
@@ -34,15 +37,19 @@ def take_posed(photos: Path, root: Path, out: Path, tell: Told) -> tuple[Intake,
         raise UserError(f"{photos} is no folder; give the photos that {root} has poses for")
     model = largest_model(root)
     capture = read_colmap(model)
+    for view in capture.views:
+        if Path(view.name).is_absolute() or ".." in Path(view.name).parts:
+            raise UserError(
+                f"{model} names the picture {view.name}, which leads out of the photos' folder;"
+                " run COLMAP with --image_path at the folder that holds them all"
+            )
     names = [view.name for view in capture.views if (photos / view.name).is_file()]
     if len(names) < FEWEST:
         raise UserError(
             f"{photos} has {len(names)} of the {len(capture.views)} pictures that {model} has poses"
             f" for (such as {capture.views[0].name}); give the folder that COLMAP was given"
         )
-    for folder in (out / "images", out / "sparse" / "0"):
-        shutil.rmtree(folder, ignore_errors=True)
-        make_folder(folder)
+    make_folder(out / "sparse" / "0")
     try:
         for path in sorted(model.iterdir()):
             if path.stem in ("cameras", "images", "points3D") and path.is_file():
@@ -57,21 +64,19 @@ def take_posed(photos: Path, root: Path, out: Path, tell: Told) -> tuple[Intake,
     pictures = tuple(_picture(photos, name) for name in names)
     lenses = {view.name: capture.cameras[view.camera] for view in capture.views}
     points = 0 if capture.points is None else len(capture.points)
-    found = Model(out, lenses, tuple(names), (len(names),), None, points)
-    return Intake(out / "images", pictures, {}, False), found, _left_out(photos, set(names))
+    found = Model(lenses, tuple(names), (len(names),), None, points)
+    known = {photos / name for name in names}
+    reason, remedy = "the COLMAP model has no pose for it", "leave out --from-colmap to pose it"
+    others = [path for path in photos_in(photos, besides) if path not in known]
+    left = [path.relative_to(photos).as_posix() for path in others]
+    lost = [Lost(name, name, reason, remedy, ()) for name in left]
+    return Intake(out / "images", pictures, {}, False), found, lost
 
 
 def _picture(photos: Path, name: str) -> Picture:
     try:
         with Image.open(photos / name) as image:
             exif, size = read_exif(image), image.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        exif, size = Exif(), (0, 0)  # the scene's reader says what is wrong with it
+    except Exception:  # whatever is wrong with it, the scene's reader says it
+        exif, size = Exif(), (0, 0)
     return Picture(name, name, *size, exif, math.nan, math.nan)
-
-
-def _left_out(photos: Path, known: set[str]) -> list[Lost]:
-    paths = sorted(p for p in photos.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES)
-    names = [path.relative_to(photos).as_posix() for path in paths]
-    reason, remedy = "the COLMAP model has no pose for it", "leave out --from-colmap to pose it"
-    return [Lost(name, name, reason, remedy, ()) for name in names if name not in known]

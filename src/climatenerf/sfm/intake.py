@@ -2,8 +2,10 @@
 
 import contextlib
 import errno
-import json
+import io
 import math
+import os
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -12,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageCms
 
 from climatenerf.errors import UserError
-from climatenerf.scene.images import to_rgb
+from climatenerf.scene.images import EXIF_TURNS, to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
-from climatenerf.storage import atomic_path, explain, make_folder, write_json
+from climatenerf.storage import atomic_path, explain, make_folder, read_json, write_json
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp"}
@@ -84,15 +86,12 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
         frames = take_frames(source, work / "frames", progress)
         files, base, is_video = frames, work / "frames", True
     else:
-        files = sorted(p for p in source.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES)
-        hidden = (any(x.startswith(".") for x in p.relative_to(source).parts) for p in files)
-        files = [p for p, is_hidden in zip(files, hidden, strict=True) if not is_hidden]
-        scene = work.resolve().parent
-        if scene.is_relative_to(source.resolve()):  # it holds pictures that this program has made
-            files = [p for p in files if not p.resolve().is_relative_to(scene)]
-        base, is_video = source, False
+        # A scene among the photos holds pictures that this program has made.
+        files, base, is_video = photos_in(source, work.parent), source, False
         if not files:
-            raise UserError(f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP)")
+            videos = any(p.suffix.lower() in VIDEO_SUFFIXES for p in source.iterdir())
+            hint = "; give the video itself" if videos else ""
+            raise UserError(f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP){hint}")
     pictures, unusable, taken = [], {}, set()
     for index, path in enumerate(files):
         name = _free_name(path.relative_to(base), taken)
@@ -101,7 +100,7 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
             try:
                 image, exif = open_upright(path)
             except UserError as error:
-                unusable[path.relative_to(base).as_posix()] = str(error)
+                unusable[_words(path.relative_to(base))] = str(error)
             else:
                 picture = _keep(path, base, folder / name, image, exif)
         if picture is not None:
@@ -116,9 +115,41 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
     return Intake(folder, tuple(pictures), unusable, is_video)
 
 
+def photos_in(folder: Path, besides: Path) -> list[Path]:
+    """All photos below a folder, through linked folders too, but hidden ones and those of a scene.
+
+    Args:
+        folder: to look in.
+        besides: folder whose files are none.
+    """
+    found = []
+    for place, folders, names in os.walk(folder, followlinks=True):
+        here = Path(place)
+        folders[:] = sorted(
+            name
+            for name in folders
+            if not name.startswith(".") and (here / name).resolve() != besides.resolve()
+        )
+        found += [
+            here / name
+            for name in names
+            if not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES
+        ]
+    return sorted(found)
+
+
+def _words(path: Path) -> str:
+    """A path as text that can be printed and kept, whatever bytes its name is made of."""
+    return path.as_posix().encode("utf-8", "replace").decode()
+
+
 def _free_name(path: Path, taken: set[str]) -> str:
-    """A flat JPEG name: folders become part of it; two photos never share one."""
-    stem = "_".join([*path.parts[:-1], path.stem]).replace(" ", "_")
+    """A flat JPEG name of plain letters: folders become part of it; two photos never share one.
+
+    COLMAP's lists and a page's addresses give a meaning to blanks, "#", "%" and more.
+    """
+    stem = re.sub(r"[^A-Za-z0-9._-]+", "_", "_".join([*path.parts[:-1], path.stem]))
+    stem = stem.strip("._") or "photo"
     name, number = f"{stem}.jpg", 1
     while name.lower() in taken:
         number += 1
@@ -130,23 +161,24 @@ def _free_name(path: Path, taken: set[str]) -> str:
 def _known(path: Path, out: Path) -> Picture | None:
     """The picture that an earlier run has made of this very photo, if it has."""
     record = out.with_suffix(".json")
-    if out.is_file() and record.is_file():
-        try:
-            known = json.loads(record.read_text())
-            return picture_from_json(known) if known.pop("stamp") == _stamp(path) else None
-        except (ValueError, KeyError, TypeError):
-            pass  # half written or of an older version: made again
-    return None
+    try:
+        known = read_json(record)
+        if known.pop("stamp") != [*_stamp(path), out.stat().st_size]:
+            return None
+        return picture_from_json(known)
+    except (UserError, OSError, ValueError, KeyError, TypeError):
+        return None  # none yet, half written or of an older version: made again
 
 
 def _keep(path: Path, base: Path, out: Path, image: Image.Image, exif: Exif) -> Picture:
     with atomic_path(out) as temporary:
         image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     grey = small_grey(image)
-    source = path.relative_to(base).as_posix()
+    source = _words(path.relative_to(base))
     measured = sharpness(grey), float(grey.mean() / 255)
     picture = Picture(out.name, source, *image.size, exif, *measured)
-    write_json(out.with_suffix(".json"), {**asdict(picture), "stamp": _stamp(path)})
+    stamp = [*_stamp(path), out.stat().st_size]
+    write_json(out.with_suffix(".json"), {**asdict(picture), "stamp": stamp})
     return picture
 
 
@@ -169,34 +201,54 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
     Raises:
         UserError: empty, damaged, no picture at all, or too large to decode.
     """
+    name = _words(Path(path.name))
     if path.suffix.lower() in (".heic", ".heif"):
-        _register_heif(path)
-    if path.stat().st_size == 0:
-        raise UserError(f"{path.name} is empty")
+        _register_heif(name)
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MOST_PIXELS
     try:
-        with Image.open(path) as image:
+        if path.stat().st_size == 0:
+            raise UserError(f"{name} is empty")
+        # Through an open file: Pillow garbles turned TIFFs that it maps into memory by their name.
+        with path.open("rb") as file, Image.open(file) as image:
             if image.width * image.height > MOST_PIXELS:
-                raise UserError(f"{path.name} has {image.width}x{image.height} pixels: too large")
-            exif = read_exif(image)
+                raise UserError(f"{name} has {image.width}x{image.height} pixels: too large")
+            exif, profile = read_exif(image), image.info.get("icc_profile")
             image.draft("RGB", (LONGEST, LONGEST))  # a JPEG is decoded smaller at once
+            image.load()
+            # A TIFF's decoder has turned the picture already and taken the tag away.
+            kept = image.getexif().get(ExifTags.Base.Orientation, 1) == exif.orientation
+            turn = EXIF_TURNS.get(exif.orientation) if kept else None
             # Made smaller before all else: a copy of 200 megapixels takes 600 MB.
             small = image if image.mode in ("RGB", "L") else Image.fromarray(to_rgb(image))
-            small.info = image.info  # the orientation is in it
             small.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS, reducing_gap=3.0)
-            return ImageOps.exif_transpose(small).convert("RGB"), exif
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise UserError(f"{path.name} is no readable picture ({error})") from error
+            small = small.convert("RGB") if turn is None else small.transpose(turn).convert("RGB")
+            return _as_srgb(small, profile), exif
+    except UserError:
+        raise
+    except Exception as error:  # decoders raise all kinds for damaged files
+        raise UserError(f"{name} is no readable picture ({error})") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def _register_heif(path: Path) -> None:
+def _as_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
+    """Colours that a wider profile (a phone's Display P3) means, in sRGB."""
+    if not profile:
+        return image
+    try:
+        given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        converted = ImageCms.profileToProfile(image, given, ImageCms.createProfile("sRGB"))
+        return converted or image
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        return image  # a profile of another kind (grey, CMYK) or damaged
+
+
+def _register_heif(name: str) -> None:
     try:
         import pi_heif
     except ImportError as error:
         raise UserError(
-            f'{path.name} is HEIC; run `pip install "climatenerf[capture]"` to read it'
+            f'{name} is HEIC; run `pip install "climatenerf[capture]"` to read it'
         ) from error
     pi_heif.register_heif_opener()
 
@@ -222,8 +274,10 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
     """
     done = folder / "done.json"
     stamp = _stamp(video)
-    if done.is_file() and json.loads(done.read_text()).get("stamp") == stamp:
-        return sorted(folder.glob("*.jpg"))
+    with contextlib.suppress(UserError, KeyError):
+        frames, known = sorted(folder.glob("[0-9]*.jpg")), read_json(done)
+        if known["stamp"] == stamp and known["frames"] == len(frames):
+            return frames
     try:
         import imageio_ffmpeg
 
@@ -257,7 +311,7 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
         progress(wanted + len(kept), wanted + min(VIDEO_FRAMES, len(candidates)))
     for path in folder.glob("candidate_*.jpg"):
         path.unlink()
-    write_json(done, {"stamp": stamp})
+    write_json(done, {"stamp": stamp, "frames": len(kept)})
     return kept
 
 

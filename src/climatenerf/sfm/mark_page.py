@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from urllib.parse import quote
 
 from climatenerf.scene.scene import Scene
 from climatenerf.storage import write_bytes
@@ -83,7 +84,7 @@ def write_mark_page(path: Path, scene: Scene) -> None:
     pictures = [
         {
             "name": view.name,
-            "file": view.path.relative_to(root).as_posix()
+            "file": quote(view.path.relative_to(root).as_posix())
             if view.path.is_relative_to(root)
             else view.path.as_uri(),
             "width": scene.cameras[view.camera].width,

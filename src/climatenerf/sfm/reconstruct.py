@@ -4,8 +4,10 @@ Each stage leaves its result in the work folder, so that a run that was stopped 
 """
 
 import contextlib
+import importlib.util
 import shutil
 import sqlite3
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +27,9 @@ ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
 MORE_PAIRS = 10_000  # of the second chance: ten minutes or so
 LEAST_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
 
-RESULT = "poses.json"
+DATABASE, CHOSEN, RESULT = "database.db", "chosen", "poses.json"  # in the work folder
+NO_PYCOLMAP = 'poses need pycolmap; run `pip install "climatenerf[capture]"`'
+LEAST_POINTS = 30  # of a model: with fewer its poses mean nothing
 
 Told = Callable[[str, float], None]
 
@@ -35,7 +39,6 @@ class Model:
     """What structure from motion found.
 
     Attributes:
-        folder: COLMAP model of the undistorted pictures (`sparse`), and the pictures (`images`).
         lenses: the camera of each picture as it was taken in, before undistortion.
         registered: names of the pictures that have poses.
         groups: number of pictures in each connected group found, largest first.
@@ -43,7 +46,6 @@ class Model:
         points: number of sparse points.
     """
 
-    folder: Path
     lenses: dict[str, Camera]
     registered: tuple[str, ...]
     groups: tuple[int, ...]
@@ -60,19 +62,35 @@ def load_pycolmap():
     try:
         import pycolmap
     except ImportError as error:
-        raise UserError('poses need pycolmap; run `pip install "climatenerf[capture]"`') from error
+        raise UserError(NO_PYCOLMAP) from error
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # errors are told in our words
     return pycolmap
 
 
-def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told) -> Model:
-    """Poses of as many pictures as possible; the largest connected group.
+def require_pycolmap() -> None:
+    """Says how to get the module if it is not there, without loading it: it catches signals.
 
-    COLMAP may end the process (a full disk) and does not hear Ctrl-C: see `worker`.
+    Raises:
+        UserError: it is not installed.
+    """
+    if "pycolmap" in sys.modules and sys.modules["pycolmap"] is None:
+        load_pycolmap()
+    if importlib.util.find_spec("pycolmap") is None:
+        raise UserError(NO_PYCOLMAP)
+
+
+def reconstruct(
+    intake: Intake, work: Path, out: Path, features: int, seed: int, tell: Told
+) -> None:
+    """Poses of as many pictures as possible, the largest connected group, and flat pictures.
+
+    COLMAP may end the process (a full disk) and does not hear Ctrl-C: see `worker`. The result is
+    for `known_result`.
 
     Args:
         intake: the pictures.
         work: work folder, with what earlier runs left there.
+        out: folder to write undistorted pictures (`images`) and their model (`sparse`) into.
         features: most features in a picture.
         seed: of all random choices.
         tell: told (stage, share of it that is done).
@@ -81,9 +99,18 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
         UserError: no two pictures fit together, or all are taken from one spot.
     """
     pycolmap = load_pycolmap()
-    database = work / "database.db"
+    if known_result(intake, work, features, seed) is None:
+        _find_poses(pycolmap, intake, work, features, seed, tell)
+    tell("undistort", 0.0)
+    model = work / CHOSEN
+    pycolmap.undistort_images(out, model, intake.folder, jpeg_quality=95, output_type="COLMAP")
+    tell("undistort", 1.0)
+
+
+def _find_poses(pycolmap, intake: Intake, work: Path, features: int, seed: int, tell: Told) -> None:
+    database = work / DATABASE
     _forget_if_changed(intake, database, features)
-    names = [picture.name for picture in intake.pictures]
+    names = in_order(intake)
     _import(pycolmap, intake, database)
     _extract(pycolmap, intake, database, names, features, tell)
     pairs = pairs_of(len(names), intake.is_video)
@@ -101,20 +128,23 @@ def reconstruct(intake: Intake, work: Path, features: int, seed: int, tell: Told
         _match(pycolmap, database, names, more, seed, tell, "more matches")
         models = _map(pycolmap, intake, database, work / "models", seed, tell)
         best = max(models, key=lambda m: m.num_reg_images())
-    out = work / "undistorted"
-    shutil.rmtree(out, ignore_errors=True)
-    chosen = make_folder(work / "chosen")
-    best.write(chosen)
-    tell("undistort", 0.0)
-    pycolmap.undistort_images(out, chosen, intake.folder, jpeg_quality=95, output_type="COLMAP")
-    tell("undistort", 1.0)
+    shutil.rmtree(work / CHOSEN, ignore_errors=True)
+    best.write(make_folder(work / CHOSEN))
     result = {
+        "made_of": _made_of(intake, features, seed),
         "groups": groups_of([_registered(model) for model in models]),
         "reprojection_error": float(best.compute_mean_reprojection_error()),
         "points": best.num_points3D(),
     }
-    write_json(work / RESULT, {"made_of": _made_of(intake, features, seed), **result})
-    return _model(work, result)
+    write_json(work / RESULT, result)
+
+
+def in_order(intake: Intake) -> list[str]:
+    """Names of the pictures in the order they were taken, where all know it, else by name."""
+    pictures = intake.pictures
+    if all(picture.exif.taken for picture in pictures):
+        pictures = sorted(pictures, key=lambda picture: (picture.exif.taken, picture.name))
+    return [picture.name for picture in pictures]
 
 
 def _registered(model) -> set[str]:
@@ -139,27 +169,22 @@ def known_result(intake: Intake, work: Path, features: int, seed: int) -> Model 
     """What a run over the same pictures with the same settings has found; None if none has."""
     try:
         result = read_json(work / RESULT)
-        if result["made_of"] == _made_of(intake, features, seed):
-            return _model(work, result)
-    except (UserError, KeyError):
-        pass  # none yet, or damaged: found anew
-    return None
+        if result["made_of"] != _made_of(intake, features, seed) or not (work / DATABASE).is_file():
+            return None
+        posed = read_colmap(work / CHOSEN)
+        return Model(
+            lenses={view.name: posed.cameras[view.camera] for view in posed.views},
+            registered=tuple(sorted(view.name for view in posed.views)),
+            groups=tuple(int(count) for count in result["groups"]),
+            reprojection_error=float(result["reprojection_error"]),
+            points=int(result["points"]),
+        )
+    except (UserError, KeyError, TypeError, ValueError):
+        return None  # none yet, or damaged: found anew
 
 
 def _made_of(intake: Intake, features: int, seed: int) -> dict:
     return {"pictures": _stamps(intake), "features": features, "seed": seed}
-
-
-def _model(work: Path, result: dict) -> Model:
-    posed = read_colmap(work / "chosen")
-    return Model(
-        folder=work / "undistorted",
-        lenses={view.name: posed.cameras[view.camera] for view in posed.views},
-        registered=tuple(sorted(view.name for view in posed.views)),
-        groups=tuple(result["groups"]),
-        reprojection_error=result["reprojection_error"],
-        points=result["points"],
-    )
 
 
 def _stamps(intake: Intake) -> dict[str, int]:
@@ -174,14 +199,14 @@ def _forget_if_changed(intake: Intake, database: Path, features: int) -> None:
     """
     record = database.with_name("database.json")
     stamps = _stamps(intake)
-    before = {}
-    if record.is_file():
-        with contextlib.suppress(UserError, ValueError):
-            before = read_json(record)
-    kept = all(stamps.get(name) == stamp for name, stamp in before.get("pictures", {}).items())
-    if not (kept and before.get("features") == features):
-        for path in database.parent.glob(f"{database.name}*"):
-            path.unlink()
+    kept = False
+    with contextlib.suppress(UserError, ValueError, KeyError, AttributeError):
+        before = read_json(record)
+        kept = all(stamps.get(name) == stamp for name, stamp in before["pictures"].items())
+        kept &= before["features"] == features
+    if not kept:
+        for path in [database, *database.parent.glob(f"{database.name}-*")]:
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(True)
     write_json(record, {"features": features, "pictures": stamps})
 
 
@@ -258,6 +283,8 @@ def _match(
     stage: str = "matches",
 ) -> None:
     pycolmap.set_random_seed(seed)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
     # Tile by tile, so that a picture's features are read once for many comparisons.
     tiles: dict[tuple[int, int], list[str]] = {}
     for i, j in pairs:
@@ -270,7 +297,9 @@ def _match(
         listing.write_text("\n".join(tiles[key]) + "\n")
         options = pycolmap.ImportedPairingOptions()
         options.match_list_path = listing
-        pycolmap.match_image_pairs(database, pairing_options=options)
+        pycolmap.match_image_pairs(
+            database, pairing_options=options, verification_options=verification
+        )
         done += len(tiles[key])
     tell(stage, 1.0)
 
@@ -279,7 +308,11 @@ def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell
     """Incremental mapping; a second try accepts a smaller baseline."""
     for least_angle in (16.0, LEAST_TRIANGULATION):
         found = _map_once(pycolmap, intake, database, folder, seed, least_angle, tell)
-        good = [m for m in found.values() if m.num_reg_images() >= FEWEST]
+        good = [
+            m
+            for m in found.values()
+            if m.num_reg_images() >= FEWEST and m.num_points3D() >= LEAST_POINTS
+        ]
         if good:
             return good
     raise UserError(

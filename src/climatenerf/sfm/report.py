@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from climatenerf.scene.scale import scale_words
 from climatenerf.scene.scene import Scene
@@ -68,13 +68,20 @@ def report_text(
     if len(model.groups) > 1:
         lines.append(f"- Groups that do not fit together: {', '.join(map(str, model.groups))}")
     if lost or intake.unusable:
-        lines += ["", "## Without pose", "", "| picture | probable reason | what to do |"]
-        lines += ["|---|---|---|"]
-        lines += [f"| {one.source} | {one.reason} | {one.remedy} |" for one in lost]
-        lines += [f"| {name} | {why} | replace it |" for name, why in intake.unusable.items()]
+        source = {picture.name: picture.source for picture in intake.pictures}
+        head = ("picture", "probable reason", "what to do", "fits best (matches)")
+        lines += ["", "## Without pose", "", _row(*head), _row(*["---"] * 4)]
+        for one in lost:
+            near = ", ".join(f"{source.get(n, n)} ({count})" for n, count in one.neighbours)
+            lines.append(_row(one.source, one.reason, one.remedy, near or "none"))
+        lines += [_row(name, why, "replace it", "") for name, why in intake.unusable.items()]
     if scene.warnings:
         lines += ["", "## Warnings", ""] + [f"- {warning}" for warning in scene.warnings]
     return "\n".join(lines) + "\n"
+
+
+def _row(*cells: str) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def ground_coverage(scene: Scene) -> float:
@@ -134,9 +141,10 @@ def draw_report(scene: Scene) -> Image.Image:
     flat = poses[:, :2, 3] - centre[:2]
     along = np.linalg.svd(flat, full_matrices=False)[2][0] if len(flat) > 1 else np.array([1, 0])
     side = np.array([along[0], along[1], 0.0])
+    above = "from above, north up" if scene.georeference else "from above"
     panels = [
-        _panel("from above, m", np.array([[1.0, 0, 0], [0, 1.0, 0]]), poses, points, centre, half),
-        _panel("from the side, m", np.stack([side, [0, 0, 1.0]]), poses, points, centre, half),
+        _panel(above, np.array([[1.0, 0, 0], [0, 1.0, 0]]), poses, points, centre, half),
+        _panel("from the side", np.stack([side, [0, 0, 1.0]]), poses, points, centre, half),
     ]
     sheet = Image.new("RGB", (2 * PANEL, PANEL), "white")
     for i, panel in enumerate(panels):
@@ -167,9 +175,14 @@ def _panel(
     for x, y in place(points):
         if 0 <= x < PANEL and 0 <= y < PANEL:
             draw.point((x, y), fill=(90, 110, 150))
-    for pose in poses:
+    font = ImageFont.load_default(15)
+    for number, pose in enumerate(poses):
         eye, ahead = place(pose[:3, 3]), place(pose[:3, 3] + 0.06 * half * pose[:3, 2])
         draw.line([tuple(eye), tuple(ahead)], fill=(200, 40, 30), width=2)
         draw.ellipse([*(eye - 3), *(eye + 3)], fill=(200, 40, 30))
-    draw.text((8, 8), f"{title}; grid {step:g} m", fill=(0, 0, 0))
+        if number % max(1, len(poses) // 8) == 0:
+            draw.text(tuple(eye + 5), str(number + 1), fill=(120, 20, 10), font=font)
+    words = f"{title}; a square is {step:g} m; cameras red, numbered in the order of their names"
+    draw.rectangle([0, 0, PANEL, 26], fill="white")
+    draw.text((8, 5), words, fill=(0, 0, 0), font=font)
     return image

@@ -19,23 +19,26 @@ from pathlib import Path
 from climatenerf.errors import UserError
 from climatenerf.sfm.intake import Intake, picture_from_json
 from climatenerf.sfm.reconstruct import Model, Told, known_result, reconstruct
-from climatenerf.storage import plain
+from climatenerf.storage import explain, plain
 
 NEARLY_FULL = 20_000_000  # bytes free, below which a crash is put down to the disk
 LOG = "colmap.log"
 
 
-def reconstruct_apart(intake: Intake, work: Path, features: int, seed: int, tell: Told) -> Model:
-    """`reconstruct` in another process; arguments, result and errors are its own.
+def reconstruct_apart(
+    intake: Intake, work: Path, out: Path, features: int, seed: int, tell: Told
+) -> Model:
+    """`reconstruct` in another process; arguments and errors are its own.
 
     Raises:
         UserError: as `reconstruct`, or the process ended before its time.
     """
-    known = known_result(intake, work, features, seed)
-    if known is not None:
-        return known
-    order = plain({"intake": asdict(intake), "work": work, "features": features, "seed": seed})
-    with (work / LOG).open("wb") as log:
+    order = {"intake": asdict(intake), "work": work, "out": out, "features": features, "seed": seed}
+    try:
+        log = (work / LOG).open("wb")
+    except OSError as error:
+        raise explain(error, work / LOG) from error
+    with log:
         process = subprocess.Popen(
             [sys.executable, "-m", "climatenerf.sfm.worker"],
             stdin=subprocess.PIPE,
@@ -44,9 +47,10 @@ def reconstruct_apart(intake: Intake, work: Path, features: int, seed: int, tell
             start_new_session=True,  # Ctrl-C is for this side, which ends the other one
         )
     assert process.stdin is not None and process.stdout is not None
+    finished = False
     try:
         # The pipe stays open: its end tells the worker that this side is gone.
-        process.stdin.write(json.dumps(order).encode() + b"\n")
+        process.stdin.write(json.dumps(plain(order)).encode() + b"\n")
         process.stdin.flush()
         for line in process.stdout:
             words = json.loads(line)
@@ -54,8 +58,10 @@ def reconstruct_apart(intake: Intake, work: Path, features: int, seed: int, tell
                 raise UserError(words["error"])
             if "stage" in words:
                 tell(words["stage"], words["share"])
-    except BrokenPipeError:
-        pass  # it ended at once; why is told below
+            finished = "done" in words
+        process.wait(10)
+    except (BrokenPipeError, subprocess.TimeoutExpired):
+        pass  # why it ended is told below
     finally:
         process.kill()
         process.wait()
@@ -63,7 +69,7 @@ def reconstruct_apart(intake: Intake, work: Path, features: int, seed: int, tell
             process.stdin.close()
         process.stdout.close()
     model = known_result(intake, work, features, seed)
-    if model is None:
+    if not finished or model is None:
         raise UserError(_why(work, process.returncode))
     return model
 
@@ -78,7 +84,8 @@ def _why(work: Path, status: int) -> str:
     if status == -signal.SIGKILL:
         return "finding poses was ended from outside, likely for memory; try --features 2048"
     words = (work / LOG).read_text(errors="replace").strip().splitlines()
-    last = next((line for line in reversed(words) if "] " in line or "Error" in line), "no reason")
+    last = next((line for line in reversed(words) if "] " in line or "Error" in line), "")
+    last = last or f"it ended with status {status}"
     return f"finding poses failed ({last.strip()[:300]}); see {work / LOG}, and run it again"
 
 
@@ -104,12 +111,15 @@ def main() -> None:
         reconstruct(
             intake,
             Path(order["work"]),
+            Path(order["out"]),
             order["features"],
             order["seed"],
             lambda stage, share: say({"stage": stage, "share": share}),
         )
     except UserError as error:
         say({"error": str(error)})
+    else:
+        say({"done": True})
 
 
 def _end_with_the_other_side() -> None:

@@ -1,0 +1,263 @@
+"""Nothing of the user's is harmed, and what comes out is of these photos and no others."""
+
+import json
+import os
+import shutil
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from photo_builders import exif, photo
+from PIL import Image
+
+from climatenerf import cli
+from climatenerf.scene import load_scene, read_scene
+from climatenerf.scene.export import export_colmap
+
+STREET = Path(str(files("climatenerf") / "assets" / "street"))
+
+
+def status(*words):
+    try:
+        return cli.main([str(word) for word in words])
+    except SystemExit as left:
+        return left.code
+
+
+def everything(folder):
+    """Every file below a folder with its content, links as where they lead."""
+    return {
+        path.relative_to(folder).as_posix(): os.readlink(path)
+        if path.is_symlink()
+        else path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+
+
+@pytest.fixture
+def posed(tmp_path):
+    """Six photos, and a COLMAP model of them in a folder of its own."""
+    truth = read_scene(STREET, holdout="0")
+    export_colmap(truth, tmp_path / "model")
+    lines = (tmp_path / "model" / "sparse" / "0" / "images.txt").read_text().splitlines()
+    (tmp_path / "model" / "sparse" / "0" / "images.txt").write_text("\n".join(lines[:13]) + "\n")
+    (tmp_path / "photos").mkdir()
+    for view in truth.views[:6]:
+        shutil.copy(view.path, tmp_path / "photos" / view.name)
+    return tmp_path
+
+
+def capture(here, out, *more):
+    return status(
+        "capture", here / "photos", "--from-colmap", here / "model", "-o", out, *more
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["images", "sparse", "labels", "scene.json", "work", "mark.html"])
+def test_what_no_capture_made_is_in_the_way(posed, capsys, name):
+    out = posed / "mine"
+    if "." in name:
+        photo(out / "other.jpg")
+        (out / name).write_text("mine")
+    else:
+        photo(out / name / "logo.png")
+    before = everything(out)
+    assert capture(posed, out) == 2
+    assert "already holds" in capsys.readouterr().err and everything(out) == before
+
+
+def test_a_link_to_the_users_photos_is_in_the_way(posed, capsys):
+    out = posed / "mine"
+    out.mkdir()
+    (out / "images").symlink_to(posed / "photos")
+    before = everything(posed / "photos")
+    assert capture(posed, out) == 2
+    assert everything(posed / "photos") == before
+    # Put in the place of what a capture made, it is taken away itself, and what it leads to stays.
+    (out / "images").unlink()
+    assert capture(posed, out) == 0
+    shutil.rmtree(out / "images")
+    (out / "images").symlink_to(posed / "photos")
+    assert capture(posed, out) == 0
+    assert everything(posed / "photos") == before and not (out / "images").is_symlink()
+
+
+@pytest.mark.parametrize("what", ["photos", "labels", "masks", "depth", "from-colmap"])
+def test_what_is_read_may_not_lie_where_is_written(posed, capsys, what):
+    out = posed / "scene"
+    assert capture(posed, out, "--labels", STREET / "labels") == 0
+    before = everything(out)
+    given = {"photos": posed / "photos", "from-colmap": posed / "model"}
+    given[what] = out / {"photos": "images", "from-colmap": "sparse"}.get(what, "labels")
+    words = [w for k, v in given.items() if k != "photos" for w in (f"--{k}", v)]
+    assert status("capture", given["photos"], *words, "-o", out) == 2
+    assert "choose another folder" in capsys.readouterr().err and everything(out) == before
+
+
+def test_a_run_that_fails_leaves_the_scene_as_it_was(posed, tmp_path, capsys):
+    out = posed / "scene"
+    assert capture(posed, out, "--labels", STREET / "labels") == 0
+    before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    bad = tmp_path / "bad"
+    bad.mkdir()
+    (bad / "0001.png").write_text("no picture")
+    marks = tmp_path / "marks.toml"
+    marks.write_text('[D.from]\n"x.jpg" = [1, 2]\n"y.jpg" = [1, 2]\n[D.to]\n"x.jpg" = [1, 2]\n'
+                     '"y.jpg" = [1, 2]\n')  # fmt: skip
+    for words in (
+        ("--camera-height", "0 m"),
+        ("--labels", bad),
+        ("--known-length", "DOOR 2.0"),
+        ("--known-length", "DOOR=2 m", "--marks", marks),
+        ("--known-length", "D=2 m", "--known-length", "D=3 m", "--marks", marks),
+        ("--marks", marks),
+        ("--known-length", "DOOR=2 m"),
+        ("--seed", "-1"),
+        ("--features", "3"),
+    ):
+        assert capture(posed, out, *words) == 2, words
+        told = capsys.readouterr().err
+        assert "Traceback" not in told
+        assert {k: v for k, v in everything(out).items() if not k.startswith("work/")} == before
+
+
+def test_a_length_that_cannot_be_measured_keeps_the_poses(posed, tmp_path, capsys):
+    marks = tmp_path / "marks.toml"
+    marks.write_text('[D.from]\n"x.jpg" = [1, 2]\n"y.jpg" = [1, 2]\n[D.to]\n"x.jpg" = [1, 2]\n'
+                     '"y.jpg" = [1, 2]\n')  # fmt: skip
+    out = posed / "scene"
+    assert capture(posed, out, "--known-length", "D=2 m", "--marks", marks) == 2
+    told = capsys.readouterr().err
+    assert "poses are kept" in told and "x.jpg" in told
+    assert len(load_scene(out).views) == 6 and (out / "mark.html").is_file()
+
+
+def test_poses_of_another_place_that_lie_there_are_not_taken(posed):
+    out = posed / "scene"
+    assert capture(posed, out) == 0
+    given = load_scene(out)
+    assert status("export", out, "-o", posed / "exported") == 0
+    data = json.loads((posed / "exported" / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"][0][3] *= 7
+    (out / "transforms.json").write_text(json.dumps(data))
+    assert capture(posed, out) == 0
+    for a, b in zip(load_scene(out).views, given.views, strict=True):
+        np.testing.assert_array_equal(a.c2w, b.c2w)
+
+
+def test_files_of_an_earlier_run_do_not_stay(posed):
+    out = posed / "scene"
+    assert capture(posed, out, "--labels", STREET / "labels") == 0
+    assert load_scene(out).views[0].label_path is not None
+    assert capture(posed, out) == 0
+    assert load_scene(out).views[0].label_path is None and not (out / "labels").exists()
+
+
+@pytest.mark.parametrize("name", ["../photos/0001.jpg", "/etc/0001.jpg"])
+def test_names_that_lead_elsewhere_are_refused(posed, capsys, name):
+    model = posed / "model" / "sparse" / "0" / "images.txt"
+    model.write_text(model.read_text().replace("0001.jpg", name))
+    assert capture(posed, posed / "scene") == 2
+    assert "leads out of the photos' folder" in capsys.readouterr().err
+    assert not (posed / "scene" / "photos").exists()
+
+
+def test_a_scene_among_the_photos_does_not_count_as_photos(posed, capsys):
+    out = posed / "photos" / "scene"
+    for _ in range(2):
+        assert capture(posed, out) == 0
+        assert "6 of 6 pictures" in capsys.readouterr().out
+
+
+def test_export_overwrites_no_points(posed, capsys):
+    assert capture(posed, posed / "scene") == 0
+    (posed / "out").mkdir()
+    (posed / "out" / "points.ply").write_text("mine")
+    assert status("export", posed / "scene", "-o", posed / "out") == 2
+    assert "already exists" in capsys.readouterr().err
+    assert (posed / "out" / "points.ply").read_text() == "mine"
+
+
+def test_gravity_of_photos_that_only_fit_when_turned(posed):
+    """Stored lying with a tag, posed as shown: what a phone tells is turned with the picture."""
+    truth = read_scene(STREET, holdout="0")
+    for view in truth.views[:6]:
+        pose = truth.c2w_world(view)
+        x, y, z = pose[:3, :3].T @ np.array([0, 0, -1.0])
+        stored = (y, -x, z)  # before tag 6 turns it: (x, y) = (-y', x')
+        data = exif(6, gravity=(-stored[1], -stored[0], -stored[2]), camera=("Apple", "iPhone"))
+        lying = Image.open(view.path).convert("RGB").transpose(Image.Transpose.ROTATE_90)
+        lying.save(posed / "photos" / view.name, quality=95, exif=data)
+    assert capture(posed, posed / "scene") == 0
+    scene = load_scene(posed / "scene")
+    assert scene.up_report["gravity"] < 3 and "gravity" in scene.up_report["used"]
+    up = scene.world_from_input[2, :3] / scene.scale
+    assert np.degrees(np.arccos(up[2])) < 2
+
+
+# From here on by structure from motion.
+
+
+def fitting_photos(folder, count=6):
+    """Photos of the street with names that no list or address likes."""
+    pytest.importorskip("pycolmap")
+    folder.mkdir()
+    names = ["#1 house.jpg", "50%20 off?.jpg", "Bild\u202f3.jpg", "a\nb.jpg", "|ü|.JPG", "6.jpeg"]
+    for path, name in zip(sorted((STREET / "images").iterdir())[:count], names, strict=False):
+        shutil.copy(path, folder / name)
+    return folder
+
+
+def sfm(photos, out):
+    return status("capture", photos, "-o", out, "--features", "2048")
+
+
+def test_strange_names_and_two_runs_alike(tmp_path, capsys):
+    photos = fitting_photos(tmp_path / "in")
+    (photos / "broken.jpg").symlink_to("nowhere")
+    (photos / os.fsdecode(b"caf\xe9.jpg")).write_bytes(b"no picture")
+    poses = []
+    for out in (tmp_path / "a", tmp_path / "b"):
+        assert sfm(photos, out) == 0
+        told = capsys.readouterr()
+        assert "broken.jpg is left out" in told.err and "Traceback" not in told.err
+        poses.append({view.name: view.c2w for view in load_scene(out).views})
+    assert len(poses[0]) >= 5 and poses[0].keys() == poses[1].keys()
+    for name in poses[0]:
+        np.testing.assert_array_equal(poses[0][name], poses[1][name])
+
+
+def test_a_work_folder_that_was_damaged_is_mended(tmp_path, capsys):
+    photos, out = fitting_photos(tmp_path / "in"), tmp_path / "scene"
+    assert sfm(photos, out) == 0
+    views = len(load_scene(out).views)
+    work = out / "work"
+
+    def garble(name):
+        return lambda: (work / name).write_bytes(b"\x00garbled")
+
+    first = sorted((work / "pictures").glob("*.json"))[0]
+    for damage in (
+        garble("poses.json"), garble("database.json"), garble("chosen/images.bin"),
+        lambda: (work / "poses.json").write_text('{"groups": 5}'),
+        lambda: (work / "database.db").unlink(),
+        lambda: first.write_text("3"),
+        lambda: first.with_suffix(".jpg").unlink(),
+        lambda: shutil.rmtree(work / "chosen"),
+    ):  # fmt: skip
+        damage()
+        assert sfm(photos, out) == 0, capsys.readouterr().err
+        assert len(load_scene(out).views) == views
+
+
+def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, capsys):
+    photos, out = fitting_photos(tmp_path / "in"), tmp_path / "scene"
+    (out / "work" / "database.db").mkdir(parents=True)
+    (out / "work" / "made-by-capture.json").write_text("{}")
+    (out / "work" / "database.db" / "x").write_text("x")
+    assert sfm(photos, out) in (0, 2)
+    told = capsys.readouterr().err
+    assert "Traceback" not in told and "memory" not in told
