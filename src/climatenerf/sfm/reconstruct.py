@@ -25,6 +25,9 @@ PICTURES_AT_ONCE = 6  # in one call for features: the bar moves in between
 TILE = 16  # pictures against as many in one call for matches
 ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
 MORE_PAIRS = 10_000  # of the second chance: ten minutes or so
+TRIES = 4  # of the mapper at most
+AGREEING = 0.95  # of the observations: two models that explain as much are sound
+LARGE_TRIANGULATION = 16.0  # degrees between the first two photos
 LEAST_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
 
 DATABASE, CHOSEN, RESULT = "database.db", "chosen", "poses.json"  # in the work folder
@@ -305,15 +308,28 @@ def _match(
 
 
 def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell: Told) -> list:
-    """Incremental mapping; a second try accepts a smaller baseline."""
-    for least_angle in (16.0, LEAST_TRIANGULATION):
-        found = _map_once(pycolmap, intake, database, folder, seed, least_angle, tell)
-        good = [
-            m
-            for m in found.values()
-            if m.num_reg_images() >= FEWEST and m.num_points3D() >= LEAST_POINTS
-        ]
-        if good:
+    """Incremental mapping, several times: one wrong link bends a whole model, but not in each.
+
+    A bent model explains fewer of the matches, so the one with most observations is taken as soon
+    as another agrees with it. Where nothing comes out a smaller baseline is accepted.
+    """
+    for least_angle in (LARGE_TRIANGULATION, LEAST_TRIANGULATION):
+        tries: list[tuple[int, list]] = []
+        for number in range(TRIES):
+            start = seed + number
+            found = _map_once(pycolmap, intake, database, folder, start, least_angle, tell, number)
+            good = [
+                m
+                for m in found.values()
+                if m.num_reg_images() >= FEWEST and m.num_points3D() >= LEAST_POINTS
+            ]
+            best = max((m.compute_num_observations() for m in good), default=0)
+            tries.append((best, good))
+            ranked = sorted((count for count, _ in tries), reverse=True)
+            if len(ranked) > 1 and ranked[1] >= AGREEING * ranked[0]:
+                break
+        best, good = max(tries, key=lambda one: one[0])
+        if best:
             return good
     raise UserError(
         "no three of the pictures fit together: they show too little in common, are blurred, or"
@@ -330,6 +346,7 @@ def _map_once(
     seed: int,
     least_angle: float,
     tell: Told,
+    number: int,
 ) -> dict:
     pycolmap.set_random_seed(seed)
     shutil.rmtree(folder, ignore_errors=True)
@@ -341,17 +358,17 @@ def _map_once(
     options.mapper.init_min_tri_angle = least_angle
     # It places pictures that share hardly a point with the rest, and places some of them wrongly.
     options.structure_less_registration_fallback = False
-    placed = 0
+    placed, stage = 0, f"poses, try {number + 1}"
 
     def one_more() -> None:
         nonlocal placed
         placed += 1
-        tell("poses", min(0.99, placed / len(intake.pictures)))
+        tell(stage, min(0.99, placed / len(intake.pictures)))
 
     found = pycolmap.incremental_mapping(
         database, intake.folder, folder, options, next_image_callback=one_more
     )
-    tell("poses", 1.0)
+    tell(stage, 1.0)
     return found
 
 
