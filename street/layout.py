@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from street.geometry import Mesh
 from street.houses import HOUSES, house_meshes
-from street.objects import bench, car, lamp
+from street.objects import bench, car, fence, lamp, person, table
 from street.plants import far_trees, hedge, shrubs, tree
 from street.terrain import ground_height, ground_meshes
 
@@ -22,8 +22,24 @@ def build_scene() -> list[Mesh]:
     meshes += tree("birch", (9.3, -8.6), (1.9, 0.12), (1.6, 1.8), 5500, "leaf-birch", 4)
     meshes += hedge("hedge-a", (-6.1, -5.4), (-12.0, -3.8), 0.95, 7)
     meshes += hedge("hedge-b", (5.65, 6.35), (10.0, 17.0), 1.05, 8)
-    meshes += car() + bench() + lamp() + shrubs() + far_trees()
+    meshes += car() + bench() + table() + fence() + lamp() + shrubs() + far_trees()
     return meshes
+
+
+def passers_by(view: int) -> list[Mesh]:
+    """Who is in the street when picture `view` (from 0) of the walk is taken; often nobody.
+
+    One walks up the left pavement while the first pictures are taken, another crosses the road
+    later: each is somewhere else in every picture, as people are.
+    """
+    if 2 <= view <= 15:
+        y = -6.0 + 1.15 * (view - 2)
+        stride = 0.5 * np.sin(2.1 * view)
+        return person("walker", (-4.3, y), 0.0, stride, "coat-blue")
+    if 24 <= view <= 33:
+        x = 2.6 - 0.62 * (view - 24)
+        return person("crosser", (x, -2.5), -90.0, 0.55 * np.cos(1.7 * view), "coat-ochre")
+    return []
 
 
 def look(
@@ -84,6 +100,27 @@ def camera_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
     for index, (x, y, height, azimuth, pitch) in enumerate(_walk() + _arc(), start=1):
         position = np.array([x, y, float(ground_height(x, y)) + height])
         out.append((f"{index:04d}.jpg", look(position, azimuth, pitch)))
+    return out
+
+
+def measuring_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
+    """Image name and pose of the six views that are for measuring: t01.jpg to t06.jpg.
+
+    House and bench from the road, the other house, across to the first one, bench and table from
+    near, the street from above its pavement, and the hollow in the road.
+    """
+    rows = (
+        (-0.6, -7.5, 1.6, -22.0, -5.0),
+        (-0.5, 3.0, 1.6, 38.0, -2.0),
+        (4.1, -4.0, 1.6, 282.0, -5.0),
+        (-3.6, -3.2, 1.6, -22.0, -11.0),
+        (4.9, 6.4, 3.4, 206.0, -13.0),
+        (0.4, -11.6, 1.6, -7.0, -10.0),
+    )
+    out = []
+    for index, (x, y, height, azimuth, pitch) in enumerate(rows, start=1):
+        position = np.array([x, y, float(ground_height(x, y)) + height])
+        out.append((f"t{index:02d}.jpg", look(position, azimuth, pitch)))
     return out
 
 

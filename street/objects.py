@@ -1,9 +1,9 @@
-"""Street furniture: a parked car, a bench, a lamp post."""
+"""What stands and walks in the street: car, bench, table, fence, lamp post, people."""
 
 import numpy as np
 from jaxtyping import Float
 
-from street.geometry import Mesh, box, cylinder, grid, merge
+from street.geometry import Mesh, blob, box, cylinder, grid, hexahedron, merge
 from street.terrain import ground_height
 
 CAR_AT = (1.93, 0.9)  # world x, y of the car's middle; it faces +y
@@ -146,6 +146,73 @@ def bench(x: float = -4.72, y: float = 0.6) -> list[Mesh]:
         merge(wood).scaled_uv(0.5, 0.5).tagged("bench-wood", "bench-wood", "object"),
         merge(feet).tagged("bench-feet", "stone", "object"),
     ]
+
+
+def table(x: float = -6.35, y: float = 2.45) -> list[Mesh]:
+    """A garden table on the lawn: a closed top, so the ground beneath is sheltered."""
+    z = float(ground_height(x, y))
+    top = [box((x - 0.42, y - 0.8, z + 0.70), (x + 0.42, y + 0.8, z + 0.745))]
+    rails = [box((x - 0.36, y - 0.72, z + 0.60), (x + 0.36, y - 0.68, z + 0.70))]
+    rails += [box((x - 0.36, y + 0.68, z + 0.60), (x + 0.36, y + 0.72, z + 0.70))]
+    legs = [
+        box((x + i * 0.36 - 0.03, y + j * 0.7 - 0.03, z - 0.15),
+            (x + i * 0.36 + 0.03, y + j * 0.7 + 0.03, z + 0.70))
+        for i in (-1, 1) for j in (-1, 1)
+    ]  # fmt: skip
+    wood = merge(top + rails + legs)
+    return [wood.scaled_uv(0.5, 0.5).tagged("table", "bench-wood", "object")]
+
+
+def fence(x: float = 5.55, y_range: tuple[float, float] = (-5.6, 3.0)) -> list[Mesh]:
+    """A white picket fence along the right pavement: thin parts with air between."""
+    y0, y1 = y_range
+    parts = []
+    for y in np.arange(y0, y1 + 1e-6, 0.14):
+        z = float(ground_height(x, y))
+        post = abs((y - y0) / 1.4 - round((y - y0) / 1.4)) < 0.01
+        half, out, tall = (0.045, 0.045, 1.0) if post else (0.028, 0.011, 0.85)
+        bottom = z - 0.15 if post else z + 0.06
+        parts.append(box((x - out, y - half, bottom), (x + out, y + half, z + tall)))
+    for low in (0.25, 0.62):  # rails, from post to post so that they follow the ground
+        for a in np.arange(y0, y1 - 0.7, 1.4):
+            ends = [float(ground_height(x, v)) + low for v in (a, a + 1.4)]
+            ring = [(x + 0.012, a), (x + 0.04, a), (x + 0.04, a + 1.4), (x + 0.012, a + 1.4)]
+            rise = np.array([ends[0], ends[0], ends[1], ends[1]])
+            bottom = np.c_[np.array(ring), rise]
+            parts.append(hexahedron(bottom, bottom + [0, 0, 0.07]))
+    return [merge(parts).tagged("fence", "white", "object")]
+
+
+def person(
+    name: str, at: tuple[float, float], heading: float, stride: float, coat: str
+) -> list[Mesh]:
+    """Somebody walking, 1.75 m: legs apart by `stride` m, `heading` in degrees from +y to +x."""
+    rng = np.random.default_rng(17)
+    z = float(ground_height(*at))
+    half = 0.5 * stride
+    legs, arms = [], []
+    for side in (-1, 1):
+        foot, knee, hip = (
+            np.array([0.1 * side, side * half, 0.05]),
+            np.array([0.1 * side, 0.6 * side * half + 0.05, 0.47]),
+            np.array([0.1 * side, 0.0, 0.92]),
+        )
+        legs += [cylinder(foot, knee, 0.055, 0.07, 10), cylinder(knee, hip, 0.075, 0.095, 10)]
+        legs.append(box(foot + [-0.05, -0.08, -0.05], foot + [0.05, 0.18, 0.04]))
+        shoulder, elbow, hand = (
+            np.array([0.22 * side, 0.0, 1.42]),
+            np.array([0.25 * side, -0.5 * side * half, 1.13]),
+            np.array([0.24 * side, -0.9 * side * half + 0.06, 0.9]),
+        )
+        arms += [cylinder(shoulder, elbow, 0.055, 0.05, 9), cylinder(elbow, hand, 0.048, 0.04, 9)]
+    torso = merge([blob((0, 0, 1.2), (0.22, 0.15, 0.34), rng, 0.03, 12), *arms])
+    head = blob((0, 0.02, 1.62), (0.09, 0.105, 0.125), rng, 0.0, 12)
+    parts = [
+        merge(legs).tagged(f"{name}-legs", "rubber", "person"),
+        torso.tagged(f"{name}-coat", coat, "person", True),
+        head.tagged(f"{name}-head", "skin", "person", True),
+    ]
+    return [part.moved(-heading, (*at, z)) for part in parts]
 
 
 def lamp(x: float = 4.75, y: float = 10.6) -> list[Mesh]:

@@ -1,4 +1,4 @@
-"""The light: one equirectangular picture of sky, clouds and a broad soft sun."""
+"""The light: one equirectangular picture of a cloudy sky, bright where the sun is."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,8 +7,9 @@ from street.textures import noise
 
 SUN_AZIMUTH = 218.0  # degrees from +y towards +x: the sun stands over the left, behind the walk
 SUN_ELEVATION = 40.0  # degrees
-SUN_APERTURE = 16.0  # degrees across: broad enough that reflections of it make no fireflies
-SUN_RADIANCE = 95.0  # relative to a blue sky of about 0.4
+SUN_WIDTH = 24.0  # degrees to 1/e: the sun through thin cloud. Broad, so that light which finds it
+# by chance, through water, makes no fireflies at any affordable number of samples.
+SUN_RADIANCE = 5.5  # relative to a cloudy sky of about 0.8
 
 
 def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
@@ -26,7 +27,7 @@ def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
     az, po = np.meshgrid(azimuth, polar)
     d = np.stack([np.sin(po) * np.sin(az), np.sin(po) * np.cos(az), np.cos(po)], -1)
     up = np.clip(d[..., 2], 0, 1)[..., None]
-    zenith, horizon = np.array([0.20, 0.36, 0.70]), np.array([0.66, 0.74, 0.82])
+    zenith, horizon = np.array([0.66, 0.74, 0.86]), np.array([0.80, 0.84, 0.88])
     sky = horizon + (zenith - horizon) * up**0.5
     # A flat cloud layer seen in perspective: look the noise up where the ray meets the layer.
     tile = 1024
@@ -42,12 +43,11 @@ def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
         for j in (0, 1)
     )
     cover = np.clip(1.4 * (cloud - 0.55), 0, 1) * np.clip((up[..., 0] - 0.03) / 0.2, 0, 1)
-    sky += 0.8 * cover[..., None] * (np.array([0.92, 0.91, 0.90]) - sky)
+    sky += 0.8 * cover[..., None] * (np.array([1.02, 1.0, 0.98]) - sky)
     sun = direction(SUN_AZIMUTH, SUN_ELEVATION)
     angle = np.rad2deg(np.arccos(np.clip(d @ sun, -1, 1)))
-    edge = np.clip((0.5 * SUN_APERTURE - angle) / 1.5, 0, 1)
-    sky += (edge * edge * (3 - 2 * edge))[..., None] * SUN_RADIANCE * np.array([1.0, 0.91, 0.76])
-    sky += (0.5 * np.exp(-((angle / 16.0) ** 2)))[..., None] * np.array([1.0, 0.95, 0.85])
+    glow = SUN_RADIANCE * np.exp(-((angle / SUN_WIDTH) ** 2))
+    sky += glow[..., None] * np.array([1.0, 0.95, 0.86])
     below = d[..., 2] < 0
     sky[below] = np.array([0.16, 0.17, 0.12])  # never seen: the ground reaches past the hills
     return sky

@@ -30,6 +30,9 @@ _PROFILE = np.array(
         (5.0, 0.145),
     ]
 )
+DIP_AT = (-1.15, -5.2)  # m: a worn hollow in the left lane, where rain would stand
+DIP_DEPTH = 0.07  # m
+DIP_RADIUS = 1.1  # m, to 1/e
 NEAR_X = 24.0  # m: extent of the detailed lawn picture
 NEAR_Y = 36.0
 FAR = 260.0
@@ -68,6 +71,7 @@ def ground_height(x: ArrayLike, y: ArrayLike) -> Float[np.ndarray, "*n"]:
         + 0.010 * np.sin(0.6 * x - 1.1 * y + 1.0)
         + 0.006 * np.sin(2.9 * x + 2.3 * y + 2.0)
     )
+    dip = -DIP_DEPTH * np.exp(-((x - DIP_AT[0]) ** 2 + (y - DIP_AT[1]) ** 2) / DIP_RADIUS**2)
     r = np.hypot(x, y)
     away = np.clip((r - 75.0) / 130.0, 0.0, 1.0)
     away = away * away * (3 - 2 * away)
@@ -76,7 +80,7 @@ def ground_height(x: ArrayLike, y: ArrayLike) -> Float[np.ndarray, "*n"]:
         + 7.0 * np.sin(x / 37.0 + 1.0) * np.cos(y / 45.0)
         + 4.0 * np.sin(x / 19.0 - y / 24.0 + 0.5)
     )
-    return road_profile(y) + cross + rise + bumps + hills
+    return road_profile(y) + cross + rise + bumps + hills + dip
 
 
 def _spaced(near: float, step: float) -> Float[np.ndarray, " n"]:

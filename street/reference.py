@@ -1,0 +1,126 @@
+"""Path trace the reference set: `python -m street.reference --out reference/street`.
+
+Every picture is one file of linear means in the store, so a run may be stopped and goes on; a pass
+adds samples to each. `--only flood-low` limits it to some groups. See docs/reference-scene.md.
+"""
+
+import argparse
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from street.layout import build_scene, camera_poses, ground_datum, measuring_poses, passers_by
+from street.render import load, render_view
+from street.snowfall import snow_meshes
+from street.store import add, stored
+from street.water import mirror, still, wavy
+from street.write import write_demo, write_reference
+
+LOW, HIGH = 0.25, 0.6  # m above the ground datum
+THIN, DEEP = 0.03, 0.15  # m
+WAVE_TIME = 1.0  # s
+WIDTH, HEIGHT = 384, 216
+Poses = list[tuple[str, Float[np.ndarray, "4 4"]]]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Pictures that are traced alike.
+
+    Attributes:
+        name: folder in the store.
+        poses: the views.
+        samples: per pixel and pass; a square number.
+        passes: to average.
+    """
+
+    name: str
+    poses: Poses
+    samples: int
+    passes: int
+
+
+def groups() -> list[Group]:
+    """All that is path traced, the dear ones last; samples for about 40 dB of noise."""
+    test = measuring_poses()
+    walk = [pose for i, pose in enumerate(camera_poses()) if passers_by(i)]
+    return [
+        Group("clean", test + camera_poses(), 49, 2),
+        Group("flood-high", test, 100, 4),
+        Group("flood-low", test, 100, 4),
+        Group("flood-waves", test, 100, 4),
+        Group("snow-deep", test, 49, 3),
+        Group("snow-thin", test, 49, 3),
+        Group("mirror", test, 49, 2),
+        Group("people", walk, 49, 2),
+        Group("clean", test, 49, 6),
+    ]
+
+
+def open_group(group: Group, view: int, folder: Path, threads: int):
+    """The group's Mitsuba scene, as it is for one of its views."""
+    meshes, water, datum = build_scene(), None, ground_datum()[0]
+    if group.name == "flood-low":
+        water = still(datum + LOW)
+    if group.name == "flood-high":
+        water = still(datum + HIGH)
+    if group.name == "flood-waves":
+        water = wavy(datum + HIGH, WAVE_TIME, folder)
+    if group.name == "mirror":
+        water = mirror(datum + HIGH)
+    if group.name == "snow-thin":
+        meshes += snow_meshes(meshes, THIN)
+    if group.name == "snow-deep":
+        meshes += snow_meshes(meshes, DEEP)
+    if group.name == "people":
+        meshes += passers_by(view)
+    return load(meshes, folder, threads, water)
+
+
+def trace(group: Group, store: Path, threads: int) -> None:
+    """Adds what is missing of a group's passes to the store."""
+    names = [name for name, _ in camera_poses()]
+    folder = store / group.name
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        scene = None
+        for number in range(group.passes):
+            for index, (name, pose) in enumerate(group.poses):
+                path = (folder / name).with_suffix(".npz")
+                if stored(path)[0] > number:
+                    continue
+                if scene is None or group.name == "people":
+                    view = names.index(name) if name in names else index
+                    scene = open_group(group, view, Path(scratch), threads)
+                start = time.monotonic()
+                seed = 1000 * number + index
+                fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed)[..., :3]
+                add(path, fresh)
+                took = time.monotonic() - start
+                print(f"{group.name} pass {number} {name} {took:.1f} s", flush=True)
+
+
+def main() -> None:
+    """Trace what is missing, group after group, and write what is wanted."""
+    parser = argparse.ArgumentParser(prog="python -m street.reference", description=__doc__)
+    parser.add_argument("--store", type=Path, default=Path("build/street-reference"))
+    parser.add_argument("--only", nargs="*", help="groups; default: all")
+    parser.add_argument("--out", type=Path, help="write the reference set into this folder")
+    parser.add_argument("--demo", type=Path, help="write the demo's subset into this folder")
+    parser.add_argument("--threads", type=int, default=1)
+    args = parser.parse_args()
+    for group in groups():
+        if args.only is None or group.name in args.only:
+            trace(group, args.store, args.threads)
+    if args.demo:
+        write_demo(args.store, args.demo, WIDTH, HEIGHT)
+    if args.out:
+        write_reference(args.store, args.out, WIDTH, HEIGHT)
+
+
+if __name__ == "__main__":
+    main()

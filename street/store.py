@@ -1,0 +1,24 @@
+"""Linear means of pictures in the making, one file each."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+
+def add(path: Path, fresh: Float[np.ndarray, "h w 3"]) -> None:
+    """Averages a new pass into a picture's mean; a stop leaves the old file or the new one."""
+    passes, mean = stored(path)
+    mean = fresh if mean is None else (passes * mean + fresh) / (passes + 1)
+    temporary = path.with_name(path.stem + ".tmp.npz")
+    np.savez(temporary, mean=mean.astype(np.float32), passes=passes + 1)
+    os.replace(temporary, path)
+
+
+def stored(path: Path) -> tuple[int, Float[np.ndarray, "h w 3"] | None]:
+    """Number of passes and their mean; (0, None) where there is none yet."""
+    if not path.exists():
+        return 0, None
+    with np.load(path) as data:
+        return int(data["passes"]), data["mean"]

@@ -1,0 +1,253 @@
+"""The path-traced truth itself: snow, water and layers of the street against closed forms."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from street import snowfall, water  # noqa: E402
+from street.geometry import box, quad  # noqa: E402
+from street.layout import build_scene, camera_poses, ground_datum, measuring_poses, passers_by  # noqa: E402
+from street.objects import bench, fence, table  # noqa: E402
+from street.sky import SUN_AZIMUTH, SUN_ELEVATION, direction  # noqa: E402
+from street.terrain import DIP_AT, DIP_DEPTH, ground_height  # noqa: E402
+from street.truth import TRAIN_IDS, layers, sun_directions  # noqa: E402
+
+
+@pytest.fixture
+def yard(monkeypatch):
+    """A level yard of 6 m with a table, a roof of 42 degrees and one of 65."""
+    monkeypatch.setattr(snowfall, "RINGS", ((3.0, 3.0, 0.05),))
+    ground = quad((-3, -3, 0), (6, 0, 0), (0, 6, 0))
+    top = box((-2.0, -2.0, 0.7), (-1.0, -1.0, 0.75))
+
+    def roof(x, degrees):
+        run = 1.2 * np.cos(np.deg2rad(degrees))
+        rise = 1.2 * np.sin(np.deg2rad(degrees))
+        return quad((x, 0, 2.0), (run, 0, rise), (0, 2.0, 0))
+
+    return [ground, top, roof(-1.5, 42.0), roof(0.8, 65.0)]
+
+
+def mean_depth(cover, x0, x1, y0, y1):
+    rows, columns = cover.depth.shape
+    x = cover.x0 + cover.cell * np.arange(columns)
+    y = cover.y0 + cover.cell * np.arange(rows)
+    return cover.depth[(y > y0) & (y < y1)][:, (x > x0) & (x < x1)].mean()
+
+
+def test_snow_lies_where_it_can_and_none_is_lost(yard):
+    cover = snowfall.snow_cover(yard, 0.15, 0)
+    assert mean_depth(cover, 1.8, 2.8, -2.5, -1.0) == pytest.approx(0.15, rel=0.04)
+    assert mean_depth(cover, -1.8, -1.2, -1.8, -1.2) == pytest.approx(0.15, rel=0.08), (
+        "on the table"
+    )
+    # EN 1991-1-3: roofs of 42 degrees keep (60 - 42) / 30 of it, those of 65 nothing.
+    assert mean_depth(cover, -1.3, -0.8, 0.5, 1.5) == pytest.approx(0.15 * 0.6, rel=0.12)
+    assert mean_depth(cover, 0.9, 1.2, 0.5, 1.5) < 0.002
+    # What slid off lies at the foot of the roofs.
+    assert mean_depth(cover, -1.9, -1.55, 0.3, 1.7) > 0.2
+    assert cover.depth.mean() == pytest.approx(0.15, rel=0.01)
+
+
+def test_nothing_lies_under_the_table(yard):
+    cover = snowfall.snow_cover(yard, 0.15, 0)
+    mesh = snowfall.cover_mesh(cover, (0.0, 0.0))
+    corners = mesh.vertices[mesh.faces].mean(1)
+    under = (np.abs(corners[:, :2] + 1.5) < 0.4).all(1)
+    assert under.any() and corners[under, 2].min() > 0.75
+    tops = corners[(np.abs(corners[:, 0] - 2.3) < 0.4) & (np.abs(corners[:, 1] + 2) < 0.4)]
+    assert np.median(tops[:, 2]) == pytest.approx(0.15, rel=0.05)
+
+
+def test_the_same_seed_lets_the_same_snow_fall(yard):
+    first, second = (snowfall.snow_cover(yard, 0.05, 0).depth for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_waves_of_the_mesh_are_the_programs_own(tmp_path):
+    from climatenerf.weather.parameters import Flood
+    from climatenerf.weather.waves import heights, make_waves
+
+    water.wavy(5.0, 1.0, tmp_path)
+    raw = (tmp_path / "water.ply").read_bytes()
+    start = raw.index(b"end_header\n") + len(b"end_header\n")
+    (x0, x1), (y0, y1) = water.NEAR
+    columns, rows = round((x1 - x0) / water.STEP) + 1, round((y1 - y0) / water.STEP) + 1
+    table = np.frombuffer(raw, "<f4", rows * columns * 6, start).reshape(rows, columns, 6)
+    z, normal = table[..., 2].astype(float) - 5.0, table[..., 3:].astype(float)
+    inner = (slice(80, -80), slice(80, -80))  # beyond the calm border
+    slope_y, slope_x = np.gradient(z, water.STEP)
+    analytic = -normal[..., :2] / normal[..., 2:]
+    wanted = np.stack([slope_x, slope_y], -1)
+    error = np.sqrt(((analytic - wanted)[inner] ** 2).mean())
+    assert error < 0.25 * np.sqrt((analytic[inner] ** 2).mean()), "differences blur short waves"
+    waves = make_waves(
+        Flood(level=0.0, wind_speed=water.WIND, wave_scale=water.WAVE_SCALE), water.SEED
+    )
+    spread = np.sqrt(sum(float(heights(waves, i, 1.0).var()) for i in range(len(waves.tiles))))
+    assert z[inner].std() == pytest.approx(spread, rel=0.25)
+    assert abs(z[0]).max() < 1e-5 and abs(z[:, -1]).max() < 1e-5, "calm at the border"
+
+
+def test_tables_repeat_and_are_met_at_their_points():
+    values = np.random.default_rng(0).normal(size=(8, 8))
+    x, y = np.meshgrid(np.arange(8) * 0.25, np.arange(8) * 0.25)
+    np.testing.assert_allclose(water.periodic(values, 2.0, x, y), values)
+    np.testing.assert_allclose(water.periodic(values, 2.0, x - 4.0, y + 2.0), values)
+    middle = water.periodic(values, 2.0, np.array([0.125]), np.array([0.0]))
+    assert middle[0] == pytest.approx((values[0, 0] + values[0, 1]) / 2)
+
+
+def test_sun_rays_fill_its_core():
+    rays, sun = sun_directions(), direction(SUN_AZIMUTH, SUN_ELEVATION)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1)
+    angles = np.degrees(np.arccos(rays @ sun))
+    assert angles.max() < 12.5 and angles.min() < 5
+    assert np.degrees(np.arccos(rays.mean(0) @ sun / np.linalg.norm(rays.mean(0)))) < 2
+
+
+def test_test_views_stand_free_and_dry():
+    solid = np.concatenate(
+        [m.vertices for m in build_scene() if m.label not in ("road", "terrain")]
+    )
+    near = solid[np.abs(solid[:, :2]).max(1) < 18]
+    taken = np.stack([pose[:3, 3] for _, pose in camera_poses()])
+    for name, pose in measuring_poses():
+        assert np.linalg.norm(near - pose[:3, 3], axis=-1).min() > 0.3, name
+        assert pose[2, 3] > ground_datum()[0] + 0.6 + 0.3, "above the high flood"
+        away = np.linalg.norm(taken - pose[:3, 3], axis=-1).min()
+        assert 0.05 < away < 3.0, "between the photos, and none of them"
+
+
+def test_new_things_are_where_they_are_said_to_be():
+    top = table()[0].vertices
+    assert ground_height(-6.35, 2.45) + 0.74 < top[:, 2].max() < ground_height(-6.35, 2.45) + 0.76
+    pickets = fence()[0].vertices
+    assert pickets[:, 0].min() > 5.4 and pickets[:, 0].max() < 5.7
+    assert bench()[0].vertices[:, 2].max() < 3
+    ring = [ground_height(DIP_AT[0] + 2.5 * np.cos(a), DIP_AT[1]) for a in (0, np.pi)]
+    assert np.mean(ring) - ground_height(*DIP_AT) > 0.6 * DIP_DEPTH
+
+
+def test_people_pass_in_some_pictures_and_never_stand_still():
+    seen = [passers_by(i) for i in range(64)]
+    assert 15 < sum(bool(s) for s in seen) < 40
+    walkers = [s[0].vertices.mean(0) for s in seen[2:16]]
+    steps = np.linalg.norm(np.diff(walkers, axis=0)[:, :2], axis=1)
+    assert steps.min() > 0.5
+    for someone in seen:
+        for mesh in someone:
+            assert mesh.label == "person"
+        if someone:
+            low = min(mesh.vertices[:, 2].min() for mesh in someone)
+            x, y = someone[0].vertices[:, :2].mean(0)
+            assert abs(low - ground_height(x, y)) < 0.16  # one foot may be off the kerb
+
+
+# From here on with the path tracer.
+
+
+@pytest.mark.slow
+def test_layers_agree_with_the_ground_and_with_each_other(tmp_path):
+    pytest.importorskip("mitsuba")
+    from street.render import load
+
+    meshes = build_scene()
+    scene = load(meshes, tmp_path, named=True)
+    name, pose = measuring_poses()[5]
+    truth = layers(scene, meshes, pose, 96, 54)
+    focal = 48 / np.tan(np.deg2rad(34.0))
+    x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
+    local = np.stack([(x - 48) / focal, (y - 27) / focal, np.ones_like(x)], -1)
+    rays = (local / np.linalg.norm(local, axis=-1, keepdims=True)) @ pose[:3, :3].T
+    road = truth["label"] == TRAIN_IDS["road"]
+    assert road.mean() > 0.2
+    points = pose[:3, 3] + truth["depth"][road, None] * rays[road]
+    assert np.abs(points[:, 2] - ground_height(points[:, 0], points[:, 1])).max() < 0.03
+    # Normals are those of the planes through neighbouring points.
+    whole = pose[:3, 3] + np.where(road, truth["depth"], 0)[..., None] * rays
+    across, down = whole[1:-1, 2:] - whole[1:-1, :-2], whole[2:, 1:-1] - whole[:-2, 1:-1]
+    plane = np.cross(down, across)
+    plane /= np.maximum(np.linalg.norm(plane, axis=-1, keepdims=True), 1e-9)
+    flat = road[1:-1, 1:-1] & road[1:-1, 2:] & road[1:-1, :-2] & road[2:, 1:-1] & road[:-2, 1:-1]
+    cosine = np.abs((plane * truth["normal"][1:-1, 1:-1]).sum(-1))[flat]
+    assert np.median(np.degrees(np.arccos(np.clip(cosine, 0, 1)))) < 1.0
+    sky = truth["label"] == TRAIN_IDS["sky"]
+    assert (np.isinf(truth["depth"]) == sky).all() and (truth["normal"][sky] == 0).all()
+    assert ((truth["sun"] >= 0) & (truth["sun"] <= 1)).all() and truth["sun"][road].mean() > 0.3
+
+
+def fresnel(cosine, n=1.333):
+    """Unpolarised reflectance of a smooth surface, from the equations in every textbook."""
+    inside = np.sqrt(1 - (1 - cosine**2) / n**2)
+    s = ((cosine - n * inside) / (cosine + n * inside)) ** 2
+    p = ((inside - n * cosine) / (inside + n * cosine)) ** 2
+    return 0.5 * (s + p), inside
+
+
+@pytest.mark.parametrize("degrees", [10.0, 45.0, 75.0])
+def test_traced_water_obeys_fresnel_and_beer(degrees):
+    """A black bed shows the mirrored sky alone; a shining bed what Beer and Lambert leave of it."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    depth, height = 0.8, 1.0
+    theta = np.deg2rad(degrees)
+    flat = mi.ScalarTransform4f()
+    target = [height * np.tan(theta), 0, 0]
+    sensor = {
+        "type": "perspective", "fov": 0.2, "near_clip": 0.01,
+        "to_world": flat.look_at(origin=[0, 0, height], target=target, up=[0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": 4096},
+    }  # fmt: skip
+    bed_place = flat.translate([0, 0, -depth]).scale([250, 250, 1])
+    reflected, inside = fresnel(np.cos(theta))
+
+    def seen(bed, sky):
+        scene = {
+            "type": "scene", "integrator": {"type": "volpath", "max_depth": 12, "rr_depth": 8},
+            "sensor": sensor, "water": water.still(0.0),
+            "bed": {"type": "rectangle", "to_world": bed_place, **bed},
+        }  # fmt: skip
+        if sky:
+            scene["sky"] = {"type": "constant", "radiance": 1.0}
+        return float(np.array(mi.render(mi.load_dict(scene), seed=1))[..., :3].mean())
+
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    assert seen({"bsdf": black}, sky=True) == pytest.approx(reflected, abs=0.01)
+    shining = {"bsdf": black, "emitter": {"type": "area", "radiance": 1.0}}
+    left = (1 - reflected) * np.exp(-water.ABSORPTION * depth / inside) / water.IOR**2
+    assert seen(shining, sky=False) == pytest.approx(left, abs=0.012)
+
+
+def test_a_mirror_shows_what_a_mirrored_camera_sees(tmp_path):
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    flat = mi.ScalarTransform4f()
+    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.2, 0.1]}}
+
+    def scene(with_mirror, eye, target, up):
+        content = {
+            "type": "scene", "integrator": {"type": "path", "max_depth": 6},
+            "sky": {"type": "constant", "radiance": 0.5},
+            "ball": {"type": "sphere", "center": [0.3, 0, 1.0], "radius": 0.4, "bsdf": red},
+            "sensor": {
+                "type": "perspective", "fov": 20.0, "near_clip": 0.01,
+                "to_world": flat.look_at(origin=eye, target=target, up=up),
+                "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": 256},
+            },
+        }  # fmt: skip
+        if with_mirror:
+            content["water"] = water.mirror(0.0)
+        return np.array(mi.render(mi.load_dict(content), seed=1))[..., :3]
+
+    seen = scene(True, [3, 0, 1.5], [0.3, 0, -1.0], [0, 0, 1])
+    mirrored = scene(False, [3, 0, -1.5], [0.3, 0, 1.0], [0, 0, -1])
+    # The mirrored camera's picture is turned left to right; only the ball's own light differs.
+    assert np.abs(seen - mirrored[:, ::-1]).mean() < 0.05
