@@ -3,7 +3,8 @@
     python examples/01_fit_and_flood.py [STEPS] [RUN]
 
 Leaves a run folder (default runs/example, which the other examples use) and RUN/flooded.png.
-300 steps on small photos give a blurred street, quickly; `climatenerf fit` does it properly.
+700 steps on small photos give a blurred street in some minutes (with 300 there is haze left that
+keeps snow from the ground); `climatenerf fit` does it properly.
 """
 
 import shutil
@@ -25,7 +26,7 @@ from climatenerf.training.run import fit_scene
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
 
-steps = int(sys.argv[1]) if len(sys.argv) > 1 else 300
+steps = int(sys.argv[1]) if len(sys.argv) > 1 else 700
 run = Path(sys.argv[2] if len(sys.argv) > 2 else "runs/example")
 shutil.rmtree(run, ignore_errors=True)  # a folder that holds a run is never overwritten
 

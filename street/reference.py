@@ -10,19 +10,19 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 from jaxtyping import Float
 
 from street.layout import build_scene, camera_poses, ground_datum, measuring_poses, passers_by
+from street.publish import LEVELS, SNOW, WAVE_TIME, write_reference
 from street.render import load, render_view
+from street.smog import air_box, scattering_air
 from street.snowfall import snow_meshes
 from street.store import add, stored
 from street.water import mirror, still, wavy
-from street.write import write_demo, write_reference
+from street.write import write_demo
 
-LOW, HIGH = 0.25, 0.6  # m above the ground datum
-THIN, DEEP = 0.03, 0.15  # m
-WAVE_TIME = 1.0  # s
 WIDTH, HEIGHT = 384, 216
 Poses = list[tuple[str, Float[np.ndarray, "4 4"]]]
 
@@ -50,35 +50,39 @@ def groups() -> list[Group]:
     walk = [pose for i, pose in enumerate(camera_poses()) if passers_by(i)]
     return [
         Group("clean", test + camera_poses(), 49, 2),
-        Group("flood-high", test, 100, 4),
-        Group("flood-low", test, 100, 4),
-        Group("flood-waves", test, 100, 4),
+        Group("flood-high", test, 100, 2),
+        Group("flood-low", test, 100, 2),
+        Group("flood-waves", test, 100, 2),
         Group("snow-deep", test, 49, 3),
         Group("snow-thin", test, 49, 3),
         Group("mirror", test, 49, 2),
         Group("people", walk, 49, 2),
         Group("clean", test, 49, 6),
+        Group("scattering", test[:1], 49, 2),
+        Group("flood-high", test, 100, 4),
+        Group("flood-low", test, 100, 4),
+        Group("flood-waves", test, 100, 4),
     ]
 
 
 def open_group(group: Group, view: int, folder: Path, threads: int):
-    """The group's Mitsuba scene, as it is for one of its views."""
-    meshes, water, datum = build_scene(), None, ground_datum()[0]
-    if group.name == "flood-low":
-        water = still(datum + LOW)
-    if group.name == "flood-high":
-        water = still(datum + HIGH)
+    """The group's Mitsuba scene, as it is for one of its views, and the medium of its air."""
+    mi.set_variant("scalar_rgb")
+    meshes, water, air, datum = build_scene(), None, None, ground_datum()[0]
+    if group.name in ("flood-low", "flood-high"):
+        water = still(datum + LEVELS[group.name])
     if group.name == "flood-waves":
-        water = wavy(datum + HIGH, WAVE_TIME, folder)
+        water = wavy(datum + LEVELS[group.name], WAVE_TIME, folder)
     if group.name == "mirror":
-        water = mirror(datum + HIGH)
-    if group.name == "snow-thin":
-        meshes += snow_meshes(meshes, THIN)
-    if group.name == "snow-deep":
-        meshes += snow_meshes(meshes, DEEP)
+        water = mirror(datum + LEVELS["flood-high"])
+    if group.name == "scattering":
+        air = mi.load_dict(scattering_air())
+        water = air_box(air)
+    if group.name in SNOW:
+        meshes += snow_meshes(meshes, SNOW[group.name])
     if group.name == "people":
         meshes += passers_by(view)
-    return load(meshes, folder, threads, water)
+    return load(meshes, folder, threads, water), air
 
 
 def trace(group: Group, store: Path, threads: int) -> None:
@@ -87,19 +91,20 @@ def trace(group: Group, store: Path, threads: int) -> None:
     folder = store / group.name
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
-        scene = None
+        opened = None
         for number in range(group.passes):
             for index, (name, pose) in enumerate(group.poses):
                 path = (folder / name).with_suffix(".npz")
                 if stored(path)[0] > number:
                     continue
-                if scene is None or group.name == "people":
+                if opened is None or group.name == "people":
                     view = names.index(name) if name in names else index
-                    scene = open_group(group, view, Path(scratch), threads)
+                    opened = open_group(group, view, Path(scratch), threads)
                 start = time.monotonic()
                 seed = 1000 * number + index
-                fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed)[..., :3]
-                add(path, fresh)
+                scene, air = opened
+                fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed, air=air)
+                add(path, fresh[..., :3])
                 took = time.monotonic() - start
                 print(f"{group.name} pass {number} {name} {took:.1f} s", flush=True)
 

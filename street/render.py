@@ -115,29 +115,34 @@ def render_view(
     spp: int,
     seed: int,
     integrator=None,
+    air=None,
 ):
-    """Linear radiance of one view before exposure and coverage by matter, [height, width, 4]."""
+    """Linear radiance of one view before exposure and coverage by matter, [height, width, 4].
+
+    `air` is the medium that the camera stands in, if any.
+    """
     import mitsuba as mi
 
     # Mitsuba's camera looks along +z with +x to the left and +y up.
     to_world = mi.ScalarTransform4f((pose @ np.diag([-1.0, -1.0, 1.0, 1.0])).tolist())
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": FIELD_OF_VIEW,
-            "fov_axis": "x",
-            "near_clip": 0.05,
-            "far_clip": 2000.0,
-            "to_world": to_world,
-            "sampler": {"type": "multijitter", "sample_count": spp},
-            "film": {
-                "type": "hdrfilm",
-                "width": width,
-                "height": height,
-                "pixel_format": "rgba",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-        }
-    )
+    sensor = {
+        "type": "perspective",
+        "fov": FIELD_OF_VIEW,
+        "fov_axis": "x",
+        "near_clip": 0.05,
+        "far_clip": 2000.0,
+        "to_world": to_world,
+        "sampler": {"type": "multijitter", "sample_count": spp},
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+    }
+    if air is not None:
+        sensor["medium"] = air
+    sensor = mi.load_dict(sensor)
     return np.array(mi.render(scene, integrator=integrator, sensor=sensor, spp=spp, seed=seed))

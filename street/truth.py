@@ -30,6 +30,17 @@ def sun_directions() -> Float[np.ndarray, "n 3"]:
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
 
+def pixel_rays(
+    pose: Float[np.ndarray, "4 4"], width: int, height: int
+) -> Float[np.ndarray, "h w 3"]:
+    """Unit directions through the middles of the pixels, in the world."""
+    focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    local = np.stack([(x - 0.5 * width) / focal, (y - 0.5 * height) / focal, np.ones_like(x)], -1)
+    rays = local @ pose[:3, :3].T
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+
+
 def layers(
     scene, meshes: list[Mesh], pose: Float[np.ndarray, "4 4"], width: int, height: int
 ) -> dict[str, np.ndarray]:
@@ -48,11 +59,7 @@ def layers(
     import mitsuba as mi
 
     classes = {mesh.name.replace(".", "_"): TRAIN_IDS[mesh.label] for mesh in meshes}
-    focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    local = np.stack([(x - 0.5 * width) / focal, (y - 0.5 * height) / focal, np.ones_like(x)], -1)
-    rays = local.reshape(-1, 3) @ pose[:3, :3].T
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = pixel_rays(pose, width, height).reshape(-1, 3)
     eye, sun = pose[:3, 3], sun_directions()
     depth = np.full(len(rays), np.inf, np.float32)
     normal = np.zeros((len(rays), 3), np.float32)
@@ -81,3 +88,35 @@ def layers(
         "label": label.reshape(shape),
         "sun": lit.reshape(shape),
     }
+
+
+def snow_layers(
+    snowy, bare, pose: Float[np.ndarray, "4 4"], width: int, height: int
+) -> dict[str, np.ndarray]:
+    """Truth of a view under snow, one ray a pixel.
+
+    Args:
+        snowy: Mitsuba's scene with the snow's meshes, loaded with their names.
+        bare: the same scene without them.
+        pose: camera to world, OpenCV axes.
+        width: pixels; height likewise.
+
+    Returns:
+        `depth` (m along the ray, inf in the sky) and `thickness` (m of snow straight below the
+        place that is seen, to what lies under it; 0 where no snow is seen).
+    """
+    import mitsuba as mi
+
+    rays = pixel_rays(pose, width, height).reshape(-1, 3)
+    depth = np.full(len(rays), np.inf, np.float32)
+    thickness = np.zeros(len(rays), np.float32)
+    start, down = mi.Point3f(*pose[:3, 3]), mi.Vector3f(0.0, 0.0, -1.0)
+    for i, ray in enumerate(rays):
+        hit = snowy.ray_intersect(mi.Ray3f(start, mi.Vector3f(*ray)))
+        if not hit.is_valid():
+            continue
+        depth[i] = float(hit.t)
+        if hit.shape.id().startswith("snow"):
+            under = bare.ray_intersect(mi.Ray3f(hit.p, down))
+            thickness[i] = float(under.t) if under.is_valid() else 0.0
+    return {"depth": depth.reshape(height, width), "thickness": thickness.reshape(height, width)}

@@ -1,16 +1,16 @@
-"""The reference set and the demo's subset of it on disk, from the store of linear pictures."""
+"""Pictures, labels, points and scene.json on disk, from the store; the demo's folder of them."""
 
-import hashlib
 import json
 import os
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 from PIL import Image
 
-from street.layout import FIELD_OF_VIEW, build_scene, camera_poses, ground_datum, measuring_poses
+from street.layout import FIELD_OF_VIEW, build_scene, camera_poses, ground_datum
 from street.render import EXPOSURE, encode, load
 from street.store import stored
 from street.truth import layers
@@ -30,54 +30,25 @@ def write_demo(store: Path, out: Path, width: int, height: int) -> None:
     known = truths(store, poses, width, height)
     for name, truth in known.items():
         label = np.where(truth["label"] == SKY, SKY, UNKNOWN).astype(np.uint8)
-        _save_png(label, out / "labels" / f"{Path(name).stem}.png")
+        save_png(label, out / "labels" / f"{Path(name).stem}.png")
     heldout = {name for name, _ in poses[::HOLDOUT_EVERY]}
     write_scene(out, poses, heldout, known, width, height)
 
 
-def write_reference(store: Path, out: Path, width: int, height: int) -> None:
-    """All views with their classes; for the test views depth, normals, sun, and the weather."""
-    poses = camera_poses() + measuring_poses()
-    write_pictures(store / "clean", out / "images", poses)
-    known = truths(store, poses, width, height)
-    for name, truth in known.items():
-        _save_png(truth["label"], out / "labels" / f"{Path(name).stem}.png")
-    tests = [name for name, _ in measuring_poses()]
-    for name in tests:
-        linear = stored((store / "clean" / name).with_suffix(".npz"))[1]
-        assert linear is not None
-        path = out / "truth" / f"{Path(name).stem}.npz"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(
-            path,
-            depth=known[name]["depth"],
-            normal=known[name]["normal"].astype(np.float16),
-            sun=known[name]["sun"].astype(np.float16),
-            clean=(EXPOSURE * linear).astype(np.float16),
-        )
-    for group in sorted(path.name for path in store.iterdir() if path.name not in OWN):
-        for picture in sorted((store / group).glob("*.npz")):
-            mean = stored(picture)[1]
-            assert mean is not None
-            _save_png(encode(EXPOSURE * mean), out / group / f"{picture.stem}.png")
-    write_scene(out, poses, set(tests), known, width, height)
-    write_sums(out)
-
-
-OWN = ("clean", "layers")  # folders of the store that are no weather
-
-
 def write_pictures(means: Path, folder: Path, poses: Poses) -> None:
     """JPEGs of the views."""
-    folder.mkdir(parents=True, exist_ok=True)
     for name, _ in poses:
-        mean = stored((means / name).with_suffix(".npz"))[1]
-        if mean is None:
-            raise SystemExit(f"{name} is not traced yet; run `python -m street.reference` first")
-        temporary = (folder / name).with_suffix(".tmp")
-        picture = Image.fromarray(encode(EXPOSURE * mean))
-        picture.save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-        os.replace(temporary, folder / name)
+        save_jpeg(EXPOSURE * mean_of(means, name), folder / name)
+
+
+def mean_of(folder: Path, name: str) -> Float[np.ndarray, "h w 3"]:
+    """The linear picture of a view in a folder of the store."""
+    mean = stored((folder / name).with_suffix(".npz"))[1]
+    if mean is None:
+        raise SystemExit(
+            f"{folder.name} {name} is not traced yet; run `python -m street.reference`"
+        )
+    return mean
 
 
 def truths(store: Path, poses: Poses, width: int, height: int) -> dict[str, dict[str, np.ndarray]]:
@@ -97,13 +68,22 @@ def truths(store: Path, poses: Poses, width: int, height: int) -> dict[str, dict
 
 
 def sparse_points(
-    poses: Poses, known: dict[str, dict[str, np.ndarray]], width: int, height: int
+    poses: Poses,
+    heldout: set[str],
+    known: dict[str, dict[str, np.ndarray]],
+    width: int,
+    height: int,
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
-    """Surface points as structure from motion would give them, metres, and the view of each."""
+    """Surface points as structure from motion would give them, metres, and the view of each.
+
+    They come from the views alone that are fitted to: what is measured is told to nobody.
+    """
     rng = np.random.default_rng(1)
     focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
     points, seen_by = [], []
     for i, (name, pose) in enumerate(poses):
+        if name in heldout:
+            continue
         row, column = rng.integers(height, size=PER_VIEW), rng.integers(width, size=PER_VIEW)
         depth = known[name]["depth"][row, column]
         pixel = np.stack([column + 0.5 - 0.5 * width, row + 0.5 - 0.5 * height], -1) / focal
@@ -122,10 +102,11 @@ def write_scene(
     known: dict[str, dict[str, np.ndarray]],
     width: int,
     height: int,
+    shared: Callable[[str], str] = lambda path: path,
 ) -> None:
     """Write scene.json (and points.ply) beside the pictures with climatenerf's own writer.
 
-    Sparse points come from the views that are fitted to alone.
+    `shared` may say that a file (`images/0001.jpg`) lies elsewhere, as a path from `out`.
     """
     from climatenerf.scene import Camera, Scene, View, save_scene
 
@@ -133,15 +114,15 @@ def write_scene(
     camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
     ground, lowest = ground_datum()
     root = out.resolve()
-    points, seen_by = sparse_points(poses, known, width, height)
+    points, seen_by = sparse_points(poses, heldout, known, width, height)
     views = tuple(
         View(
             name,
-            root / "images" / name,
+            root / shared(f"images/{name}"),
             0,
             pose,
             "heldout" if name in heldout else "train",
-            label_path=root / "labels" / Path(name).with_suffix(".png"),
+            label_path=root / shared(f"labels/{Path(name).stem}.png"),
             seen=np.flatnonzero(seen_by == i),
         )
         for i, (name, pose) in enumerate(poses)
@@ -156,18 +137,18 @@ def write_scene(
     os.replace(temporary, path)
 
 
-def write_sums(out: Path) -> None:
-    """SHA256SUMS of all files, as sha256sum writes it."""
-    lines = [
-        f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(out).as_posix()}"
-        for path in sorted(out.rglob("*"))
-        if path.is_file() and path.name != "SHA256SUMS"
-    ]
-    (out / "SHA256SUMS").write_text("\n".join(lines) + "\n")
-
-
-def _save_png(picture: np.ndarray, path: Path) -> None:
+def save_png(picture: np.ndarray, path: Path) -> None:
+    """A picture without loss."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     Image.fromarray(picture).save(temporary, "PNG", optimize=True)
+    os.replace(temporary, path)
+
+
+def save_jpeg(linear: Float[np.ndarray, "h w 3"], path: Path) -> None:
+    """An exposed linear picture as a photo."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".tmp")
+    picture = Image.fromarray(encode(linear))
+    picture.save(temporary, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     os.replace(temporary, path)

@@ -15,12 +15,12 @@ def test_the_examples_run_one_after_the_other(tmp_path):
     run = tmp_path / "run"
     told = {}
     for name, words in (
-        ("01_fit_and_flood", ["150", str(run)]),
+        ("01_fit_and_flood", ["400", str(run)]),
         ("02_weather_file", [str(run)]),
         ("03_new_matter", [str(run)]),
     ):
         command = [sys.executable, str(EXAMPLES / f"{name}.py"), *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
         assert done.returncode == 0, done.stderr
         told[name] = done.stdout
     assert (run / "flooded.png").stat().st_size > 1000

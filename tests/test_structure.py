@@ -15,7 +15,7 @@ MAY_IMPORT = {
     "ops": set(),
     "scene": BASE,
     "sfm": BASE | {"scene"},
-    "evaluation": BASE,
+    "evaluation": BASE | {"scene", "field", "weather", "render", "ops", "samples"},
     "field": BASE | {"ops", "samples"},
     "weather": BASE | {"ops", "samples"},
     "render": BASE | {"scene", "field", "weather", "ops", "samples"},

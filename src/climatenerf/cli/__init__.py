@@ -46,6 +46,7 @@ VERBS = {
     "capture": Verb("climatenerf.cli.capture", "Capture", "find the poses of photos or a video"),
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
+    "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against the truth"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),
     "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the street that comes along"),
 }

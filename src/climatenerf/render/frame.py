@@ -33,6 +33,18 @@ def render_frame(
             taken from the ray next to the pixel's centre.
         normals: also the layer `normal`.
     """
+    linear, layers = see_frame(world, camera, c2w, supersample, normals)
+    return (encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy(), layers
+
+
+def see_frame(
+    world: World,
+    camera: Camera,
+    c2w: Float[np.ndarray, "4 4"],
+    supersample: int = 1,
+    normals: bool = False,
+) -> tuple[Float[Tensor, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
+    """As `render_frame`, but the picture in linear light."""
     height, width = camera.height, camera.width
     fine = camera.resized(width * supersample, height * supersample)
     rays_o, rays_d = camera_rays(fine, c2w)
@@ -42,7 +54,6 @@ def render_frame(
     roll = pixel_roll(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
     seen = trace(world, rays_o, rays_d, angle, roll)
     linear = seen.rgb.view(height, supersample, width, supersample, 3).mean((1, 3))
-    display = (encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
     shape = (height, supersample, width, supersample)
     layers = {
         each.name: _middle(getattr(seen, each.name), shape)
@@ -54,7 +65,7 @@ def render_frame(
         solid = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
         known = (layers["normal"] != 0).any(-1, keepdims=True)  # of water and snow
         layers["normal"] = np.where(known, layers["normal"], solid)
-    return display, layers
+    return linear, layers
 
 
 def _middle(values: Tensor, shape: tuple[int, int, int, int]) -> np.ndarray:

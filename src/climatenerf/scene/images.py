@@ -143,6 +143,15 @@ def load_depth(view: View, scene: Scene, downscale: int = 1) -> Float[np.ndarray
     return _nearest(_fitting(read_depth(view.depth_path), camera, view.depth_path), downscale)
 
 
+def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture as it is stored, 8-bit RGB.
+
+    Raises:
+        UserError: The file cannot be read.
+    """
+    return to_rgb(_opened(path))
+
+
 def read_labels(path: Path) -> UInt8[np.ndarray, "h w"]:
     """An 8-bit picture of class ids.
 

@@ -1,0 +1,64 @@
+"""``climatenerf evaluate RUN --reference -o REPORT``: a run's scores against the known truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from climatenerf.cli import progress
+from climatenerf.errors import UserError
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Measure a run against the truth: a table, report.json, and pictures."""
+
+    run: tyro.conf.Positional[Path]
+    """Run folder made by `climatenerf fit reference/street`."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for the report."""
+    reference: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Against the reference set that the run was fitted to: geometry, weather, baselines."""
+    views: tuple[str, ...] = ()
+    """Test views, such as t01 t04. Default: all."""
+    weathers: tuple[str, ...] = ()
+    """Weathers, such as flood-low smog-near. Default: all."""
+
+
+def run(options: Evaluate) -> int:
+    """Measures, prints the table, and says where the report is."""
+    if not options.reference:
+        raise UserError("say what to measure against: climatenerf evaluate RUN --reference -o OUT")
+
+    from climatenerf.evaluation.reference import read_reference
+    from climatenerf.evaluation.report import check_place, table_text, write_report
+    from climatenerf.evaluation.scores import Place, evaluate
+    from climatenerf.field.checkpoint import load_field
+    from climatenerf.scene import load_scene
+    from climatenerf.storage import read_json
+    from climatenerf.training.run import check_config
+
+    field = load_field(options.run)
+    config = check_config(options.run)
+    scene = load_scene(options.run)
+    reference = read_reference(scene.root, options.views, options.weathers)
+    names = ["clean", *(kind.name for kind in reference.weathers)]
+    check_place(options.out, names)
+    metrics = read_json(options.run / "metrics.json", "the run's measurements")
+    with progress.Bar("evaluate", len(names) + 7) as bar:
+        scores = evaluate(
+            Place(field, scene, reference), lambda what: bar.advance(1, {"now": what})
+        )
+    about = {
+        "run": options.run.resolve().name,
+        "capture": scene.root.name,
+        "seconds": round(float(metrics.get("seconds", 0.0)), 1),
+        "steps": metrics.get("steps"),
+        "downscale": config.get("downscale"),
+        "views": [Path(truth.name).stem for truth in reference.truths],
+    }
+    write_report(scores, about, options.out)
+    progress.result(table_text(scores.table))
+    progress.result(f"report: {options.out / 'report.md'}")
+    return 0

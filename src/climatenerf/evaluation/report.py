@@ -1,0 +1,123 @@
+"""A run's scores on disk and as text: report.json, report.md, and a picture for each weather."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import climatenerf
+from climatenerf.errors import UserError
+from climatenerf.evaluation.baselines import NAMES as BASELINES
+from climatenerf.evaluation.scores import Scores
+from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
+from climatenerf.storage import make_folder, read_json, write_bytes, write_json
+
+SCHEMA_VERSION = 1
+FILE_NAME, TEXT_NAME = "report.json", "report.md"
+CELL = 384  # pixels of a picture's width
+GAIN = 2.0  # of the difference pictures
+
+
+def check_place(out: Path, pictures: list[str]) -> None:
+    """Refuses a folder where a report would overwrite what is no report, and makes it.
+
+    Args:
+        out: folder to be.
+        pictures: names of the weathers.
+    """
+    old = out / FILE_NAME
+    if old.exists():
+        if "scores" not in read_json(old, "an earlier report"):
+            raise UserError(f"{old} is no report of climatenerf; choose another folder with -o")
+    else:
+        for name in (TEXT_NAME, *(f"{each}.jpg" for each in pictures)):
+            if (out / name).exists():
+                raise UserError(f"{out / name} would be overwritten; choose another -o")
+    make_folder(out)
+
+
+def write_report(scores: Scores, about: dict[str, Any], out: Path) -> None:
+    """Writes REPORT/report.json, report.md and one picture a weather.
+
+    Args:
+        scores: what was measured.
+        about: of the run: its folder's name, minutes, steps.
+        out: folder.
+    """
+    for name, rows in scores.pictures.items():
+        sheet = []
+        for view, ours, real in rows:
+            apart = np.abs(ours.astype(np.float64) - real.astype(np.float64)) * GAIN
+            difference = np.clip(apart, 0, 255).astype(np.uint8)
+            sheet.append((f"{name} {Path(view).stem}", [ours, real, difference]))
+        write_jpeg(out / f"{name}.jpg", contact_sheet(sheet, cell_width=CELL), 600_000)
+    text = table_text(scores.table)
+    head = f"# Against the truth\n\n{', '.join(f'{k} {v}' for k, v in about.items())}\n\n"
+    foot = "\n\nPictures: ours, the truth, and twice the difference.\n\n"
+    foot += "\n".join(f"![{name}]({name}.jpg)" for name in scores.pictures)
+    write_bytes(out / TEXT_NAME, f"{head}```\n{text}\n```{foot}\n".encode())
+    write_json(
+        out / FILE_NAME,
+        {
+            "schema_version": SCHEMA_VERSION,
+            "climatenerf": climatenerf.__version__,
+            "run": about,
+            "scores": _finite(scores.table),
+            **_finite(scores.table),
+        },
+    )
+
+
+def table_text(table: dict[str, Any]) -> str:
+    """The scores as lines for a terminal."""
+    lines = [
+        f"clean            PSNR {_db(table['clean']['psnr'])}  SSIM {table['clean']['ssim']:.3f}",
+        _line("geometry", table["geometry"]),
+        _line("classes", table["labels"]),
+        _line("mirrored cameras", table["completeness"]),
+        "",
+        f"{'PSNR dB / SSIM':<14}{'ours':>13}" + "".join(f"{name:>19}" for name in BASELINES),
+    ]
+    for name, own in table["weather"].items():
+        cells = [f"{_pair(own):>13}"]
+        for baseline in BASELINES:
+            other = table["baselines"].get(baseline, {}).get(name)
+            cells.append(f"{'-' if other is None else _pair(other):>19}")
+        lines.append(f"{name:<14}" + "".join(cells))
+    lines.append("")
+    for name, own in table["weather"].items():
+        lines.append(_line(name, {k: v for k, v in own.items() if k not in ("psnr", "ssim")}))
+    told = table["consistency"]
+    lines += ["", f"{'warp error, next / far':<24}" + "".join(f"{k:>15}" for k in KINDS)]
+    for name in ("ours", *BASELINES):
+        here = told if name == "ours" else told["baselines"].get(name, {})
+        cells = [
+            f"{here[k]['next']:.3f} / {here[k]['far']:.3f}" if k in here else "-" for k in KINDS
+        ]
+        if any(cell != "-" for cell in cells):
+            lines.append(f"{name:<24}" + "".join(f"{cell:>15}" for cell in cells))
+    return "\n".join(lines)
+
+
+KINDS = ("clean", "smog", "flood", "snow")
+
+
+def _pair(score: dict[str, float]) -> str:
+    return f"{_db(score['psnr'])} / {score['ssim']:.3f}"
+
+
+def _db(value: float) -> str:
+    return f"{value:.2f}"
+
+
+def _line(title: str, values: dict[str, float]) -> str:
+    told = "  ".join(f"{key.replace('_', ' ')} {value:.3g}" for key, value in values.items())
+    return f"{title:<16} {told}"
+
+
+def _finite(value: Any) -> Any:
+    """NaN is no JSON: None stands for what could not be measured."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,336 @@
+"""All scores of a fitted run against the reference set, and the pictures that show them.
+
+See docs/reference-scene.md for what each number means.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from climatenerf.errors import UserError
+from climatenerf.evaluation import baselines, geometry, weather_scores
+from climatenerf.evaluation.baselines import Dry
+from climatenerf.evaluation.consistency import Frame, warp_error
+from climatenerf.evaluation.metrics import psnr, ssim
+from climatenerf.evaluation.painting import painted, tune
+from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, world_rays
+from climatenerf.field.field import Field
+from climatenerf.ops import dispatch
+from climatenerf.render.camera_path import camera_path
+from climatenerf.render.frame import see_frame
+from climatenerf.render.stage import Stage, prepare
+from climatenerf.render.view import RENDER_STEP, camera_rays
+from climatenerf.render.world import World
+from climatenerf.scene import Camera, Scene
+from climatenerf.weather import smog
+from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.parameters import Flood, Weather
+
+Picture = UInt8[np.ndarray, "h w 3"]
+Tell = Callable[[str], None]
+FOLLOWED = {"smog": "smog-mid", "flood": "flood-waves", "snow": "snow-deep"}
+PATH_FRAMES, STARTS, FAR = 400, (60, 180, 300), 8  # of the path over which frames are compared
+SMALL = 2  # frames are compared at this part of the photos' size
+
+
+@dataclass
+class Scores:
+    """What was measured.
+
+    Attributes:
+        table: nested scores; the keys are told in docs/reference-scene.md.
+        pictures: for "clean" and each weather the rows ours, truth of the views.
+    """
+
+    table: dict[str, Any]
+    pictures: dict[str, list[tuple[str, Picture, Picture]]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Place:
+    """What is evaluated: a fitted field, its scene, and the truth of it."""
+
+    fitted: Field
+    scene: Scene
+    reference: Reference
+
+    def pose(self, truth: Truth) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
+        """Camera and pose, in the run's own world, of a view that is measured."""
+        view = next(v for v in self.scene.views if v.name == truth.name)
+        return self.scene.cameras[view.camera], self.scene.c2w_world(view)
+
+
+def evaluate(place: Place, tell: Tell) -> Scores:
+    """Measures a run.
+
+    Args:
+        place: of the run and its truth.
+        tell: told what is being done.
+
+    Raises:
+        UserError: the run lacks a test view, was fitted to it, or has it in another size.
+    """
+    check_place(place)
+    truths = place.reference.truths
+    tell("clean views")
+    dry = [dry_view(place, truth) for truth in truths]
+    clean = [display_8bit(each.linear) for each in dry]
+    real = [display_8bit(truth.clean) for truth in truths]
+    scores = Scores({"clean": picture_scores(clean, real)})
+    scores.pictures["clean"] = _rows(truths, clean, real)
+    tell("geometry")
+    scores.table["geometry"] = geometry_scores(place, dry)
+    tell("classes")
+    scores.table["labels"] = label_scores(place, dry)
+    tell("mirrored cameras")
+    scores.table["completeness"] = mirror_scores(place)
+    scores.table["weather"], scores.table["baselines"] = {}, {}
+    tuned: dict[str, dict[str, Any]] = {}
+    for kind in place.reference.weathers:
+        tell(kind.name)
+        one_weather(place, kind, dry, scores, tuned)
+    tell("consistency")
+    scores.table["consistency"] = consistency(place, tuned, tell)
+    return scores
+
+
+def check_place(place: Place) -> None:
+    """Refuses a run that cannot be measured honestly."""
+    views = {view.name: view for view in place.scene.views}
+    for truth in place.reference.truths:
+        if truth.name not in views:
+            raise UserError(
+                f"the run does not know the test view {truth.name}; fit the whole reference set"
+            )
+        view = views[truth.name]
+        if view.split == "train":
+            raise UserError(
+                f"the run was fitted to the test view {truth.name}, so it cannot be measured by it;"
+                " fit without --holdout"
+            )
+        camera = place.scene.cameras[view.camera]
+        if (camera.height, camera.width) != truth.depth.shape:
+            raise UserError(
+                f"the run has {truth.name} at {camera.width}x{camera.height} pixels, the reference"
+                f" set at {truth.depth.shape[1]}x{truth.depth.shape[0]}; fit its own pictures"
+            )
+
+
+def picture_scores(ours: list[Picture], real: list[Picture]) -> dict[str, float]:
+    """Means over the views of PSNR, dB, and SSIM."""
+    pairs = list(zip(ours, real, strict=True))
+    return {
+        "psnr": float(np.mean([psnr(a, b) for a, b in pairs])),
+        "ssim": float(np.mean([ssim(a, b) for a, b in pairs])),
+    }
+
+
+def display_8bit(linear: Float[np.ndarray, "h w 3"]) -> Picture:
+    """8-bit display values."""
+    return (baselines.display(linear) * 255 + 0.5).astype(np.uint8)
+
+
+def dry_view(place: Place, truth: Truth) -> Dry:
+    """Our clean view of a test view's camera."""
+    return dry_from(place, *place.pose(truth))
+
+
+def dry_from(place: Place, camera: Camera, c2w: Float[np.ndarray, "4 4"]) -> Dry:
+    """Our clean view from any camera."""
+    world = World(place.fitted, place.fitted.near)
+    linear, layers = see_frame(world, camera, c2w, normals=True)
+    rays_d = world_rays(camera, c2w)
+    return Dry(linear.double().numpy(), layers["depth"], layers["normal"], rays_d, c2w, camera)
+
+
+def geometry_scores(place: Place, dry: list[Dry]) -> dict[str, float]:
+    """Depth, normals, floaters and sky."""
+    truths = place.reference.truths
+    normals = [each.normal @ each.c2w[:3, :3] for each in dry]
+    absorbed, skyward = [], []
+    for truth in truths:
+        camera, c2w = place.pose(truth)
+        free = torch.from_numpy(geometry.free_space(truth).astype(np.float32).ravel())
+        lost = 1 - passing(place.fitted, camera, c2w, free.clamp_max(1e9))
+        absorbed.append(lost.view(truth.depth.shape).numpy())
+        whole = passing(place.fitted, camera, c2w, torch.full_like(free, 1e9))
+        skyward.append(whole.view(truth.depth.shape).numpy())
+    return {
+        **geometry.depth_scores([each.depth for each in dry], truths),
+        **geometry.normal_scores(normals, truths),
+        **geometry.emptiness_scores(absorbed, skyward, truths),
+    }
+
+
+@torch.no_grad()
+def passing(
+    fitted: Field, camera: Camera, c2w: Float[np.ndarray, "4 4"], t_max: torch.Tensor
+) -> torch.Tensor:
+    """Transmittance of each pixel's ray up to a ray length, m."""
+    rays_o, rays_d = camera_rays(camera, c2w)
+    start = torch.full_like(t_max, fitted.near)
+    samples = fitted.march(rays_o, rays_d, start, t_max.clamp_min(fitted.near), RENDER_STEP)
+    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    return left
+
+
+def label_scores(place: Place, dry: list[Dry]) -> dict[str, float]:
+    """Classes of the test views by the vote of training views, against the true ones."""
+    train = [view for view in place.scene.of_split("train") if view.label_path is not None]
+    if not train:
+        return {"miou": float("nan")}
+    step = max(1, len(train) // geometry.VOTERS)
+    world, depths = World(place.fitted, place.fitted.near), {}
+    for view in train[::step][: geometry.VOTERS]:
+        camera = place.scene.cameras[view.camera]
+        depths[view.name] = see_frame(world, camera, place.scene.c2w_world(view))[1]["depth"]
+    labels = []
+    for each in dry:
+        sky = np.isinf(each.depth)
+        points = each.c2w[:3, 3] + np.where(sky, 0.0, each.depth)[..., None] * each.rays_d
+        labels.append(geometry.voted_labels(place.scene, depths, points, sky))
+    return geometry.label_scores(labels, place.reference.truths)
+
+
+def mirror_scores(place: Place) -> dict[str, float]:
+    """How complete the light field is: what a perfect mirror lying on the ground would show."""
+    reference = place.reference
+    calm = Flood(level=reference.mirror_level, wind_speed=0.0)
+    still = KeyframedWeather(Weather(flood=calm), {})
+    stage = _stage(place, still, 0.0, [place.pose(t)[1] for t in reference.truths])
+    world = stage.at(0.0)
+    assert world.water is not None
+    world = dataclasses.replace(world, water=dataclasses.replace(world.water, mirror_only=True))
+    errors = []
+    for truth in reference.truths:
+        camera, c2w = place.pose(truth)
+        linear, layers = see_frame(world, camera, c2w)
+        wet = layers["mask_water"] > 0.99
+        ours = display_8bit(linear.double().numpy())[wet] / 255.0
+        errors.append(((ours - reference.mirrored(truth.name)[wet] / 255.0) ** 2).ravel())
+    mse = float(np.concatenate(errors).mean()) if sum(map(len, errors)) else float("nan")
+    return {"mirror_psnr": float(-10 * np.log10(max(mse, 1e-12)))}
+
+
+def one_weather(
+    place: Place, kind: WeatherTruth, dry: list[Dry], scores: Scores, tuned: dict
+) -> None:
+    """Renders one weather in all views, scores it, and does the same with the baselines."""
+    truths = place.reference.truths
+    poses = [place.pose(truth) for truth in truths]
+    stage = _stage(place, kind.weather, kind.time, [c2w for _, c2w in poses])
+    world = stage.at(kind.time)
+    seen = [see_frame(world, camera, c2w) for camera, c2w in poses]
+    ours = [display_8bit(linear.double().numpy()) for linear, _ in seen]
+    layers = [found for _, found in seen]
+    real = [kind.picture(truth.name) for truth in truths]
+    own: dict[str, float] = picture_scores(ours, real)
+    weather = kind.weather.at(kind.time)
+    if weather.flood.level is not None:
+        level, scene = weather.flood.level, place.reference.scene
+        eyes = [c2w for _, c2w in poses]
+        own |= weather_scores.waterline_scores(
+            layers, eyes, place.scene.ground_z + level, truths, scene.ground_z + level
+        )
+    if weather.snow.depth is not None:
+        snow = [kind.layers(truth.name) for truth in truths]
+        own |= weather_scores.snow_scores(layers, truths, snow, 1.0 / poses[0][0].fx)
+    if weather.smog.present:
+        passed = [found["transmittance"] for found in layers]
+        own |= weather_scores.transmittance_scores(passed, _true_air(place, kind))
+    scores.table["weather"][kind.name] = own
+    scores.pictures[kind.name] = _rows(truths, ours, real)
+    tuned[kind.name] = tune(kind, place.scene.ground_z, dry, real)
+    for name in baselines.NAMES:
+        pictures = [
+            painted(kind, place.scene.ground_z, each, tuned[kind.name], name, seed)
+            for seed, each in enumerate(dry)
+        ]
+        if all(picture is not None for picture in pictures):
+            kept = [picture for picture in pictures if picture is not None]
+            each_score = picture_scores([(255 * p + 0.5).astype(np.uint8) for p in kept], real)
+            scores.table["baselines"].setdefault(name, {})[kind.name] = each_score
+
+
+def consistency(place: Place, tuned: dict[str, dict], tell: Tell) -> dict[str, Any]:
+    """Errors of frames warped to t + 1 and t + 8, for the clean place, weathers and baselines."""
+    camera = place.scene.cameras[place.scene.views[0].camera]
+    size = (camera.width // SMALL, camera.height // SMALL)
+    path = camera_path("training", place.scene, PATH_FRAMES, size)
+    starts = [start for start in STARTS if start + FAR < len(path)]
+    wanted = sorted({index for s in starts for index in (s, s + 1, s + FAR)})
+    dry = {i: dry_from(place, path.cameras[i], path.c2w[i]) for i in wanted}
+    plain = np.zeros(dry[wanted[0]].depth.shape, bool)
+
+    def frame(index: int, picture: np.ndarray, depth: np.ndarray, excluded: np.ndarray) -> Frame:
+        return Frame(picture, depth, excluded, path.c2w[index], path.cameras[index])
+
+    clean = {
+        i: frame(i, baselines.display(each.linear), each.depth, plain) for i, each in dry.items()
+    }
+    out: dict[str, Any] = {"clean": _pairs(clean, starts), "baselines": {}}
+    kinds = {kind.name: kind for kind in place.reference.weathers}
+    for short, name in FOLLOWED.items():
+        if name not in kinds:
+            continue
+        tell(f"consistency, {short}")
+        kind = kinds[name]
+        stage = _stage(place, kind.weather, kind.time, [path.c2w[i] for i in wanted])
+        world, frames = stage.at(kind.time), {}
+        for i in wanted:
+            linear, layers = see_frame(world, path.cameras[i], path.c2w[i])
+            picture = baselines.display(linear.double().numpy())
+            frames[i] = frame(i, picture, layers["depth"], layers["mask_water"] > 0)
+        out[short] = _pairs(frames, starts)
+        for baseline in baselines.NAMES:
+            painted_frames = {}
+            for i in wanted:
+                picture = painted(kind, place.scene.ground_z, dry[i], tuned[name], baseline, i)
+                if picture is None:
+                    break
+                painted_frames[i] = frame(i, picture, dry[i].depth, frames[i].excluded)
+            else:
+                out["baselines"].setdefault(baseline, {})[short] = _pairs(painted_frames, starts)
+    return out
+
+
+def _pairs(frames: dict[int, Frame], starts: list[int]) -> dict[str, float]:
+    near = [warp_error(frames[s], frames[s + 1]) for s in starts]
+    far = [warp_error(frames[s], frames[s + FAR]) for s in starts]
+    return {"next": _mean(near), "far": _mean(far)}
+
+
+def _mean(values: list[float]) -> float:
+    known = [value for value in values if np.isfinite(value)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def _stage(place: Place, weather: KeyframedWeather, time: float, poses: list[np.ndarray]) -> Stage:
+    places = np.stack([pose[:3, 3] for pose in poses])
+    moment = np.array([time])
+    return prepare(place.fitted, place.scene, weather, places, moment, lambda what, share: None)
+
+
+def _true_air(place: Place, kind: WeatherTruth) -> list[np.ndarray]:
+    """True transmittance of each test view's air, from the true depth in the true world."""
+    scene = place.reference.scene
+    air = smog.medium(kind.weather.at(kind.time).smog, scene.ground_z)
+    assert air is not None
+    out = []
+    for truth in place.reference.truths:
+        rays_d = torch.from_numpy(truth.rays_d)
+        rays_o = torch.from_numpy(truth.c2w[:3, 3]).expand_as(rays_d)
+        depth = torch.from_numpy(truth.depth.astype(np.float64))
+        out.append(smog.transmittance(air, rays_o, rays_d, depth).numpy())
+    return out
+
+
+def _rows(
+    truths: tuple[Truth, ...], ours: list[Picture], real: list[Picture]
+) -> list[tuple[str, Picture, Picture]]:
+    return [(t.name, a, b) for t, a, b in zip(truths, ours, real, strict=True)]

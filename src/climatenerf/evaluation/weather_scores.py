@@ -1,0 +1,163 @@
+"""How right a weather is beside its picture: waterline, snow surface, transmittance of the air."""
+
+import numpy as np
+from jaxtyping import Float
+
+from climatenerf.evaluation.geometry import ground_or_roof
+from climatenerf.evaluation.reference import Truth
+from climatenerf.render.normals import plane_normals
+
+JOINED = 0.5  # m: neighbouring pixels this close show one surface
+NEAR = 30.0  # m: snow is compared up to here
+LEAST_SNOW = 0.005  # m: less is bare ground
+
+Layers = dict[str, np.ndarray]
+
+
+def waterline_scores(
+    layers: list[Layers], eyes: list[Float[np.ndarray, "4 4"]], level: float,
+    truths: tuple[Truth, ...], true_level: float,
+) -> dict[str, float]:  # fmt: skip
+    """Where the water ends, against where it truly does.
+
+    Both lines are found between neighbouring pixels of one surface, one above and one below the
+    water, at the share of the way where it crosses.
+
+    Args:
+        layers: `depth`, `water_depth` and `mask_water` of each view.
+        eyes: poses of its cameras in our world.
+        level: height of our water, m.
+        truths: of the same views.
+        true_level: height of the true water, m.
+
+    Returns:
+        `waterline_error_cm`, the median distance of the true line from ours;
+        `waterline_height_error_cm`, the median height by which our ground misses the water there;
+        `water_iou` of the flooded pixels.
+    """
+    apart, rise, both, either = [], [], 0, 0
+    for ours, c2w, truth in zip(layers, eyes, truths, strict=True):
+        rays_c = truth.rays_d @ truth.c2w[:3, :3]  # camera axes
+        height = truth.points[..., 2] - true_level
+        height[truth.sky] = np.inf
+        line, (i, j) = crossings(truth.depth[..., None] * rays_c, height)
+        rays = rays_c @ c2w[:3, :3].T
+        wet = ours["mask_water"] > 0.5
+        bed_z = level - ours["water_depth"]
+        sink = np.minimum(rays[..., 2], -1e-6)  # water is seen downwards only: 0/0 elsewhere
+        t = np.where(wet, (bed_z - c2w[2, 3]) / sink, ours["depth"])
+        with np.errstate(invalid="ignore"):
+            own_height = c2w[2, 3] + t * rays[..., 2] - level
+        own_height = np.where(wet, -np.maximum(ours["water_depth"], 1e-4), own_height)
+        own_height[~np.isfinite(t)] = np.inf
+        own, _ = crossings(t[..., None] * rays_c, own_height)
+        if len(line):
+            apart.append(_nearest(line, own))
+            here = 0.5 * (own_height.ravel()[i] + own_height.ravel()[j])
+            rise.append(np.abs(np.where(np.isfinite(here), here, 10.0)))
+        real = _plane_first(truth, true_level)
+        both, either = both + (wet & real).sum(), either + (wet | real).sum()
+    return {
+        "waterline_error_cm": _median_cm(apart),
+        "waterline_height_error_cm": _median_cm(rise),
+        "water_iou": float(both / either) if either else float("nan"),
+    }
+
+
+def crossings(
+    points: Float[np.ndarray, "h w 3"], height: Float[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "n 3"], tuple[np.ndarray, np.ndarray]]:
+    """Places where a surface crosses height 0 between neighbouring pixels.
+
+    Args:
+        points: seen by the pixels.
+        height: theirs, m; inf where there is nothing.
+
+    Returns:
+        The places, and the flat indices of the pixels on both sides of each.
+    """
+    number = np.arange(height.size).reshape(height.shape)
+    i = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+    j = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+    p, z = points.reshape(-1, 3), height.ravel()
+    known = np.isfinite(z[i]) & np.isfinite(z[j])
+    i, j = i[known], j[known]
+    crosses = (z[i] < 0) != (z[j] < 0)
+    i, j = i[crosses], j[crosses]
+    one = np.linalg.norm(p[i] - p[j], axis=-1) < JOINED
+    i, j = i[one], j[one]
+    share = z[i] / (z[i] - z[j])  # signs differ: never 0/0
+    return p[i] + share[:, None] * (p[j] - p[i]), (i, j)
+
+
+def snow_scores(
+    layers: list[Layers], truths: tuple[Truth, ...], snow: list[Layers], pixel_angle: float
+) -> dict[str, float]:
+    """Where snow lies and how deep, against the truth.
+
+    Args:
+        layers: our `depth`, `snow_thickness` and `mask_snow` of each view.
+        truths: of the same views, without snow.
+        snow: true `depth` and `thickness` under snow.
+        pixel_angle: of a pixel, rad.
+
+    Returns:
+        `snow_surface_error_cm`, the median distance between our surface and the true one, square to
+        it; `thickness_error_cm`, the median error of the snow's thickness; both on ground and roofs
+        nearer than `NEAR` where snow truly lies; `thickness_cm` and `true_thickness_cm`, medians;
+        `snow_iou` of snowy pixels there.
+    """
+    apart, error, ours_thick, true_thick, both, either = [], [], [], [], 0, 0
+    for ours, truth, real in zip(layers, truths, snow, strict=True):
+        thickness = real["thickness"].astype(np.float64)
+        rays_c = truth.rays_d @ truth.c2w[:3, :3]
+        place = ground_or_roof(truth) & (truth.depth < NEAR)
+        white = place & (thickness > LEAST_SNOW) & np.isfinite(real["depth"])
+        normal = plane_normals(np.zeros(3), rays_c, real["depth"], pixel_angle)
+        depth = np.minimum(ours["depth"], 2 * np.where(white, real["depth"], 1.0))
+        gap = np.abs(depth - np.where(white, real["depth"], depth)) * np.abs(
+            (normal * rays_c).sum(-1)
+        )
+        apart.append(gap[white])
+        error.append(np.abs(ours["snow_thickness"] - thickness)[white])
+        ours_thick.append(ours["snow_thickness"][white])
+        true_thick.append(thickness[white])
+        own = place & (ours["mask_snow"] > 0.5)
+        both, either = both + (own & white).sum(), either + (own | white).sum()
+    return {
+        "snow_surface_error_cm": _median_cm(apart),
+        "thickness_error_cm": _median_cm(error),
+        "thickness_cm": _median_cm(ours_thick),
+        "true_thickness_cm": _median_cm(true_thick),
+        "snow_iou": float(both / either) if either else float("nan"),
+    }
+
+
+def transmittance_scores(
+    passed: list[Float[np.ndarray, "h w"]], real: list[Float[np.ndarray, "h w"]]
+) -> dict[str, float]:
+    """Mean absolute error of the air's transmittance over all pixels."""
+    errors = [np.abs(a - b).ravel() for a, b in zip(passed, real, strict=True)]
+    return {"transmittance_error": float(np.concatenate(errors).mean())}
+
+
+def _plane_first(truth: Truth, level: float) -> np.ndarray:
+    """Where the truth shows the water's plane before anything else."""
+    fall = -truth.rays_d[..., 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(fall > 0, (truth.c2w[2, 3] - level) / fall, np.inf)
+    return (t > 0) & (t < truth.depth)
+
+
+def _nearest(line: Float[np.ndarray, "n 3"], own: Float[np.ndarray, "m 3"]) -> np.ndarray:
+    """Distance of each place of a line from the nearest of ours; 10 m where there is none."""
+    if not len(own):
+        return np.full(len(line), 10.0)
+    parts = [line[k : k + 512] for k in range(0, len(line), 512)]
+    near = [np.sqrt(((p[:, None] - own[None]) ** 2).sum(-1).min(1)) for p in parts]
+    return np.minimum(np.concatenate(near), 10.0)
+
+
+def _median_cm(parts: list[np.ndarray]) -> float:
+    values = np.concatenate(parts) if parts else np.empty(0)
+    return float(100 * np.median(values)) if values.size else float("nan")

@@ -1,0 +1,253 @@
+"""Scores against the reference truth: known answers on scenes made by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+from climatenerf.errors import UserError
+from climatenerf.evaluation import baselines, geometry, weather_scores
+from climatenerf.evaluation.baselines import Dry
+from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
+from climatenerf.evaluation.reference import Truth, read_reference, world_rays
+from climatenerf.scene import Camera
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+ROAD, TERRAIN, LEAVES, SKY = 0, 9, 8, 10  # Cityscapes train ids
+
+
+def looking_down(height=2.0, pitch=-25.0):
+    a = np.deg2rad(pitch)
+    forward = np.array([0.0, np.cos(a), np.sin(a)])
+    right = np.array([1.0, 0.0, 0.0])
+    pose = np.eye(4)
+    pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(forward, right), forward
+    pose[:3, 3] = (0.0, 0.0, height)
+    return pose
+
+
+def sloped_ground(pose, rise=0.0, offset=0.0):
+    """Ray lengths to the plane z = offset + rise y."""
+    rays = world_rays(CAMERA, pose).astype(float)
+    fall = rays[..., 2] - rise * rays[..., 1]
+    with np.errstate(divide="ignore"):
+        t = (offset + rise * pose[1, 3] - pose[2, 3]) / fall
+    return np.where((fall < 0) & (t > 0), t, np.inf).astype(np.float32)
+
+
+def truth_of(rise=0.0, label=ROAD):
+    pose = looking_down()
+    depth = sloped_ground(pose, rise)
+    normal = np.array([0.0, -rise, 1.0]) / np.hypot(1, rise)
+    sky = np.isinf(depth)
+    return Truth(
+        "t01.jpg",
+        depth,
+        np.where(sky[..., None], 0.0, normal @ pose[:3, :3]),
+        np.where(sky, SKY, label).astype(np.uint8),
+        np.ones(depth.shape),
+        np.full((*depth.shape, 3), 0.5),
+        world_rays(CAMERA, pose).astype(float),
+        pose,
+    )
+
+
+def test_depth_errors_are_those_put_in():
+    truth = truth_of()
+    found = geometry.depth_scores([1.1 * truth.depth], (truth,))
+    assert found["depth_abs_rel"] == pytest.approx(0.1, rel=1e-4)
+    near = truth.depth[truth.depth < geometry.FARTHEST].astype(float)
+    assert found["depth_rmse_m"] == pytest.approx(0.1 * np.sqrt((near**2).mean()), rel=1e-4)
+    nothing = np.full_like(truth.depth, np.inf)
+    assert geometry.depth_scores([nothing], (truth,))["depth_abs_rel"] == pytest.approx(1.0)
+
+
+def test_normals_turned_by_ten_degrees_are_ten_degrees_off():
+    truth = truth_of()
+    a = np.deg2rad(10.0)
+    turn = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    found = geometry.normal_scores([truth.normal @ turn.T], (truth,))
+    assert found["normal_median_deg"] == pytest.approx(10.0, abs=1e-3)
+    assert found["normal_ground_roof_median_deg"] == pytest.approx(10.0, abs=1e-3)
+    leaves = truth_of(label=LEAVES)
+    found = geometry.normal_scores([leaves.normal @ turn.T], (leaves,))
+    assert np.isnan(found["normal_median_deg"]) and found["normal_all_median_deg"] > 9
+
+
+def test_a_roof_is_what_of_a_building_looks_up():
+    roof, wall = truth_of(rise=0.5, label=2), truth_of(label=2)
+    assert geometry.ground_or_roof(roof)[~roof.sky].all()
+    wall.normal[:] = [0.0, 0.0, -1.0]
+    assert not geometry.ground_or_roof(wall).any()
+    assert not geometry.ground_or_roof(truth_of(label=LEAVES)).any()
+
+
+def test_floaters_and_sky_are_counted_where_they_are():
+    truth = truth_of()
+    lost = np.where(truth.sky, 0.9, 0.25)
+    passed = np.where(truth.sky, 1.0, 0.0)
+    passed[0, :8] = 0.5
+    found = geometry.emptiness_scores([lost], [passed], (truth,))
+    assert found["floater_mass"] == pytest.approx(0.25)
+    assert truth.sky[0, :8].all()
+    assert found["sky_empty_fraction"] == pytest.approx(1 - 8 / truth.sky.sum())
+    free = geometry.free_space(truth)
+    assert (free[~truth.sky] < truth.depth[~truth.sky]).all() and np.isinf(free[truth.sky]).all()
+
+
+def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_distance():
+    truth = truth_of(rise=0.1)  # water at 0.3 m ends at y = 3
+    line, _ = weather_scores.crossings(truth.points, truth.points[..., 2] - 0.3)
+    np.testing.assert_allclose(line[:, 1], 3.0, atol=0.02)
+
+    def ours(level):
+        rays = truth.rays_d
+        t = (level - truth.c2w[2, 3]) / np.minimum(rays[..., 2], -1e-9)
+        wet = t < truth.depth
+        return {
+            "depth": np.where(wet, t, truth.depth),
+            "water_depth": np.where(wet, level - truth.points[..., 2], 0.0),
+            "mask_water": wet.astype(float),
+        }
+
+    right = weather_scores.waterline_scores([ours(0.3)], [truth.c2w], 0.3, (truth,), 0.3)
+    assert right["waterline_error_cm"] < 0.5 and right["water_iou"] == 1.0
+    # 2 cm too high on a slope of one in ten: the line lies 20 cm further.
+    high = weather_scores.waterline_scores([ours(0.32)], [truth.c2w], 0.32, (truth,), 0.3)
+    assert high["waterline_error_cm"] == pytest.approx(20.0, rel=0.05)
+    # 10 m is said where there is no line of ours at all.
+    dry = ours(0.3) | {"mask_water": np.zeros(truth.depth.shape), "depth": truth.depth + 50.0}
+    none = weather_scores.waterline_scores([dry], [truth.c2w], 0.3, (truth,), 0.3)
+    assert none["water_iou"] == 0.0
+
+
+def test_snow_too_thin_by_two_centimetres_is_two_centimetres_off():
+    truth = truth_of()
+    snowy = sloped_ground(truth.c2w, offset=0.15)
+    real = {"depth": snowy, "thickness": np.where(truth.sky, 0.0, 0.15)}
+    thin = {
+        "depth": sloped_ground(truth.c2w, offset=0.13),
+        "snow_thickness": np.where(truth.sky, 0.0, 0.13),
+        "mask_snow": (~truth.sky).astype(float),
+    }
+    found = weather_scores.snow_scores([thin], (truth,), [real], 1 / 50)
+    assert found["thickness_error_cm"] == pytest.approx(2.0, abs=1e-6)
+    assert found["snow_surface_error_cm"] == pytest.approx(2.0, rel=0.03)
+    assert found["snow_iou"] == 1.0 and found["true_thickness_cm"] == pytest.approx(15.0)
+    bare = thin | {"mask_snow": np.zeros(truth.depth.shape)}
+    assert weather_scores.snow_scores([bare], (truth,), [real], 1 / 50)["snow_iou"] == 0.0
+
+
+def test_classes_unknown_to_the_field_are_wrong():
+    truth = truth_of()
+    right = geometry.MERGED[truth.label]
+    found = geometry.label_scores([right], (truth,))
+    assert found["miou"] == 1.0 and set(found) == {"miou", "iou_road", "iou_sky"}
+    half = right.copy()
+    half[truth.sky] = 255
+    assert geometry.label_scores([half], (truth,))["iou_sky"] == 0.0
+
+
+def dry_view(rise=0.0):
+    truth = truth_of(rise)
+    red = np.linspace(0.1, 0.6, 64) * np.ones((48, 1))
+    linear = np.stack([red, 0.3 * np.ones_like(red), 0.2 * np.ones_like(red)], -1)
+    linear[truth.sky] = (0.5, 0.6, 0.9)
+    normal = truth.normal @ truth.c2w[:3, :3].T
+    return Dry(linear, truth.depth, normal, truth.rays_d, truth.c2w, CAMERA)
+
+
+def test_tuning_finds_the_constants_that_made_the_truth():
+    dry, colour = dry_view(), np.array([0.8, 0.7, 0.6])
+    foggy = baselines.display(baselines.depth_fog(dry, 0.1, colour))
+    found = baselines.tuned_sigma([dry], [np.round(255 * foggy).astype(np.uint8)], 0.05, colour)
+    assert found == pytest.approx(0.1, rel=0.1)
+    share = baselines.white_paint(dry)
+    assert share[~np.isinf(dry.depth)].min() > 0.99 and share[np.isinf(dry.depth)].max() < 1e-6
+    painted = baselines.display(baselines.painted(dry.linear, share, colour))
+    white = baselines.tuned_colour(
+        [dry.linear], [share], [np.round(255 * painted).astype(np.uint8)]
+    )
+    np.testing.assert_allclose(white, colour, atol=0.01)
+
+
+def test_a_screen_reflects_what_it_shows_and_its_sky():
+    """A wall beyond water: rays that leave the water for the wall find its colour."""
+    pose = looking_down(1.5, 0.0)
+    rays = world_rays(CAMERA, pose).astype(float)
+    with np.errstate(divide="ignore"):
+        ground = np.where(rays[..., 2] < 0, -1.5 / np.minimum(rays[..., 2], -1e-9), np.inf)
+    wall = 8.0 / rays[..., 1]
+    high = 1.5 + wall * rays[..., 2] > 2.5
+    depth = np.where(high, np.inf, np.minimum(ground, wall))
+    linear = np.where((wall < ground)[..., None], [0.7, 0.1, 0.1], [0.2, 0.2, 0.2])
+    linear[high] = (0.1, 0.2, 0.9)
+    dry = Dry(linear, depth, np.zeros_like(linear), rays, pose, CAMERA)
+    wet, t = baselines.wet_pixels(dry, 0.1)
+    assert wet.any() and (t[wet] < depth[wet]).all()
+    shown, part = baselines.screen_reflection(dry, 0.1, 1.333, np.zeros((48, 64, 2)))
+    column = 32
+    rows = np.flatnonzero(wet[:, column])
+    assert np.allclose(shown[rows[0], column], [0.7, 0.1, 0.1]), "just below the wall: the wall"
+    assert part[rows[0], column] > part[rows[-1], column], "more of it at grazing"
+    sky = [r for r in rows if np.allclose(shown[r, column], [0.1, 0.2, 0.9])]
+    assert sky and min(sky) > rows[0], "the sky above the wall mirrors nearer to the eye"
+
+
+def test_fresnel_of_the_baselines_is_the_textbooks():
+    angles = np.deg2rad([0.0, 30.0, 60.0, 75.0, 80.0, 85.0])
+    found = baselines.fresnel(np.cos(angles), 1.333)
+    np.testing.assert_allclose(found, [0.0204, 0.0214, 0.0597, 0.212, 0.348, 0.584], rtol=0.01)
+
+
+def frames_of(pattern, step=0.5):
+    """Two frames of a textured plane, taken `step` metres apart."""
+    out = []
+    for index in (0, 1):
+        pose = looking_down(3.0, -50.0)
+        pose[1, 3] = index * step
+        depth = sloped_ground(pose)
+        rays = world_rays(CAMERA, pose).astype(float)
+        place = pose[:3, 3] + depth[..., None] * rays
+        out.append(Frame(pattern(place, index), depth, np.zeros(depth.shape, bool), pose, CAMERA))
+    return out
+
+
+def waves(place, _):
+    x, y = place[..., 0], place[..., 1]
+    return np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.5 + 0 * x], -1)
+
+
+def test_frames_of_one_place_agree_and_noise_of_each_frame_does_not():
+    first, second = frames_of(waves)
+    assert warp_error(first, second) < 0.02
+    assert warp_error(first, first) < 1e-6
+    noisy = frames_of(lambda place, i: baselines.frame_noise(waves(place, i), i))
+    assert warp_error(*noisy) > 5 * warp_error(first, second)
+    apart = Frame(
+        second.picture, second.depth, np.ones(second.depth.shape, bool), second.c2w, CAMERA
+    )
+    assert np.isnan(warp_error(first, apart)), "all of it is water"
+
+
+def test_hidden_places_are_not_compared():
+    first, second = frames_of(waves)
+    blocked = Frame(
+        np.zeros_like(second.picture), 0.5 * second.depth, second.excluded, second.c2w, CAMERA
+    )
+    assert np.isnan(warp_error(first, blocked))
+
+
+def test_bilinear_meets_pixel_centres():
+    picture = np.random.default_rng(0).uniform(size=(5, 7, 3))
+    found = bilinear(picture, np.array([[2.5, 1.5], [3.0, 1.5]]))
+    np.testing.assert_allclose(found[0], picture[1, 2])
+    np.testing.assert_allclose(found[1], 0.5 * (picture[1, 2] + picture[1, 3]))
+
+
+def test_a_folder_that_is_no_reference_set_is_refused(tmp_path):
+    with pytest.raises(UserError, match="no reference set"):
+        read_reference(tmp_path)
+    (tmp_path / "reference.json").write_text(json.dumps({"schema_version": 1}))
+    with pytest.raises(UserError, match="damaged"):
+        read_reference(tmp_path)
