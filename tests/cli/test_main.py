@@ -1,5 +1,7 @@
 import errno
 import os
+import pty
+import signal
 import subprocess
 import sys
 import types
@@ -71,7 +73,7 @@ def test_no_verb_and_wrong_verbs(capsys):
     complaint = "climatenerf: there is no verb 'rendr'; did you mean render?\n"
     assert capsys.readouterr().err == complaint
     assert cli.main(["xyzzy"]) == 2
-    assert "use one of capture, fit, render, export, demo" in capsys.readouterr().err
+    assert "use one of capture, fit, render, evaluate, export, demo" in capsys.readouterr().err
 
 
 def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):
@@ -107,6 +109,80 @@ def test_expected_failures_are_one_line(verb, capsys, error, status, words):
     assert cli.main(["fit", "--scene", "a"]) == status
     err = capsys.readouterr().err
     assert words in err and len(err.strip().splitlines()) == 1 and "Traceback" not in err
+
+
+IN_A_TERMINAL = """
+import signal, sys, time, types
+from dataclasses import dataclass
+from climatenerf import cli
+from climatenerf.cli.progress import Bar
+@dataclass
+class Options:
+    pass
+def run(options):
+    with Bar("work", 1.0) as bar:
+        bar.update(0.5)
+        time.sleep(0.5)
+        print("READY", flush=True)
+        time.sleep(60)
+# Whoever began the tests may have asked for these to be ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+module = types.ModuleType("a_verb")
+module.Options, module.run = Options, run
+sys.modules["a_verb"] = module
+cli.VERBS["fit"] = cli.Verb("a_verb", "Options", "test")
+sys.exit(cli.main(["fit"]))
+"""
+
+
+def stopped_in_a_terminal(how):
+    """What a terminal shows of a verb that a signal ends, and the exit status."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-c", IN_A_TERMINAL],
+        stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm"},
+    )  # fmt: skip
+    os.close(theirs)
+    shown = b""
+    while True:
+        try:
+            more = os.read(ours, 4096)
+        except OSError:  # Linux's way to say that the other side is closed
+            break
+        if b"READY" in more and b"READY" not in shown:
+            process.send_signal(how)
+        shown += more
+        if not more:
+            break
+    os.close(ours)
+    return shown.decode(), process.wait(timeout=60)
+
+
+@pytest.mark.parametrize(
+    ("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+)
+def test_a_signal_leaves_the_terminal_as_it_was(how, status):
+    shown, left = stopped_in_a_terminal(how)
+    assert left == status and "Traceback" not in shown
+    assert "climatenerf: interrupted" in shown
+    assert "\x1b[?25l" in shown, "the bar hides the cursor"
+    assert shown.rfind("\x1b[?25h") > shown.rfind("\x1b[?25l"), "and it comes back"
+
+
+def test_signals_are_as_before_after_a_verb_and_an_ignored_one_stays_so(verb):
+    seen = []
+    verb.run = lambda options: seen.append([signal.getsignal(n) for n in numbers])
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(signal.SIGTERM, signal.SIG_DFL)]
+    before.append(signal.signal(signal.SIGHUP, signal.SIG_IGN))
+    try:
+        assert cli.main(["fit", "--scene", "a"]) == 0
+        assert callable(seen[0][0]) and seen[0][1] is signal.SIG_IGN
+        assert [signal.getsignal(n) for n in numbers] == [signal.SIG_DFL, signal.SIG_IGN]
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def test_a_defect_is_not_hidden(verb):

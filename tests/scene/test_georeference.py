@@ -6,7 +6,14 @@ import pytest
 from scene_builders import look_at, ring
 
 from climatenerf.scene import Camera, Scene, View
-from climatenerf.scene.georeference import apply_georeference, east_north, find_georeference
+from climatenerf.scene.georeference import (
+    Georeference,
+    Unused,
+    apply_georeference,
+    east_north,
+    find_georeference,
+    gps_note,
+)
 from climatenerf.scene.scale import scale_warnings
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
@@ -55,7 +62,7 @@ def test_scale_and_heading(tmp_path, noise):
     scene = scene_of(ring(24, radius=15.0), tmp_path)
     places = places_of(scene, 1.7, 2.1, noise)
     found = find_georeference(scene, places)
-    assert found is not None
+    assert isinstance(found, Georeference) and gps_note(found, {}) is None
     assert found.scale == pytest.approx(1.7, rel=max(1e-3, 3 * found.scale_error))
     assert found.scale_error < 0.06
     assert found.heading == pytest.approx(2.1, abs=max(1e-3, 3 * found.scale_error))
@@ -96,14 +103,14 @@ def drifting(scene, noise, correlation, seed):
 def test_the_error_is_honest_for_drift_and_for_few_photos(tmp_path, count, noise, correlation):
     scene = scene_of(ring(count, radius=20.0), tmp_path)
     found = [find_georeference(scene, drifting(scene, noise, correlation, s)) for s in range(80)]
-    ratio = [(f.scale - 1) / f.scale_error for f in found if f is not None]
+    ratio = [(f.scale - 1) / f.scale_error for f in found if isinstance(f, Georeference)]
     assert len(ratio) > 20 and np.sqrt(np.mean(np.square(ratio))) < 2.2
 
 
 def test_drift_as_large_as_the_path_is_not_believed(tmp_path):
     scene = scene_of(ring(48, radius=3.0), tmp_path)
     found = [find_georeference(scene, drifting(scene, 4.0, 0.95, seed)) for seed in range(60)]
-    assert np.mean([f is None for f in found]) > 0.8
+    assert np.mean([isinstance(f, Unused) for f in found]) > 0.8
 
 
 def test_a_fix_that_is_given_to_several_photos_is_one(tmp_path):
@@ -112,7 +119,7 @@ def test_a_fix_that_is_given_to_several_photos_is_one(tmp_path):
     names = [view.name for view in scene.views]
     lagging = {name: places[names[i // 4 * 4]] for i, name in enumerate(names)}
     found = find_georeference(scene, lagging)
-    assert found is not None and found.photos == 24
+    assert isinstance(found, Georeference) and found.photos == 24
     assert abs(found.scale - 1) < 3 * found.scale_error
     assert found.scale_error > 1.5 * find_georeference(scene, places).scale_error
 
@@ -124,22 +131,33 @@ def test_a_third_of_wild_fixes_does_no_harm(tmp_path):
         lat, lon, alt = places[f"{i}.png"]
         places[f"{i}.png"] = (lat + 0.002, lon - 0.001, alt)
     found = find_georeference(scene, places)
-    assert found is not None and found.scale == pytest.approx(1.3, rel=0.05)
+    assert isinstance(found, Georeference) and found.scale == pytest.approx(1.3, rel=0.05)
+    assert set(found.left_out) == {f"{i}.png" for i in range(8)} and found.photos == 16
+    note = gps_note(found, {"0.png": "IMG_0.HEIC"})
+    assert note is not None and "GPS of 8 of 24 photos" in note and "IMG_0.HEIC, 1.png, " in note
 
 
 def test_a_scale_that_is_known_better_is_kept(tmp_path):
     scene = scene_of(ring(24, radius=15.0), tmp_path)
     scene = replace(scene, scale_source="camera-height", scale_error=0.05)
     found = find_georeference(scene, places_of(scene, 1.7, 2.1))
-    assert found is not None
+    assert isinstance(found, Georeference)
     out = apply_georeference(scene, found, keep_scale=True)
     assert out.scale == pytest.approx(1.0) and out.scale_source == "camera-height"
     assert out.scale_report["gps"]["times"] == pytest.approx(1.7, rel=1e-3)
     assert scale_warnings(out) and "gps makes the scene 1.70 times" in scale_warnings(out)[0]
 
 
-@pytest.mark.parametrize("what", ["few", "one spot", "noise"])
-def test_gps_that_says_nothing_is_left_alone(tmp_path, what):
+@pytest.mark.parametrize(
+    ("what", "words"),
+    [
+        ("few", "GPS of 4 photos is of no use here: it names 4 different places, and 5"),
+        ("one spot", "GPS of 9 photos"),
+        ("noise", "GPS of 24 photos"),
+        ("lag", "GPS of 24 photos is of no use here: it names 1 different places"),
+    ],
+)
+def test_gps_that_says_nothing_is_left_alone_and_told_of(tmp_path, what, words):
     if what == "one spot":
         poses = [look_at((0, 0, 1.6), (math.cos(t), math.sin(t), 1.6)) for t in range(9)]
     else:
@@ -148,4 +166,12 @@ def test_gps_that_says_nothing_is_left_alone(tmp_path, what):
     places = places_of(scene, 1.0, 0.0, 8.0 if what == "noise" else 0.0)
     if what == "few":
         places = dict(list(places.items())[:4])
-    assert find_georeference(scene, places) is None
+    if what == "lag":
+        places = dict.fromkeys(places, places["0.png"])
+    found = find_georeference(scene, places)
+    assert isinstance(found, Unused) and str(gps_note(found, {})).startswith(words)
+
+
+def test_no_gps_is_nothing_to_tell_of(tmp_path):
+    found = find_georeference(scene_of(ring(9), tmp_path), {})
+    assert isinstance(found, Unused) and gps_note(found, {}) is None

@@ -16,6 +16,7 @@ from PIL import Image
 from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.export import export_colmap
+from climatenerf.sfm.scene_folder import FORMER, RECORD
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
 
@@ -98,6 +99,204 @@ def test_what_is_read_may_not_lie_where_is_written(posed, capsys, what):
     assert "choose another folder" in capsys.readouterr().err and everything(out) == before
 
 
+def test_what_the_user_puts_into_a_scene_stays_and_is_used(posed, capsys):
+    out = posed / "scene"
+    assert capture(posed, out, "--labels", STREET / "labels") == 0
+    first, second = (view.name for view in load_scene(out).views[:2])
+    mine = {
+        out / "labels" / "more" / "notes.txt": b"mine",
+        (out / "labels" / second).with_suffix(".png"): None,  # in the place of capture's
+        (out / "masks" / first).with_suffix(".png"): None,
+        out / "depth" / f"{first}.npy": b"mine",
+        out / "readme.txt": b"mine",
+        out / "marks.toml": b"",
+    }
+    for path, content in mine.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if content is None:
+            Image.new("L", (384, 216), 10).save(path)
+        else:
+            path.write_bytes(content)
+    kept = {path: path.read_bytes() for path in mine}
+    for words in ((), ("--camera-height", "1.7 m"), ()):
+        assert capture(posed, out, *words) == 0
+        assert {path: path.read_bytes() for path in mine} == kept
+        assert f"Files of yours stay in {out / 'masks'}: 1 (masks/" in capsys.readouterr().err
+    used = {view.name: view for view in read_scene(out).views}
+    assert used[first].mask_path is not None
+    assert used[second].label_path is not None
+    assert used[first].label_path is None, "the one that capture made is gone"
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "told"),
+    [
+        ("images/extra.jpg", (), "is not capture's"),
+        ("images/0000.jpg", (), "was changed since"),
+        ("sparse/1/notes.txt", (), "is not capture's"),
+        ("report.md", (), "was changed since"),
+        ("labels", (), "is not capture's"),
+        ("labels/mine.png", ("--labels", STREET / "labels"), "is yours"),
+    ],
+)
+def test_what_would_be_lost_is_named_before_any_work(posed, capsys, name, words, told):
+    out = posed / "scene"
+    assert capture(posed, out) == 0
+    name = name.replace("0000.jpg", load_scene(out).views[0].name)
+    (out / name).parent.mkdir(exist_ok=True)
+    (out / name).write_bytes(b"mine")
+    before = everything(out)
+    capsys.readouterr()
+    assert capture(posed, out, *words) == 2
+    err = capsys.readouterr().err
+    assert told in err and str(out / name) in err and len(err.strip().splitlines()) == 1
+    assert everything(out) == before
+
+
+def test_what_comes_while_capture_works_is_not_lost_either(posed, capsys, monkeypatch):
+    from climatenerf.sfm import report
+
+    out = posed / "scene"
+    assert capture(posed, out) == 0
+    before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    real = report.write_report
+
+    def meanwhile(*arguments):
+        (out / "images" / "late.jpg").write_bytes(b"mine")
+        return real(*arguments)
+
+    monkeypatch.setattr(report, "write_report", meanwhile)
+    assert capture(posed, out) == 2
+    assert "late.jpg is not capture's" in capsys.readouterr().err
+    after = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    assert after == {**before, "images/late.jpg": b"mine"}
+
+
+def test_a_record_without_a_list_is_read_with_care(posed, capsys):
+    out = posed / "scene"
+    assert capture(posed, out, "--labels", STREET / "labels") == 0
+    (out / RECORD).unlink()
+    (out / "work" / FORMER).write_text('{"places": ["images"]}')
+    mine = out / "labels" / "mine.png"
+    Image.new("L", (384, 216), 10).save(mine)
+    assert capture(posed, out) == 0
+    assert [path.name for path in (out / "labels").iterdir()] == ["mine.png"]
+    (out / RECORD).unlink()
+    (out / "images" / "extra.jpg").write_bytes(b"mine")
+    assert capture(posed, out) == 2
+    assert "extra.jpg is not capture's" in capsys.readouterr().err
+
+
+def test_the_work_folder_may_be_deleted_and_a_scene_moved(posed):
+    out = posed / "scene"
+    assert capture(posed, out) == 0
+    shutil.rmtree(out / "work")
+    assert capture(posed, out) == 0
+    assert json.loads((out / "scene.json").read_text())["root_absolute"] == str(out)
+    shutil.copytree(out, posed / "copy", copy_function=shutil.copyfile)  # other times
+    assert capture(posed, posed / "copy") == 0
+
+
+def test_stopped_while_a_scene_takes_its_place(posed, monkeypatch):
+    from climatenerf.sfm import scene_folder
+
+    out = posed / "scene"
+    assert capture(posed, out) == 0
+    real, moved = os.replace, []
+
+    def stopped(source, target):
+        if Path(source).parent.name == "new":
+            moved.append(source)
+            if len(moved) == 3:
+                raise KeyboardInterrupt
+        real(source, target)
+
+    monkeypatch.setattr(scene_folder.os, "replace", stopped)
+    assert capture(posed, out, "--camera-height", "1.7 m") == 130
+    monkeypatch.undo()
+    assert capture(posed, out) == 0 and len(load_scene(out).views) == 6
+
+
+def marks_file(path, picture="0001.jpg", pixel=(10, 20)):
+    """Marks of a length D in two pictures."""
+    lines = [f'[D.{end}]\n"{picture}" = {list(pixel)}\n"0002.jpg" = [1, 2]\n' for end in
+             ("from", "to")]  # fmt: skip
+    path.write_text("".join(lines))
+    return path
+
+
+@pytest.mark.parametrize(("picture", "pixel"), [("nowhere.jpg", (1, 2)), (None, (5000, 2))])
+def test_marks_that_cannot_be_used_leave_a_finished_scene(posed, capsys, picture, pixel):
+    out = posed / "scene"
+    assert capture(posed, out, "--camera-height", "1.7 m") == 0
+    name = picture or load_scene(out).views[0].name
+    marks = marks_file(posed / "marks.toml", name, pixel)
+    before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    assert capture(posed, out, "--known-length", "D=2 m", "--marks", marks) == 2
+    err = capsys.readouterr().err
+    assert "stays as it was" in err and "poses are kept" not in err
+    assert {k: v for k, v in everything(out).items() if not k.startswith("work/")} == before
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("DOOR", "a name and a length"), ("DOOR=2", "no unit"), ("DOOR=-2 m", "above 0"),
+     ("DOOR=2 kg", "a length"), ("", "a name and a length"), ("=2 m", "wants a name"),
+     ("DOOR=2 m", "run this once without --known-length")],
+)  # fmt: skip
+def test_known_lengths_are_looked_at_first(posed, capsys, text, told):
+    assert status("capture", posed / "absent", "-o", posed / "scene", "--known-length", text) == 2
+    err = capsys.readouterr().err
+    assert told in err and len(err.strip().splitlines()) == 1
+    assert not (posed / "scene").exists()
+
+
+def test_the_scale_that_is_assumed_names_flags_that_there_are(posed, capsys):
+    assert capture(posed, posed / "scene") == 0
+    err = capsys.readouterr().err
+    assert "give --camera-height or --known-length" in err and "--metric-input" not in err
+
+
+def test_gps_that_is_of_no_use_is_told_of(posed, capsys):
+    for path in (posed / "photos").iterdir():
+        data = exif(place=(47.3769, 8.5417, 400.0))
+        Image.open(path).convert("RGB").save(path, format="JPEG", quality=95, exif=data)
+    assert capture(posed, posed / "scene") == 0
+    told = "GPS of 6 photos is of no use here"
+    assert told in capsys.readouterr().err and told in (posed / "scene" / "report.md").read_text()
+
+
+def test_a_picture_that_does_not_fit_is_named_as_the_users(posed, capsys):
+    first = sorted((posed / "photos").iterdir())[0]
+    Image.new("RGB", (100, 100)).save(first, format="JPEG")
+    assert capture(posed, posed / "scene") == 2
+    err = capsys.readouterr().err
+    assert str(first) in err and "work/new" not in err
+
+
+@pytest.mark.parametrize("what", ["nothing", "too few", "no model", "no video"])
+def test_refused_input_leaves_no_folder(posed, capsys, what):
+    (posed / "in").mkdir()
+    given = [posed / "in"]
+    if what == "too few":
+        photo(posed / "in" / "a.jpg")
+    elif what == "no model":
+        (posed / "none").mkdir()
+        given = [posed / "photos", "--from-colmap", posed / "none"]
+    elif what == "no video":
+        given = [posed / "in" / "walk.mp4"]
+        given[0].write_bytes(b"no video" * 100)
+    assert status("capture", *given, "-o", posed / "out") == 2
+    err = capsys.readouterr().err
+    assert "Traceback" not in err and not (posed / "out").exists()
+
+
+def test_a_scene_folder_that_is_a_link_to_nowhere(posed, capsys):
+    (posed / "out").symlink_to("absent")
+    assert capture(posed, posed / "out") == 2
+    assert "is a link to absent, which does not exist" in capsys.readouterr().err
+
+
 def test_a_run_that_fails_leaves_the_scene_as_it_was(posed, tmp_path, capsys):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
@@ -172,6 +371,10 @@ def test_a_scene_among_the_photos_does_not_count_as_photos(posed, capsys):
     for _ in range(2):
         assert capture(posed, out) == 0
         assert "6 of 6 pictures" in capsys.readouterr().out
+    assert capture(posed, posed / "photos" / "another") == 0
+    told = capsys.readouterr()
+    assert "6 of 6 pictures" in told.out
+    assert "Scenes among the photos are left out: scene." in told.err
 
 
 def test_export_overwrites_no_points(posed, capsys):
@@ -217,13 +420,17 @@ def sfm(photos, out):
     return status("capture", photos, "-o", out, "--features", "2048")
 
 
-def test_strange_names_and_two_runs_alike(tmp_path, capsys):
+def test_strange_names_and_two_runs_alike(tmp_path, capsys, monkeypatch):
     photos = fitting_photos(tmp_path / "in")
     (photos / "broken.jpg").symlink_to("nowhere")
     (photos / os.fsdecode(b"caf\xe9.jpg")).write_bytes(b"no picture")
     poses, verified = [], []
-    for out in (tmp_path / "a", tmp_path / "b"):
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    for out in (tmp_path / "a", tmp_path / "b #1?x=%20y"):
         assert sfm(photos, out) == 0
+        assert not list(here.iterdir()), "no stray file in the folder where one works"
         told = capsys.readouterr()
         assert "broken.jpg is left out" in told.err and "Traceback" not in told.err
         poses.append({view.name: view.c2w for view in load_scene(out).views})

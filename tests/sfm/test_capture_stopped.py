@@ -64,7 +64,9 @@ def test_a_folder_that_cannot_be_written(photos, tmp_path):
     assert done.returncode == 2 and "is a file" in done.stderr
 
 
-@pytest.mark.parametrize(("how", "status"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("how", "status"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 143)]
+)
 def test_killed_in_the_middle_and_run_again(tmp_path, how, status):
     photos = some_photos(tmp_path / "photos", 14)
     command = [*CAPTURE, str(photos), "-o", str(tmp_path / "scene")]
@@ -77,6 +79,7 @@ def test_killed_in_the_middle_and_run_again(tmp_path, how, status):
     process.send_signal(how)
     _, told = process.communicate(timeout=60)
     assert process.returncode == status and "Traceback" not in told
+    assert ("climatenerf: interrupted" in told) == (how != signal.SIGKILL)
     for _ in range(100):
         if not others(tmp_path):
             break

@@ -2,12 +2,13 @@ import sqlite3
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from climatenerf.sfm.diagnose import diagnose, turned_only, verified_matches
 from climatenerf.sfm.exif import Exif
 from climatenerf.sfm.intake import Intake, Picture
-from climatenerf.sfm.reconstruct import groups_of
+from climatenerf.sfm.reconstruct import _names, groups_of
 
 PAIR = 2147483647
 
@@ -34,24 +35,41 @@ def database(path, pairs):
 def test_each_reason(tmp_path):
     pairs = {
         ("a", "b"): 500, ("soft", "a"): 12, ("dark", "a"): 3, ("lone", "b"): 9,
-        ("far1", "far2"): 200, ("odd", "a"): 90,
+        ("far1", "far2"): 200, ("odd", "a"): 90, ("plain", "b"): 4,
     }  # fmt: skip
     path = database(tmp_path / "d.db", pairs)
     assert verified_matches(path)["a.jpg", "b.jpg"] == 500
     pictures = (
-        picture("a"), picture("b"), picture("soft", sharp=10), picture("dark", bright=0.03),
+        picture("a"), picture("b"), picture("soft", sharp=5), picture("dark", bright=0.03),
         picture("lone"), picture("far1"), picture("far2"), picture("odd"),
+        picture("plain", sharp=20),
     )  # fmt: skip
     lost = diagnose(Intake(tmp_path, pictures, {}, False), ("a.jpg", "b.jpg"), path)
     reasons = {one.name.removesuffix(".jpg"): one for one in lost}
-    assert set(reasons) == {"soft", "dark", "lone", "far1", "far2", "odd"}
-    assert "blurred (10%" in reasons["soft"].reason and "still" in reasons["soft"].remedy
+    assert set(reasons) == {"soft", "dark", "lone", "far1", "far2", "odd", "plain"}
+    # Sharp, but of a subject with less detail: not called blurred.
+    assert "few matches" in reasons["plain"].reason and "20%" in reasons["plain"].reason
+    assert "blurred" not in reasons["plain"].reason
+    assert "blurred (5%" in reasons["soft"].reason and "still" in reasons["soft"].remedy
     assert "dark" in reasons["dark"].reason and "exposure" in reasons["dark"].remedy
     assert "too little in common" in reasons["lone"].reason and "b.HEIC" in reasons["lone"].reason
     assert "cut off" in reasons["far1"].reason and "far2.HEIC" in reasons["far1"].reason
     assert "ambiguous" in reasons["odd"].reason
     assert reasons["far2"].neighbours == (("far1.jpg", 200),)
     assert reasons["soft"].source == "soft.HEIC"
+
+
+@pytest.mark.parametrize("name", ["a#b", "what?", "50%20off"])
+def test_a_folder_whose_name_an_address_would_read_otherwise(tmp_path, monkeypatch, name):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    (tmp_path / name).mkdir()
+    path = database(tmp_path / name / "d.db", {("a", "b"): 500})
+    assert verified_matches(path) == {("a.jpg", "b.jpg"): 500}
+    assert sorted(_names(path)) == ["a.jpg", "b.jpg"]
+    intake = flat_pairs(tmp_path / name / "flat.db", plane_maps(0.0))
+    assert turned_only(*intake)
+    assert not list((tmp_path / "here").iterdir())
 
 
 def flat_pairs(path, maps, general=0):

@@ -105,6 +105,14 @@ def test_what_is_no_picture_is_left_out_with_the_reason(tmp_path):
     assert len(taken.pictures) == 4
     assert set(taken.unusable) == {"text.png", "empty.jpg", "cut.jpg"}
     assert "empty" in taken.unusable["empty.jpg"]
+    assert "is no picture" in taken.unusable["text.png"]
+    assert "damaged or cut off" in taken.unusable["cut.jpg"]
+    (tmp_path / "in" / "gone.jpg").symlink_to("nowhere")
+    (tmp_path / "in" / "folder.jpg").mkdir()
+    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    assert "link to a file that is not there" in taken.unusable["gone.jpg"]
+    for words in taken.unusable.values():
+        assert "<" not in words and "Errno" not in words
 
 
 @pytest.mark.parametrize("count", [0, 2])
@@ -186,7 +194,7 @@ def test_a_video_that_cannot_be_decoded(tmp_path):
     with pytest.raises(UserError, match="cannot be decoded"):
         take_in(tmp_path / "bad.mp4", tmp_path / "work", quiet)
     (tmp_path / "song.mp3").write_bytes(b"x")
-    with pytest.raises(UserError, match="neither"):
+    with pytest.raises(UserError, match="neither .*; give the folder"):
         take_in(tmp_path / "song.mp3", tmp_path / "work", quiet)
     with pytest.raises(UserError, match="does not exist"):
         take_in(tmp_path / "absent", tmp_path / "work", quiet)

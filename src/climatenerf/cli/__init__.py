@@ -4,12 +4,15 @@ Each verb is a module of this package with a torch-free options dataclass and a 
 Only the module of the verb that was asked for is imported, so that help is quick.
 """
 
+import contextlib
 import difflib
 import errno
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import climatenerf
@@ -59,18 +62,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after the program's name; None takes those of this process.
 
     Returns:
-        Exit status: 0, 2 after a mistake that the user can mend, 130 after Ctrl-C.
+        Exit status: 0, 2 after a mistake that the user can mend, 130 after Ctrl-C, 143 and 129
+        after the signals of `kill` and of a terminal that is closed.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        status = _run(words)
+        with _stopped_like_ctrl_c():
+            status = _run(words)
         sys.stdout.flush()  # here, where a reader that has gone is dealt with
         return status
     except UserError as error:
         return _complain(str(error))
-    except KeyboardInterrupt:
-        sys.stderr.write("\nclimatenerf: interrupted\n")
-        return 130
+    except KeyboardInterrupt as stop:
+        with contextlib.suppress(OSError):  # the terminal may be what has gone
+            sys.stderr.write("\nclimatenerf: interrupted\n")
+        return 128 + (stop.args[0] if stop.args else signal.SIGINT)
     except BrokenPipeError:
         # The reader (`| head`) has gone; a second complaint at exit is avoided by closing.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -82,6 +88,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and error.filename:
             return _complain(f"{error.filename} may not be read or written; change its permissions")
         raise
+
+
+@contextlib.contextmanager
+def _stopped_like_ctrl_c() -> Iterator[None]:
+    """Lets `kill` and a closed terminal end a verb as Ctrl-C does: tidily and with a word."""
+    taken = []
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):  # Windows lacks the second
+            number = getattr(signal, name, None)
+            # What is ignored (nohup) or somebody else's stays so.
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                signal.signal(number, _stop)
+                taken.append(number)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _stop(number: int, frame: object) -> None:
+    raise KeyboardInterrupt(number)
 
 
 def _run(words: list[str]) -> int:

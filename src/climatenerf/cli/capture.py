@@ -3,6 +3,8 @@
 import os
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -10,23 +12,40 @@ from typing import Annotated
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.fit import check_known_lengths, frame_line, with_known_lengths
+from climatenerf.cli.fit import (
+    check_known_lengths,
+    frame_line,
+    parse_known_lengths,
+    with_known_lengths,
+)
 from climatenerf.errors import UserError
-from climatenerf.scene import Camera, Scene, load_scene, read_scene, save_scene
+from climatenerf.scene import Camera, Scene, read_scene, save_scene
 from climatenerf.scene.colmap import read_colmap
-from climatenerf.scene.georeference import apply_georeference, find_georeference
+from climatenerf.scene.georeference import (
+    Georeference,
+    apply_georeference,
+    find_georeference,
+    gps_note,
+)
 from climatenerf.scene.images import picture_header
 from climatenerf.scene.known_length import FILE_NAME as MARKS
-from climatenerf.scene.scale import by_depth, scale_warnings, with_witness
-from climatenerf.storage import explain, make_folder, write_json
+from climatenerf.scene.scale import (
+    by_depth,
+    scale_warnings,
+    with_capture_remedies,
+    with_witness,
+)
+from climatenerf.scene.scene import FILE_NAME as SCENE
+from climatenerf.sfm.scene_folder import (
+    KINDS,
+    WORK,
+    begin,
+    check_place,
+    leave,
+    take_place,
+)
+from climatenerf.storage import explain, make_folder
 from climatenerf.weather.units import OptionalLength
-
-WORK = "work"  # folder in the scene: may be deleted when all is well
-MADE = "made-by-capture.json"  # in it: what bears our names beside it is ours
-PLACES = (
-    "images", "sparse", "labels", "masks", "depth", "scene.json", "points.ply", "points_seen.npz",
-    "report.md", "report.png", "mark.html",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -60,32 +79,27 @@ class Capture:
 def run(options: Capture) -> int:
     """Takes pictures in, finds poses, levels the scene and says what came of it."""
     check(options)
-    from climatenerf.sfm.mark_page import write_mark_page
-    from climatenerf.sfm.report import write_report
-
+    finished, fresh = (options.out / SCENE).is_file(), not os.path.lexists(options.out)
     new = begin(options.out)
-    find = poses_of_colmap if options.from_colmap else poses_by_motion
-    intake, model, lost = find(options, new)
-    scene = with_files(options, in_metres(options, new, intake), intake, model)
-    refused = None
     try:
-        scene = with_known_lengths(scene, options.known_length, options.marks or marks_of(options))
-    except UserError as error:
-        refused = error  # the poses are worth keeping, and the page is needed to make marks
-    told = dict.fromkeys((*scene.warnings, *scale_warnings(scene)))
-    scene = replace(scene, warnings=tuple(told))
-    save_scene(scene, new)
-    write_mark_page(new / "mark.html", scene)
-    write_report(new, scene, intake, model, lost)
-    take_place(options.out, new)
-    save_scene(load_scene(options.out), options.out)  # now it knows where it is
+        scene, model, lost, refused = make_scene(options, new, finished)
+    except UserError:
+        leave(options.out, fresh)
+        raise
+    kept = take_place(options.out, new, given_kinds(options))
+    for kind in KINDS:
+        if mine := [path for path in kept if path.startswith(f"{kind}/")]:
+            progress.say(f"Files of yours stay in {options.out / kind}: {listed(mine)}.")
     for warning in scene.warnings:
         progress.warn(warning)
     progress.say(frame_line(scene))
     for one in lost:
         progress.warn(f"{one.source} has no pose: {one.reason}; {one.remedy}")
     if refused is not None:
-        raise UserError(f"{refused} (poses are kept in {options.out}, without this length)")
+        raise UserError(
+            f"{refused} (poses are kept in {options.out}, with the scale from"
+            f" {scene.scale_source} and without this length)"
+        )
     error = model.reprojection_error
     progress.result(
         f"{len(scene.views)} of {len(scene.views) + len(lost)} pictures have poses"
@@ -97,12 +111,79 @@ def run(options: Capture) -> int:
     return 0
 
 
+def make_scene(options: Capture, new: Path, finished: bool):
+    """Makes the whole scene in a folder of its own.
+
+    Args:
+        options: of the verb.
+        new: the folder.
+        finished: whether there is a scene already, which is better than one without its length.
+
+    Returns:
+        The scene, the model, the pictures without pose, and why known lengths could not be used.
+
+    Raises:
+        UserError: there is no scene to be made of this.
+    """
+    from climatenerf.sfm.mark_page import write_mark_page
+    from climatenerf.sfm.report import write_report
+
+    find = poses_of_colmap if options.from_colmap else poses_by_motion
+    intake, model, lost = find(options, new)
+    with naming_photos(options, new):
+        scene = with_files(options, in_metres(options, new, intake), intake, model)
+    refused = None
+    try:
+        scene = with_known_lengths(scene, options.known_length, options.marks or marks_of(options))
+    except UserError as error:
+        if finished:
+            raise UserError(f"{error} (the scene in {options.out} stays as it was)") from error
+        refused = error  # the poses are worth keeping, and the page is needed to make marks
+    told = dict.fromkeys((*scene.warnings, *scale_warnings(scene)))
+    scene = replace(scene, warnings=tuple(told))
+    save_scene(scene, new)
+    write_mark_page(new / "mark.html", scene)
+    write_report(new, scene, intake, model, lost)
+    return scene, model, lost, refused
+
+
+def listed(paths: list[str]) -> str:
+    """How many there are and the first few."""
+    return f"{len(paths)} ({', '.join(paths[:3])}{', ...' if len(paths) > 3 else ''})"
+
+
+@contextmanager
+def naming_photos(options: Capture, new: Path) -> Iterator[None]:
+    """Lets errors name the user's photos where pictures are copies of them."""
+    try:
+        yield
+    except UserError as error:
+        if options.from_colmap is None:
+            raise
+        copies = str(new.absolute() / "images")
+        raise UserError(str(error).replace(copies, str(options.photos))) from error
+
+
+def given_kinds(options: Capture) -> list[str]:
+    """Which of labels, masks and depths the user gives a folder for."""
+    return [kind for kind in KINDS if getattr(options, kind) is not None]
+
+
+def no_photos(options: Capture) -> list[Path]:
+    """Folders whose pictures are not the photos to pose."""
+    return [options.out, *(getattr(options, kind) for kind in given_kinds(options))]
+
+
 def check(options: Capture) -> None:
     """What can be known to be wrong before anything is done.
 
     Raises:
         UserError: a flag out of its range, a folder that is absent, or files in the way.
     """
+    from climatenerf.sfm.photos import find_photos, is_video
+    from climatenerf.sfm.reconstruct import require_pycolmap
+
+    check_lengths(options)
     if not 64 <= options.features <= 32768:
         raise UserError(f"--features must lie between 64 and 32768; got {options.features}")
     if not 0 <= options.seed < 2**31:
@@ -111,23 +192,46 @@ def check(options: Capture) -> None:
         raise UserError(f"--camera-height must be above 0; got {options.camera_height:g} m")
     if not options.photos.exists():
         raise UserError(f"{options.photos} does not exist; give a folder of photos or a video")
-    for kind in ("labels", "masks", "depth"):
+    for kind in given_kinds(options):
         folder = getattr(options, kind)
-        if folder is not None and not (folder.is_dir() and any(folder.iterdir())):
+        if not (folder.is_dir() and any(folder.iterdir())):
             raise UserError(f"--{kind} {folder} is no folder with files; give the folder of them")
+    if options.out.is_symlink() and not options.out.exists():
+        raise UserError(
+            f"{options.out} is a link to {os.readlink(options.out)}, which does not exist; make"
+            " that folder, or choose another with -o"
+        )
     out = options.out.resolve()
-    for name in ("photos", "labels", "masks", "depth", "from_colmap"):
+    for name in ("photos", *KINDS, "from_colmap"):
         path = getattr(options, name)
         if path is not None and path.resolve().is_relative_to(out):
             raise UserError(f"{path} lies in {options.out}; choose another folder with -o")
+    check_place(options.out, given_kinds(options))
+    if options.from_colmap is None:
+        require_pycolmap()
+        if not is_video(options.photos):
+            find_photos(options.photos, no_photos(options))
+
+
+def check_lengths(options: Capture) -> None:
+    """What is wrong with known lengths and their marks, as far as it shows without a scene.
+
+    Raises:
+        UserError: lengths or marks that cannot be used.
+    """
+    for name, metres in parse_known_lengths(options.known_length):
+        if not name:
+            raise UserError(
+                f'--known-length wants a name before the length, "DOOR={metres:g} m"; give the name'
+                " that the marks have"
+            )
+    marks = options.marks or marks_of(options)
+    if options.known_length and not (marks.exists() or (options.out / SCENE).exists()):
+        raise UserError(
+            f"{marks} does not exist, and marks are made in a scene's pictures: run this once"
+            f" without --known-length, then open {options.out / 'mark.html'}"
+        )
     check_known_lengths(options.known_length, options.marks, marks_of(options))
-    if (options.out / WORK).is_symlink() or not (options.out / WORK / MADE).is_file():
-        for name in (*PLACES, WORK):
-            if (options.out / name).exists() or (options.out / name).is_symlink():
-                raise UserError(
-                    f"{options.out} already holds {name}, which no earlier capture made; choose"
-                    " another folder with -o"
-                )
 
 
 def marks_of(options: Capture) -> Path:
@@ -135,49 +239,19 @@ def marks_of(options: Capture) -> Path:
     return options.out / MARKS
 
 
-def begin(out: Path) -> Path:
-    """The folder in which the scene is made before it takes its place, empty.
-
-    A record in the work folder says that what bears our names here is ours.
-    """
-    work = make_folder(out / WORK)
-    write_json(work / MADE, {"places": PLACES})
-    new = work / "new"
-    shutil.rmtree(new, ignore_errors=True)
-    return make_folder(new)
-
-
-def take_place(out: Path, new: Path) -> None:
-    """Moves a finished scene to its place; what an earlier capture made goes.
-
-    Raises:
-        UserError: a file cannot be moved.
-    """
-    try:
-        for name in PLACES:
-            old, fresh = out / name, new / name
-            if old.is_dir() and not old.is_symlink():
-                shutil.rmtree(old)
-            else:
-                old.unlink(missing_ok=True)
-            if fresh.exists():
-                os.replace(fresh, old)
-        shutil.rmtree(new, ignore_errors=True)
-    except OSError as error:
-        raise explain(error, out) from error
-
-
 def poses_by_motion(options: Capture, new: Path):
     """The pictures, their poses by structure from motion, and those without with the reason."""
     from climatenerf.sfm.diagnose import diagnose
     from climatenerf.sfm.intake import take_in
-    from climatenerf.sfm.reconstruct import DATABASE, require_pycolmap
+    from climatenerf.sfm.reconstruct import DATABASE
     from climatenerf.sfm.worker import reconstruct_apart
 
-    require_pycolmap()  # its absence is to be known before anything is done
     work = options.out / WORK
     with progress.Bar("pictures", 1.0) as bar:
-        intake = take_in(options.photos, work, lambda done, total: bar.update(done / total))
+        besides = no_photos(options)
+        intake = take_in(options.photos, work, lambda n, all: bar.update(n / all), besides)
+    for note in intake.notes:
+        progress.say(note)
     for name, reason in intake.unusable.items():
         progress.warn(f"{name} is left out: {reason}")
     flat = new / "flat"
@@ -204,7 +278,10 @@ def poses_of_colmap(options: Capture, new: Path):
 
     assert options.from_colmap is not None
     with Stages() as tell:
-        return take_posed(options.photos, options.from_colmap, new, options.out, tell)
+        found = take_posed(options.photos, options.from_colmap, new, no_photos(options), tell)
+    for note in found[0].notes:
+        progress.say(note)
+    return found
 
 
 def in_metres(options: Capture, new: Path, intake) -> Scene:
@@ -220,9 +297,13 @@ def in_metres(options: Capture, new: Path, intake) -> Scene:
             if down is not None:
                 gravity[view.name] = down
     scene = read_scene(new, camera_height=options.camera_height, gravity=gravity)
+    scene = with_capture_remedies(scene)
     places = {name: exif.place for name, exif in known.items() if exif.place is not None}
     found = find_georeference(scene, places)
-    if found is None:
+    note = gps_note(found, {picture.name: picture.source for picture in intake.pictures})
+    if note is not None:
+        scene = replace(scene, warnings=(*scene.warnings, note))
+    if not isinstance(found, Georeference):
         return scene
     return apply_georeference(scene, found, keep_scale=options.camera_height is not None)
 
@@ -246,10 +327,8 @@ def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
         )
         for view in scene.views
     }
-    for kind in ("labels", "masks", "depth"):
-        folder = getattr(options, kind)
-        if folder is not None:
-            scene = bring_along(scene, kind, folder, photos)
+    for kind in given_kinds(options):
+        scene = bring_along(scene, kind, getattr(options, kind), photos)
     if options.depth is None:
         return scene
     said = by_depth(scene)

@@ -1,6 +1,7 @@
 """Scale, heading and place from where photos say that they were taken (GPS)."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ LEAST_ERROR = 0.005  # of the scale: the map's and the fit's own
 EXACT = 0.005  # of the extent: residuals below are not looked at for correlation
 LEAST_INDEPENDENT = 4.0  # fixes
 WORST_SCALE = 0.2  # relative standard error from which GPS says nothing of use
+NAMED = 3  # photos, in a sentence about several
 # WGS 84 (EPSG:4326): equatorial radius, m, and first eccentricity squared.
 RADIUS, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
 
@@ -31,6 +33,7 @@ class Georeference:
         origin: latitude and longitude, degrees, of the frame's origin.
         spread: robust standard deviation of a GPS coordinate from its photo's, m.
         photos: number of photos used.
+        left_out: names of the photos whose places are too far off to be used.
     """
 
     scale: float
@@ -40,6 +43,20 @@ class Georeference:
     origin: tuple[float, float]
     spread: float
     photos: int
+    left_out: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Unused:
+    """GPS that tells nothing of a scene.
+
+    Attributes:
+        photos: number of photos that know their place.
+        reason: why that is not enough, as a clause.
+    """
+
+    photos: int
+    reason: str
 
 
 def east_north(
@@ -59,7 +76,7 @@ def east_north(
 
 def find_georeference(
     scene: Scene, places: dict[str, tuple[float, float, float]]
-) -> Georeference | None:
+) -> Georeference | Unused:
     """Fits a level similarity from the scene's camera positions to their GPS places.
 
     Up stays as it is: GPS heights are worse than the vertical lines of a picture. Robust, since a
@@ -70,11 +87,13 @@ def find_georeference(
         places: latitude, longitude (degrees) and altitude (m) by picture name.
 
     Returns:
-        None where fewer than five photos know their place or they lie too close together.
+        Why it says nothing where fewer than five photos know their place, they lie too close
+        together or the places are too inexact.
     """
-    own, where = _fixes(scene, places)
+    own, where, names = _fixes(scene, places)
+    photos = sum(map(len, names))
     if len(own) < FEWEST:
-        return None
+        return Unused(photos, f"it names {len(own)} different places, and {FEWEST} are needed")
     origin = np.median(where, axis=0)
     flat = east_north(where, origin)
     target, source = flat[:, 0] + 1j * flat[:, 1], own[:, 0] + 1j * own[:, 1]
@@ -86,12 +105,17 @@ def find_georeference(
     exact = float(np.abs(away).max()) < EXACT * abs(turn) * extent
     independent = float(len(away)) if exact else _independent(away)
     # The fit takes 4 of the 2 n degrees of freedom; with two independent fixes none is left.
-    if independent < LEAST_INDEPENDENT or abs(turn) * extent < 1e-9:
-        return None
+    if abs(turn) * extent < 1e-9:
+        return Unused(photos, "the photos lie too close together")
+    if independent < LEAST_INDEPENDENT:
+        drift = f"its errors drift from photo to photo, which leaves {independent:.1f} fixes"
+        return Unused(photos, f"{drift} where {LEAST_INDEPENDENT:g} are needed")
     spread = math.sqrt(float((np.abs(away) ** 2).mean()) / 2 * independent / (independent - 2))
     error = spread / (abs(turn) * extent * math.sqrt(independent))
     if error > WORST_SCALE:
-        return None
+        apart = f"its places are off by {spread:.1f} m, and the photos lie within about"
+        return Unused(photos, f"{apart} {2 * abs(turn) * extent:.1f} m of each other")
+    left_out = [name for some, kept in zip(names, sound, strict=True) if not kept for name in some]
     return Georeference(
         scale=float(abs(turn)),
         scale_error=error,
@@ -99,30 +123,55 @@ def find_georeference(
         shift=(float(shift.real), float(shift.imag)),
         origin=(float(origin[0]), float(origin[1])),
         spread=spread,
-        photos=sum(view.name in places for view in scene.views),
+        photos=photos - len(left_out),
+        left_out=tuple(left_out),
+    )
+
+
+def gps_note(found: Georeference | Unused, sources: Mapping[str, str]) -> str | None:
+    """What the user should know of GPS that is not used; None if there is none or all is.
+
+    Args:
+        found: what came of it.
+        sources: the user's name of each photo, by picture name.
+    """
+    if isinstance(found, Unused):
+        if not found.photos:
+            return None
+        return f"GPS of {found.photos} photos is of no use here: {found.reason}."
+    if not found.left_out:
+        return None
+    named = ", ".join(sources.get(name, name) for name in found.left_out[:NAMED])
+    more = ", ..." if len(found.left_out) > NAMED else ""
+    return (
+        f"GPS of {len(found.left_out)} of {found.photos + len(found.left_out)} photos is far from"
+        f" where the pictures put them and is left out: {named}{more}."
     )
 
 
 def _fixes(
     scene: Scene, places: dict[str, tuple[float, float, float]]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """Camera positions, m, and latitude and longitude of each fix, in the views' order.
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], list[list[str]]]:
+    """Camera positions, m, latitude and longitude, and the photos of each fix, in views' order.
 
     A receiver that lags gives one fix to several photos: those are one, at their mean position.
     """
-    own, where, count = [], [], []
+    own, where, names = [], [], []
     for view in scene.views:
         if view.name not in places:
             continue
         position, place = scene.c2w_world(view)[:2, 3], places[view.name][:2]
         if where and place == where[-1]:
             own[-1] = own[-1] + position
-            count[-1] += 1
+            names[-1].append(view.name)
         else:
             own.append(position)
             where.append(place)
-            count.append(1)
-    return (np.array(own) / np.array(count)[:, None] if own else np.empty((0, 2))), np.array(where)
+            names.append([view.name])
+    if not own:
+        return np.empty((0, 2)), np.empty((0, 2)), []
+    count = np.array([len(some) for some in names])
+    return np.array(own) / count[:, None], np.array(where), names
 
 
 def _independent(away: Complex[np.ndarray, "n"]) -> float:

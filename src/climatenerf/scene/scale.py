@@ -16,6 +16,7 @@ ASSUMED = "camera-height-assumed"
 LEAST_DEPTHS = 5  # points in a view, and views, that depth files must reach
 LEAST_ERROR = 0.01  # of the scale by depth files
 MOST_SPREAD = 0.15  # of log depth over points: metric depth is within a tenth nearly everywhere
+ASSUMED_WARNING = "The scale is assumed"  # how the warning begins
 SIGMAS = 2.0  # between two pieces of evidence, from which the user is warned
 
 
@@ -40,7 +41,7 @@ def rescaled(scene: Scene, factor: float, source: str, error: float) -> Scene:
         scale_error=error,
         scale_report=report,
         lowest_ground_z=scene.ground_z + factor * (scene.lowest_ground_z - scene.ground_z),
-        warnings=tuple(w for w in scene.warnings if not w.startswith("The scale is assumed")),
+        warnings=tuple(w for w in scene.warnings if not w.startswith(ASSUMED_WARNING)),
     )
 
 
@@ -70,6 +71,16 @@ def scale_words(scene: Scene) -> str:
     for name, said in scene.scale_report.items():
         words.append(f"{name} says {said['times']:.2f} times that (+-{percent(said['error'])})")
     return "; ".join(words)
+
+
+def with_capture_remedies(scene: Scene) -> Scene:
+    """The scene with the flags named that `capture` knows too where its scale is assumed."""
+    remedy = "; give --camera-height or --known-length."
+    told = [
+        w.partition("; give ")[0] + remedy if w.startswith(ASSUMED_WARNING) else w
+        for w in scene.warnings
+    ]
+    return replace(scene, warnings=tuple(told))
 
 
 def percent(share: float) -> str:

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from climatenerf.sfm.intake import Intake
 
 ENOUGH_MATCHES = 30  # verified ones that a picture needs with a posed one
-BLURRED = 0.3  # of the median sharpness
+BLURRED = 0.08  # of the median sharpness; a sharp picture of plain walls has more
+SOFT = 0.3  # of the median sharpness: blurred, or of a plain subject
 DARK, BRIGHT = 0.08, 0.92  # mean grey value
 TURNED = 0.02  # deviation from a rotation; a step of a hundredth of the distance makes as much
 FLAT_SHARE = 0.9  # of the pairs that one homography explains
@@ -38,9 +39,14 @@ class Lost:
     neighbours: tuple[tuple[str, int], ...]
 
 
+def read_only(database: Path) -> sqlite3.Connection:
+    """Opens COLMAP's database without changing it; "#", "?" and "%" in its path are quoted."""
+    return sqlite3.connect(database.resolve().as_uri() + "?mode=ro", uri=True, timeout=1.0)
+
+
 def verified_matches(database: Path) -> dict[tuple[str, str], int]:
     """Number of geometrically verified matches of each pair of pictures that has any."""
-    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
+    with contextlib.closing(read_only(database)) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         rows = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
         pairs = {}
@@ -66,12 +72,13 @@ def diagnose(intake: Intake, registered: tuple[str, ...], database: Path) -> lis
             continue
         best = sorted(partners.get(picture.name, []), key=lambda pair: -pair[1])[:3]
         to_posed = max((n for other, n in best if other in posed), default=0)
+        detail = picture.sharpness / max(typical, 1e-9)
         near = f" (best: {sources[best[0][0]]}, {best[0][1]} matches)" if best else ""
         if picture.brightness < DARK or picture.brightness > BRIGHT:
             side = "dark" if picture.brightness < DARK else "bright"
             reason, remedy = f"far too {side}", "take it again with the exposure locked"
-        elif picture.sharpness < BLURRED * typical:
-            reason = f"blurred ({picture.sharpness / max(typical, 1e-9):.0%} of the usual detail)"
+        elif detail < BLURRED:
+            reason = f"blurred ({detail:.0%} of the usual detail)"
             remedy = "take it again, holding still"
         elif to_posed >= ENOUGH_MATCHES:
             reason = f"fits others{near} but its place stays ambiguous"
@@ -79,6 +86,9 @@ def diagnose(intake: Intake, registered: tuple[str, ...], database: Path) -> lis
         elif best and best[0][1] >= ENOUGH_MATCHES:
             reason = f"fits only pictures that are cut off from the rest{near}"
             remedy = "take pictures that lead from these to the others, two thirds in common"
+        elif detail < SOFT:
+            reason = f"few matches{near}; it has {detail:.0%} of the usual detail"
+            remedy = "if it looks blurred take it again, else take pictures that lead to it"
         else:
             reason = f"too little in common with any other{near}"
             remedy = "take pictures between it and its neighbours, two thirds in common"
@@ -94,7 +104,7 @@ def turned_only(intake: Intake, database: Path) -> bool:
     places it never is.
     """
     sizes = {picture.name: (picture.width, picture.height) for picture in intake.pictures}
-    with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
+    with contextlib.closing(read_only(database)) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         rows = connection.execute(
             "SELECT pair_id, config, H FROM two_view_geometries WHERE rows >= ?", (ENOUGH_MATCHES,)

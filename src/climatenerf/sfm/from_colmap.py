@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 
 from PIL import Image
@@ -10,13 +11,14 @@ from climatenerf.errors import UserError
 from climatenerf.scene.colmap import largest_model, read_colmap
 from climatenerf.sfm.diagnose import Lost
 from climatenerf.sfm.exif import Exif, read_exif
-from climatenerf.sfm.intake import FEWEST, Intake, Picture, photos_in
+from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.photos import FEWEST, photos_in
 from climatenerf.sfm.reconstruct import Model, Told
 from climatenerf.storage import explain, make_folder
 
 
 def take_posed(
-    photos: Path, root: Path, out: Path, besides: Path, tell: Told
+    photos: Path, root: Path, out: Path, besides: Collection[Path], tell: Told
 ) -> tuple[Intake, Model, list[Lost]]:
     """Copies photos and model as they are into `out/images` and `out/sparse/0`.
 
@@ -24,7 +26,7 @@ def take_posed(
         photos: the folder that the model's picture names are relative to.
         root: COLMAP's folder: a model, or with `sparse/0`.
         out: folder to write into.
-        besides: folder whose pictures are no photos of the user's.
+        besides: folders whose pictures are no photos of the user's.
         tell: told (stage, share of it that is done).
 
     Returns:
@@ -67,10 +69,11 @@ def take_posed(
     found = Model(lenses, tuple(names), (len(names),), None, points)
     known = {photos / name for name in names}
     reason, remedy = "the COLMAP model has no pose for it", "leave out --from-colmap to pose it"
-    others = [path for path in photos_in(photos, besides) if path not in known]
+    found_there = photos_in(photos, besides)
+    others = [path for path in found_there.files if path not in known]
     left = [path.relative_to(photos).as_posix() for path in others]
     lost = [Lost(name, name, reason, remedy, ()) for name in left]
-    return Intake(out / "images", pictures, {}, False), found, lost
+    return Intake(out / "images", pictures, {}, False, found_there.notes), found, lost
 
 
 def _picture(photos: Path, name: str) -> Picture:

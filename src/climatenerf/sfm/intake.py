@@ -4,28 +4,25 @@ import contextlib
 import errno
 import io
 import math
-import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ExifTags, Image, ImageCms
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from climatenerf.errors import UserError
 from climatenerf.scene.images import EXIF_TURNS, to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
+from climatenerf.sfm.photos import FEWEST, find_photos, is_video, too_few
 from climatenerf.storage import atomic_path, explain, make_folder, read_json, write_json
 
-PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}
-VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp"}
 LONGEST = 2000  # pixels: more than a radiance field of a place resolves, and features need less
 MOST_PIXELS = 400_000_000  # of a picture that is decoded at all: 1.2 GB
-FEWEST = 3
 JPEG_QUALITY = 96
 VIDEO_FRAMES = 100  # frames taken from a video, the sharpest of as many intervals
 CANDIDATES = 5  # looked at in each interval
@@ -56,15 +53,21 @@ class Picture:
 
 @dataclass(frozen=True)
 class Intake:
-    """All usable pictures, and what could not be used with the reason."""
+    """All usable pictures, what could not be used with the reason, and notes for the user."""
 
     folder: Path
     pictures: tuple[Picture, ...]
     unusable: dict[str, str]
     is_video: bool
+    notes: tuple[str, ...] = ()
 
 
-def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> Intake:
+def take_in(
+    source: Path,
+    work: Path,
+    progress: Callable[[int, int], None],
+    besides: Collection[Path] = (),
+) -> Intake:
     """Makes upright pictures of at most `LONGEST` pixels from photos or a video.
 
     Finished pictures are kept, so that an interrupted run goes on where it was.
@@ -73,25 +76,18 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
         source: folder of photos, or a video file.
         work: work folder; pictures go to `work/pictures`.
         progress: told (done, all).
+        besides: folders whose pictures are no photos; the scene that is being made is one always.
 
     Raises:
         UserError: nothing to read, a video that cannot be decoded, or fewer than three pictures.
     """
-    if not source.exists():
-        raise UserError(f"{source} does not exist; give a folder of photos or a video")
-    folder = make_folder(work / "pictures")
-    if source.is_file():
-        if source.suffix.lower() not in VIDEO_SUFFIXES:
-            raise UserError(f"{source} is neither a folder of photos nor a video")
-        frames = take_frames(source, work / "frames", progress)
-        files, base, is_video = frames, work / "frames", True
+    video = is_video(source)
+    if video:
+        files, base, notes = take_frames(source, work / "frames", progress), work / "frames", ()
     else:
-        # A scene among the photos holds pictures that this program has made.
-        files, base, is_video = photos_in(source, work.parent), source, False
-        if not files:
-            videos = any(p.suffix.lower() in VIDEO_SUFFIXES for p in source.iterdir())
-            hint = "; give the video itself" if videos else ""
-            raise UserError(f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP){hint}")
+        found = find_photos(source, (work.parent, *besides))
+        files, base, notes = found.files, found.folder, found.notes
+    folder = make_folder(work / "pictures")
     pictures, unusable, taken = [], {}, set()
     for index, path in enumerate(files):
         name = _free_name(path.relative_to(base), taken)
@@ -108,34 +104,8 @@ def take_in(source: Path, work: Path, progress: Callable[[int, int], None]) -> I
         progress(index + 1, len(files))
     if len(pictures) < FEWEST:
         why = f"; unusable: {next(iter(unusable.values()))}" if unusable else ""
-        raise UserError(
-            f"{source} holds {len(pictures)} usable pictures, and a place needs at least {FEWEST}"
-            f" (40 to 100 are good){why}"
-        )
-    return Intake(folder, tuple(pictures), unusable, is_video)
-
-
-def photos_in(folder: Path, besides: Path) -> list[Path]:
-    """All photos below a folder, through linked folders too, but hidden ones and those of a scene.
-
-    Args:
-        folder: to look in.
-        besides: folder whose files are none.
-    """
-    found = []
-    for place, folders, names in os.walk(folder, followlinks=True):
-        here = Path(place)
-        folders[:] = sorted(
-            name
-            for name in folders
-            if not name.startswith(".") and (here / name).resolve() != besides.resolve()
-        )
-        found += [
-            here / name
-            for name in names
-            if not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES
-        ]
-    return sorted(found)
+        raise too_few(source, len(pictures), why)
+    return Intake(folder, tuple(pictures), unusable, video, notes)
 
 
 def _words(path: Path) -> str:
@@ -226,9 +196,26 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
     except UserError:
         raise
     except Exception as error:  # decoders raise all kinds for damaged files
-        raise UserError(f"{name} is no readable picture ({error})") from error
+        raise UserError(f"{name} {_in_words(error)}") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
+
+
+def _in_words(error: Exception) -> str:
+    """What is wrong with a photo, said of it; a decoder's own words name its internals."""
+    if isinstance(error, UnidentifiedImageError):
+        return "is no picture, or is damaged from its first bytes on"
+    if isinstance(error, FileNotFoundError):
+        return "is a link to a file that is not there"
+    if isinstance(error, PermissionError):
+        return "may not be read; change its permissions"
+    if isinstance(error, IsADirectoryError):
+        return "is a folder with the name of a picture"
+    if isinstance(error, Image.DecompressionBombError):
+        return f"exceeds {MOST_PIXELS / 1e6:g} megapixels: too large"
+    if isinstance(error, MemoryError):
+        return "takes more memory to read than there is"
+    return "is damaged or cut off"
 
 
 def _as_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:

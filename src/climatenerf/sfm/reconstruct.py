@@ -15,8 +15,9 @@ from pathlib import Path
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.colmap import read_colmap
-from climatenerf.sfm.diagnose import turned_only
-from climatenerf.sfm.intake import FEWEST, Intake, Picture
+from climatenerf.sfm.diagnose import read_only, turned_only
+from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.photos import FEWEST
 from climatenerf.storage import make_folder, read_json, write_json
 
 EXHAUSTIVE_UP_TO = 120  # photos; beyond, and for video, neighbours in time and loops are compared
@@ -376,9 +377,7 @@ def _names(database: Path) -> list[str]:
     if not database.is_file():
         return []
     try:
-        with contextlib.closing(
-            sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=1.0)
-        ) as connection:
+        with contextlib.closing(read_only(database)) as connection:
             return [row[0] for row in connection.execute("SELECT name FROM images")]
     except sqlite3.Error:
         database.unlink()  # half written: begun anew
