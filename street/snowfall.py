@@ -3,8 +3,9 @@
 Nothing here is shared with the program's own snow. A field of heights as seen from above is filled
 flake by flake. A flake stays on a bare surface with the probability that roofs of that pitch keep
 their snow (EN 1991-1-3, 5.3: all up to 30 degrees, none from 60), on snow up to its angle of
-repose, and else goes on to the lowest neighbour, over an edge if need be. What lies under a roof, a
-table or a crown is never reached by a flake from above.
+repose, and else goes on to the lowest neighbour, over an edge if need be. What lies under a roof or
+a table is never reached by a flake from above. Leaves that are level enough keep their share of
+what falls on them; the rest falls through to what lies below the crown, and settles there.
 """
 
 from dataclasses import dataclass
@@ -43,33 +44,41 @@ class Cover:
     depth: Float[np.ndarray, "rows columns"]
 
 
-def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> Cover:
-    """Snow of a mean depth on open level ground, over one of `RINGS`."""
+def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> tuple[Cover, Cover]:
+    """Snow over one of `RINGS`, of a mean depth on open level ground; that on leaves comes last."""
     half_x, half_y, cell = RINGS[ring]
     columns, rows = round(2 * half_x / cell), round(2 * half_y / cell)
     x0, y0 = -half_x + 0.5 * cell, -half_y + 0.5 * cell
-    ground = np.full((rows, columns), -np.inf)
-    level = np.ones((rows, columns))
-    for mesh in meshes:
-        _from_above(mesh.vertices[mesh.faces], x0, y0, cell, ground, level)
-    pitch = np.degrees(np.arccos(np.clip(level, 0, 1)))
-    keeps = np.clip((SHEDS - pitch) / (SHEDS - KEEPS), 0, 1)
+    surfaces = []
+    for leaves in (False, True):
+        top, level = np.full((rows, columns), -np.inf), np.ones((rows, columns))
+        for mesh in meshes:
+            if (mesh.label == "vegetation") == leaves:
+                _from_above(mesh.vertices[mesh.faces], x0, y0, cell, top, level)
+        pitch = np.degrees(np.arccos(np.clip(level, 0, 1)))
+        surfaces.append((top, np.clip((SHEDS - pitch) / (SHEDS - KEEPS), 0, 1)))
+    (ground, keeps), (crown, holds) = surfaces
+    crown[crown <= ground] = -np.inf
     rng = np.random.default_rng(seed)
-    lying = _settle(ground, keeps, depth / FLAKES, REPOSE * cell, rng)
-    for _ in range(4):  # single flakes are no bumps
-        lying = _smooth(lying, ground, STEEPEST * cell)
-    return Cover(x0, y0, cell, ground, np.where(lying > LEAST, lying, 0.0))
+    steepest = STEEPEST * cell
+    lying, held = _settle(ground, keeps, crown, holds, depth / FLAKES, REPOSE * cell, rng)
+    covers = []
+    for top, snow in ((ground, lying), (crown, held)):
+        for _ in range(4):  # single flakes are no bumps
+            snow = _smooth(snow, top, steepest)
+        covers.append(Cover(x0, y0, cell, top, np.where(snow > LEAST, snow, 0.0)))
+    return covers[0], covers[1]
 
 
 def snow_meshes(meshes: list[Mesh], depth: float) -> list[Mesh]:
     """The snow as meshes: one a ring, each without what finer ones cover."""
     out = []
     for ring, (_, _, cell) in enumerate(RINGS):
-        cover = snow_cover(meshes, depth, ring)
         inner = RINGS[ring - 1][:2] if ring else (0.0, 0.0)
-        mesh = cover_mesh(cover, inner)
-        out.append(mesh.tagged(f"snow-{ring}", "snow", "terrain"))
-        assert cell == cover.cell
+        for where, cover in zip(("", "-leaves"), snow_cover(meshes, depth, ring), strict=True):
+            assert cell == cover.cell
+            mesh = cover_mesh(cover, inner)
+            out.append(mesh.tagged(f"snow{where}-{ring}", "snow", "terrain"))
     return out
 
 
@@ -151,16 +160,19 @@ def _from_above(triangles, x0, y0, cell, ground, level):
 
 
 @numba.njit(cache=True)
-def _settle(ground, keeps, flake, steepest, rng):
-    """Depth of snow after all flakes have come to rest, one after the other.
+def _settle(ground, keeps, crown, holds, flake, steepest, rng):
+    """Depth of snow, below and on leaves, after all flakes have come to rest, one after the other.
 
     A flake that has begun to slide goes on to where all snow is kept, or over the edge.
     """
     rows, columns = ground.shape
-    depth = np.zeros_like(ground)
+    depth, held = np.zeros_like(ground), np.zeros_like(ground)
     for _ in range(FLAKES * rows * columns):
         j, i = int(rng.random() * rows), int(rng.random() * columns)
         slides = False
+        if crown[j, i] > -np.inf and rng.random() < holds[j, i]:
+            held[j, i] += flake
+            continue
         if ground[j, i] == -np.inf:
             continue
         for _ in range(MOVES):
@@ -182,7 +194,7 @@ def _settle(ground, keeps, flake, steepest, rng):
                 depth[j, i] += flake
                 break
             j, i = best_j, best_i
-    return depth
+    return depth, held
 
 
 _STEPS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
@@ -190,7 +202,10 @@ _STEPS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0),
 
 @numba.njit(cache=True)
 def _smooth(depth, ground, steepest):
-    """Each depth as the mean of its own and those of the four neighbours on the same surface."""
+    """Each depth as the mean of its own and those of the four neighbours on the same surface.
+
+    Cells without a surface have no snow and give none: inf - inf is no height.
+    """
     rows, columns = depth.shape
     out = depth.copy()
     for j in range(1, rows - 1):
@@ -198,7 +213,8 @@ def _smooth(depth, ground, steepest):
             total, count = 4 * depth[j, i], 4
             for k in (1, 3, 4, 6):
                 dj, di = _STEPS[k]
-                if abs(ground[j + dj, i + di] - ground[j, i]) < steepest:
+                apart = abs(ground[j + dj, i + di] - ground[j, i])
+                if apart < steepest:
                     total += depth[j + dj, i + di]
                     count += 1
             out[j, i] = total / count

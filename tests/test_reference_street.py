@@ -1,5 +1,6 @@
 """The path-traced truth itself: snow, water and layers of the street against closed forms."""
 
+import hashlib
 import sys
 from pathlib import Path
 
@@ -9,12 +10,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from street import snowfall, water  # noqa: E402
+from street import publish, render, smog, snowfall, water  # noqa: E402
 from street.geometry import box, quad  # noqa: E402
 from street.layout import build_scene, camera_poses, ground_datum, measuring_poses, passers_by  # noqa: E402
 from street.objects import bench, fence, table  # noqa: E402
 from street.sky import SUN_AZIMUTH, SUN_ELEVATION, direction  # noqa: E402
 from street.terrain import DIP_AT, DIP_DEPTH, ground_height  # noqa: E402
+from street.textures import make  # noqa: E402
 from street.truth import TRAIN_IDS, layers, sun_directions  # noqa: E402
 
 
@@ -41,7 +43,7 @@ def mean_depth(cover, x0, x1, y0, y1):
 
 
 def test_snow_lies_where_it_can_and_none_is_lost(yard):
-    cover = snowfall.snow_cover(yard, 0.15, 0)
+    cover, _ = snowfall.snow_cover(yard, 0.15, 0)
     assert mean_depth(cover, 1.8, 2.8, -2.5, -1.0) == pytest.approx(0.15, rel=0.04)
     assert mean_depth(cover, -1.8, -1.2, -1.8, -1.2) == pytest.approx(0.15, rel=0.08), (
         "on the table"
@@ -55,7 +57,7 @@ def test_snow_lies_where_it_can_and_none_is_lost(yard):
 
 
 def test_nothing_lies_under_the_table(yard):
-    cover = snowfall.snow_cover(yard, 0.15, 0)
+    cover, _ = snowfall.snow_cover(yard, 0.15, 0)
     mesh = snowfall.cover_mesh(cover, (0.0, 0.0))
     corners = mesh.vertices[mesh.faces].mean(1)
     under = (np.abs(corners[:, :2] + 1.5) < 0.4).all(1)
@@ -64,8 +66,24 @@ def test_nothing_lies_under_the_table(yard):
     assert np.median(tops[:, 2]) == pytest.approx(0.15, rel=0.05)
 
 
+def test_snow_falls_through_a_crown_and_piles_up_nowhere(yard):
+    """Loose leaves over open ground: what they do not hold lies evenly below them."""
+    rng = np.random.default_rng(0)
+    leaves = []
+    for x, y in rng.uniform((-2.5, -2.8), (2.5, -0.2), (900, 2)):
+        steep = np.deg2rad(rng.uniform(0, 90))
+        side, down = (0.12, 0, 0), (0, 0.12 * np.cos(steep), -0.12 * np.sin(steep))
+        leaves.append(quad((x, y, rng.uniform(2.0, 3.0)), side, down).tagged("l", "", "vegetation"))
+    below, held = snowfall.snow_cover([yard[0], *leaves], 0.15, 0)
+    under = mean_depth(below, -2.0, 2.0, -2.5, -0.5)
+    assert 0.04 < under < 0.13, "less than in the open, but not bare"
+    assert below.depth.max() < 0.25, "no towers in the gaps"
+    assert held.depth.max() > 0.05
+    assert below.depth.mean() + held.depth.mean() == pytest.approx(0.15, rel=0.02)
+
+
 def test_the_same_seed_lets_the_same_snow_fall(yard):
-    first, second = (snowfall.snow_cover(yard, 0.05, 0).depth for _ in range(2))
+    first, second = (snowfall.snow_cover(yard, 0.05, 0)[0].depth for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
@@ -149,6 +167,85 @@ def test_people_pass_in_some_pictures_and_never_stand_still():
             assert abs(low - ground_height(x, y)) < 0.16  # one foot may be off the kerb
 
 
+REFERENCE = ROOT / "reference" / "street"
+
+
+def test_the_set_on_disk_is_whole():
+    for folder in (
+        REFERENCE,
+        publish.beside(REFERENCE, "busy"),
+        publish.beside(REFERENCE, "turned"),
+    ):
+        lines = (folder / "SHA256SUMS").read_text().splitlines()
+        assert len(lines) > 3
+        for line in lines:
+            wanted, name = line.split("  ")
+            assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == wanted, name
+        there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+        assert there == {line.split("  ")[1] for line in lines} | {"SHA256SUMS"}
+    total = sum(p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file())
+    assert total < 30e6
+
+
+def test_the_set_reads_as_a_capture_and_as_the_truth():
+    from climatenerf.evaluation.reference import read_reference
+    from climatenerf.scene import read_scene
+
+    for variant in ("", "-busy", "-turned"):
+        folder = REFERENCE.with_name(REFERENCE.name + variant)
+        scene = read_scene(folder)
+        assert len(scene.of_split("train")) == 64 and len(scene.of_split("heldout")) == 6
+        reference = read_reference(folder)
+        assert len(reference.truths) == 6 and len(reference.weathers) == 9
+    kinds = {kind.name: kind for kind in reference.weathers}
+    truth = reference.truths[0]
+    assert kinds["flood-low"].weather.at(0).flood.level == 0.25
+    assert kinds["flood-waves"].time == publish.WAVE_TIME
+    deep = kinds["snow-deep"].layers(truth.name)
+    lies = deep["thickness"] > 0.005
+    road = lies & (truth.label == TRAIN_IDS["road"]) & (truth.depth < 20)
+    assert np.median(deep["thickness"][road]) == pytest.approx(0.15, rel=0.1)
+    # Snow is only ever nearer than what it lies on.
+    assert (deep["depth"] < truth.depth + 1e-3)[~truth.sky].all()
+    clean = render.encode(truth.clean).astype(float)
+    smoggy = kinds["smog-far"].picture(truth.name).astype(float)
+    dim = kinds["smog-near"].picture(truth.name).astype(float)
+    assert np.abs(dim - clean).mean() > 2 * np.abs(smoggy - clean).mean()
+
+
+def test_the_turned_variant_can_be_levelled_and_measured():
+    from climatenerf.scene import read_scene
+    from climatenerf.scene.known_length import apply_known_lengths, measure
+
+    scene = read_scene(publish.beside(REFERENCE, "turned"))
+    turn = np.eye(4)
+    turn[:3, :3] = publish.SHRUNK * publish._rotation(*publish.TURN)
+    turn[:3, 3] = publish.SHIFT
+    up = (scene.world_from_input @ turn)[:3, 2]
+    assert np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 0.5
+    # A wall whose length is known, marked in the pictures that see both its ends.
+    ends = {"from": np.array([-10.5, -6.5, 1.0, 1.0]), "to": np.array([-10.5, 1.5, 1.0, 1.0])}
+    marks = {"from": {}, "to": {}}
+    rng = np.random.default_rng(0)
+    for view in scene.of_split("train"):
+        camera = scene.cameras[view.camera]
+        local = {k: np.linalg.inv(view.c2w) @ (turn @ p) for k, p in ends.items()}
+        if min(p[2] for p in local.values()) < 0.5:
+            continue
+        pixels = {k: camera.project(p[:3]) for k, p in local.items()}
+        if all(
+            (q > 0).all() and (q < (camera.width, camera.height)).all() for q in pixels.values()
+        ):
+            for end, pixel in pixels.items():
+                marks[end][view.name] = tuple(pixel + rng.normal(0, 0.5, 2))
+    assert len(marks["from"]) >= 3
+    measured = measure(scene, {"WALL": marks}, "WALL", 8.0)
+    scaled = apply_known_lengths(scene, [measured])
+    assert np.cbrt(np.linalg.det((scaled.world_from_input @ turn)[:3, :3])) == pytest.approx(
+        1.0, abs=0.01
+    )
+
+
 # From here on with the path tracer.
 
 
@@ -223,6 +320,66 @@ def test_traced_water_obeys_fresnel_and_beer(degrees):
     shining = {"bsdf": black, "emitter": {"type": "area", "radiance": 1.0}}
     left = (1 - reflected) * np.exp(-water.ABSORPTION * depth / inside) / water.IOR**2
     assert seen(shining, sky=False) == pytest.approx(left, abs=0.012)
+
+
+def test_smog_without_fall_off_is_exponential_and_haze_is_summed_right():
+    depth, rise = np.array([[10.0, 200.0, np.inf]]), np.array([[0.0, 0.1, 0.5]])
+    even = smog.transmittance("smog-mid", depth, 1.7, rise, 0.1)
+    np.testing.assert_allclose(even, 0.05 ** (depth / 120.0))
+    hazy = smog.transmittance("haze", depth, 1.7, rise, 0.1)
+    sigma, falloff = -np.log(0.05) / 60.0, 5.0
+    level = np.exp(-sigma * 10.0 * np.exp(-1.6 / falloff))
+    up = np.exp(-sigma * np.exp(-1.6 / falloff) * falloff / 0.5)
+    assert hazy[0, 0] == pytest.approx(level, rel=1e-4)
+    assert hazy[0, 2] == pytest.approx(up, rel=2e-3)
+    # Down from 1.7 m to the base at 0.1 m and on through what is even there.
+    low = smog.transmittance("haze", np.array([[20.0]]), 1.7, np.array([[-0.2]]), 0.1)
+    above = falloff * (1 - np.exp(-1.6 / falloff)) / 0.2
+    assert low[0, 0] == pytest.approx(np.exp(-sigma * (above + 12.0)), rel=1e-3)
+    white = smog.smoggy(np.zeros((1, 1, 3)), np.zeros((1, 1)))
+    assert np.abs(render.encode(white)[0, 0] / 255 - smog.COLOUR).max() < 0.003
+
+
+@pytest.mark.slow
+def test_true_smog_agrees_with_an_absorbing_medium_in_the_path_tracer(tmp_path):
+    """The street's surfaces shine with their own colours, in air that only absorbs."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    sigma, samples, width, height = -np.log(0.05) / 40.0, 400, 96, 54
+    air = mi.load_dict({"type": "homogeneous", "sigma_t": sigma, "albedo": 0.0})
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    content = {"type": "scene", "integrator": {"type": "volpath", "max_depth": 2}}
+    meshes = build_scene()
+    textures = {}
+    for mesh in meshes:
+        if mesh.texture not in textures:
+            bitmap = mi.Bitmap(make(mesh.texture))
+            textures[mesh.texture] = mi.load_dict({"type": "bitmap", "bitmap": bitmap})
+        path = tmp_path / f"{mesh.name}.ply"
+        render.write_ply(mesh, path)
+        content[mesh.name.replace(".", "_")] = {
+            "type": "ply", "filename": str(path), "bsdf": {"type": "twosided", "own": black},
+            "emitter": {"type": "area", "radiance": textures[mesh.texture]},
+        }  # fmt: skip
+    clear = mi.load_dict(content)
+    place = mi.ScalarTransform4f().scale([500, 500, 300])
+    box = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": air}
+    smoky = mi.load_dict(content | {"air": box})
+    pose = measuring_poses()[0][1]
+    dry = render.render_view(clear, pose, width, height, samples, 0)[..., :3]
+    seen = render.render_view(smoky, pose, width, height, samples, 1, air=air)[..., :3]
+    fine = layers(render.load(meshes, tmp_path, named=True), meshes, pose, width, height)
+    passed = smog.transmittance("smog-near", fine["depth"], 0.0, np.zeros((height, width)), 0.0)
+    # One ray's depth stands for a pixel only where its surroundings are about as far.
+    depth = np.pad(fine["depth"], 1, mode="edge")
+    around = np.stack([depth[i : i + height, j : j + width] for i in range(3) for j in range(3)])
+    flat = np.isfinite(around).all(0) & (around.max(0) < 1.2 * around.min(0)) & (dry.sum(-1) > 0.05)
+    assert flat.mean() > 0.25
+    wanted = (dry * passed[..., None])[flat]
+    noise = dry[flat] * np.sqrt(passed * (1 - passed) / samples)[flat][:, None]
+    apart = seen[flat] - wanted
+    assert abs(apart.mean()) < 0.01 * wanted.mean()
+    assert np.sqrt((apart**2).mean()) < 2.0 * np.sqrt((noise**2).mean())
 
 
 def test_a_mirror_shows_what_a_mirrored_camera_sees(tmp_path):

@@ -97,7 +97,7 @@ def test_floaters_and_sky_are_counted_where_they_are():
 
 def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_distance():
     truth = truth_of(rise=0.1)  # water at 0.3 m ends at y = 3
-    line, _ = weather_scores.crossings(truth.points, truth.points[..., 2] - 0.3)
+    line, _ = weather_scores.crossings(truth.points - truth.c2w[:3, 3], truth.points[..., 2] - 0.3)
     np.testing.assert_allclose(line[:, 1], 3.0, atol=0.02)
 
     def ours(level):
@@ -110,14 +110,16 @@ def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_dist
             "mask_water": wet.astype(float),
         }
 
-    right = weather_scores.waterline_scores([ours(0.3)], [truth.c2w], 0.3, (truth,), 0.3)
-    assert right["waterline_error_cm"] < 0.5 and right["water_iou"] == 1.0
+    right = weather_scores.waterline_scores([ours(0.3)], [truth.c2w], 0.3, (truth,), 0.3, 0.02)
+    assert right["waterline_error_cm"] < 0.5 and right["waterline_error_px"] < 0.1
+    assert right["waterline_height_error_cm"] < 2
+    assert right["water_iou"] == 1.0
     # 2 cm too high on a slope of one in ten: the line lies 20 cm further.
-    high = weather_scores.waterline_scores([ours(0.32)], [truth.c2w], 0.32, (truth,), 0.3)
+    high = weather_scores.waterline_scores([ours(0.32)], [truth.c2w], 0.32, (truth,), 0.3, 0.02)
     assert high["waterline_error_cm"] == pytest.approx(20.0, rel=0.05)
     # 10 m is said where there is no line of ours at all.
     dry = ours(0.3) | {"mask_water": np.zeros(truth.depth.shape), "depth": truth.depth + 50.0}
-    none = weather_scores.waterline_scores([dry], [truth.c2w], 0.3, (truth,), 0.3)
+    none = weather_scores.waterline_scores([dry], [truth.c2w], 0.3, (truth,), 0.3, 0.02)
     assert none["water_iou"] == 0.0
 
 

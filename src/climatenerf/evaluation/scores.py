@@ -6,6 +6,7 @@ See docs/reference-scene.md for what each number means.
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from climatenerf.render.frame import see_frame
 from climatenerf.render.stage import Stage, prepare
 from climatenerf.render.view import RENDER_STEP, camera_rays
 from climatenerf.render.world import World
-from climatenerf.scene import Camera, Scene
+from climatenerf.scene import Camera, Scene, View
 from climatenerf.weather import smog
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
@@ -59,9 +60,15 @@ class Place:
     scene: Scene
     reference: Reference
 
+    def view(self, truth: Truth) -> View | None:
+        """The run's view of that name; poses from elsewhere may call it `images/NAME`."""
+        names = {Path(view.name).name: view for view in self.scene.views}
+        return names.get(truth.name)
+
     def pose(self, truth: Truth) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
         """Camera and pose, in the run's own world, of a view that is measured."""
-        view = next(v for v in self.scene.views if v.name == truth.name)
+        view = self.view(truth)
+        assert view is not None
         return self.scene.cameras[view.camera], self.scene.c2w_world(view)
 
 
@@ -101,13 +108,12 @@ def evaluate(place: Place, tell: Tell) -> Scores:
 
 def check_place(place: Place) -> None:
     """Refuses a run that cannot be measured honestly."""
-    views = {view.name: view for view in place.scene.views}
     for truth in place.reference.truths:
-        if truth.name not in views:
+        view = place.view(truth)
+        if view is None:
             raise UserError(
                 f"the run does not know the test view {truth.name}; fit the whole reference set"
             )
-        view = views[truth.name]
         if view.split == "train":
             raise UserError(
                 f"the run was fitted to the test view {truth.name}, so it cannot be measured by it;"
@@ -235,7 +241,12 @@ def one_weather(
         level, scene = weather.flood.level, place.reference.scene
         eyes = [c2w for _, c2w in poses]
         own |= weather_scores.waterline_scores(
-            layers, eyes, place.scene.ground_z + level, truths, scene.ground_z + level
+            layers,
+            eyes,
+            place.scene.ground_z + level,
+            truths,
+            scene.ground_z + level,
+            1.0 / poses[0][0].fx,
         )
     if weather.snow.depth is not None:
         snow = [kind.layers(truth.name) for truth in truths]

@@ -7,7 +7,7 @@ from climatenerf.evaluation.geometry import ground_or_roof
 from climatenerf.evaluation.reference import Truth
 from climatenerf.render.normals import plane_normals
 
-JOINED = 0.5  # m: neighbouring pixels this close show one surface
+JOINED, JOINED_SHARE = 0.5, 0.05  # m, and of the distance: neighbours this close are one surface
 NEAR = 30.0  # m: snow is compared up to here
 LEAST_SNOW = 0.005  # m: less is bare ground
 
@@ -16,7 +16,7 @@ Layers = dict[str, np.ndarray]
 
 def waterline_scores(
     layers: list[Layers], eyes: list[Float[np.ndarray, "4 4"]], level: float,
-    truths: tuple[Truth, ...], true_level: float,
+    truths: tuple[Truth, ...], true_level: float, pixel_angle: float,
 ) -> dict[str, float]:  # fmt: skip
     """Where the water ends, against where it truly does.
 
@@ -29,13 +29,16 @@ def waterline_scores(
         level: height of our water, m.
         truths: of the same views.
         true_level: height of the true water, m.
+        pixel_angle: of a pixel, rad.
 
     Returns:
-        `waterline_error_cm`, the median distance of the true line from ours;
+        `waterline_error_cm`, the median distance of the true line from ours in the place;
+        `waterline_error_px`, the same in the picture, where far shores seen at grazing do not
+        count for more than they are looked at;
         `waterline_height_error_cm`, the median height by which our ground misses the water there;
         `water_iou` of the flooded pixels.
     """
-    apart, rise, both, either = [], [], 0, 0
+    apart, seen, rise, both, either = [], [], [], 0, 0
     for ours, c2w, truth in zip(layers, eyes, truths, strict=True):
         rays_c = truth.rays_d @ truth.c2w[:3, :3]  # camera axes
         height = truth.points[..., 2] - true_level
@@ -53,12 +56,14 @@ def waterline_scores(
         own, _ = crossings(t[..., None] * rays_c, own_height)
         if len(line):
             apart.append(_nearest(line, own))
+            seen.append(_nearest(_unit(line), _unit(own)) / pixel_angle)
             here = 0.5 * (own_height.ravel()[i] + own_height.ravel()[j])
             rise.append(np.abs(np.where(np.isfinite(here), here, 10.0)))
         real = _plane_first(truth, true_level)
         both, either = both + (wet & real).sum(), either + (wet | real).sum()
     return {
         "waterline_error_cm": _median_cm(apart),
+        "waterline_error_px": _median_cm(seen) / 100,
         "waterline_height_error_cm": _median_cm(rise),
         "water_iou": float(both / either) if either else float("nan"),
     }
@@ -70,7 +75,7 @@ def crossings(
     """Places where a surface crosses height 0 between neighbouring pixels.
 
     Args:
-        points: seen by the pixels.
+        points: seen by the pixels, from the eye.
         height: theirs, m; inf where there is nothing.
 
     Returns:
@@ -84,7 +89,8 @@ def crossings(
     i, j = i[known], j[known]
     crosses = (z[i] < 0) != (z[j] < 0)
     i, j = i[crosses], j[crosses]
-    one = np.linalg.norm(p[i] - p[j], axis=-1) < JOINED
+    away = np.minimum(*(np.linalg.norm(p[k], axis=-1) for k in (i, j)))
+    one = np.linalg.norm(p[i] - p[j], axis=-1) < JOINED + JOINED_SHARE * away
     i, j = i[one], j[one]
     share = z[i] / (z[i] - z[j])  # signs differ: never 0/0
     return p[i] + share[:, None] * (p[j] - p[i]), (i, j)
@@ -147,6 +153,10 @@ def _plane_first(truth: Truth, level: float) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(fall > 0, (truth.c2w[2, 3] - level) / fall, np.inf)
     return (t > 0) & (t < truth.depth)
+
+
+def _unit(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    return line / np.linalg.norm(line, axis=-1, keepdims=True)
 
 
 def _nearest(line: Float[np.ndarray, "n 3"], own: Float[np.ndarray, "m 3"]) -> np.ndarray:
