@@ -57,7 +57,7 @@ def groups() -> list[Group]:
         Group("snow-thin", test, 49, 2),
         Group("mirror", test, 49, 2),
         Group("people", walk, 49, 2),
-        Group("clean", test, 49, 6),
+        Group("clean", test, 49, 3),
         Group("scattering", test[:1], 25, 1),
     ]
 

@@ -177,7 +177,7 @@ def test_the_set_on_disk_is_whole():
         publish.beside(REFERENCE, "turned"),
     ):
         lines = (folder / "SHA256SUMS").read_text().splitlines()
-        assert len(lines) > 3
+        assert len(lines) >= 3
         for line in lines:
             wanted, name = line.split("  ")
             assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == wanted, name

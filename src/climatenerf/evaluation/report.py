@@ -15,7 +15,8 @@ from climatenerf.storage import make_folder, read_json, write_bytes, write_json
 
 SCHEMA_VERSION = 1
 FILE_NAME, TEXT_NAME = "report.json", "report.md"
-CELL = 384  # pixels of a picture's width
+OVERVIEW = "overview.jpg"  # the first view in all weathers
+CELL, SMALL_CELL = 384, 256  # pixels of a picture's width
 GAIN = 2.0  # of the difference pictures
 
 
@@ -31,20 +32,21 @@ def check_place(out: Path, pictures: list[str]) -> None:
         if "scores" not in read_json(old, "an earlier report"):
             raise UserError(f"{old} is no report of climatenerf; choose another folder with -o")
     else:
-        for name in (TEXT_NAME, *(f"{each}.jpg" for each in pictures)):
+        for name in (TEXT_NAME, OVERVIEW, *(f"{each}.jpg" for each in pictures)):
             if (out / name).exists():
                 raise UserError(f"{out / name} would be overwritten; choose another -o")
     make_folder(out)
 
 
 def write_report(scores: Scores, about: dict[str, Any], out: Path) -> None:
-    """Writes REPORT/report.json, report.md and one picture a weather.
+    """Writes REPORT/report.json, report.md, one picture a weather and one of them all.
 
     Args:
         scores: what was measured.
         about: of the run: its folder's name, minutes, steps.
         out: folder.
     """
+    overview = []
     for name, rows in scores.pictures.items():
         sheet = []
         for view, ours, real in rows:
@@ -52,9 +54,11 @@ def write_report(scores: Scores, about: dict[str, Any], out: Path) -> None:
             difference = np.clip(apart, 0, 255).astype(np.uint8)
             sheet.append((f"{name} {Path(view).stem}", [ours, real, difference]))
         write_jpeg(out / f"{name}.jpg", contact_sheet(sheet, cell_width=CELL), 600_000)
+        overview.append(sheet[0])
+    write_jpeg(out / OVERVIEW, contact_sheet(overview, cell_width=SMALL_CELL), 150_000)
     text = table_text(scores.table)
     head = f"# Against the truth\n\n{', '.join(f'{k} {v}' for k, v in about.items())}\n\n"
-    foot = "\n\nPictures: ours, the truth, and twice the difference.\n\n"
+    foot = f"\n\nOurs, the truth, and twice the difference:\n\n![all]({OVERVIEW})\n"
     foot += "\n".join(f"![{name}]({name}.jpg)" for name in scores.pictures)
     write_bytes(out / TEXT_NAME, f"{head}```\n{text}\n```{foot}\n".encode())
     write_json(

@@ -1,0 +1,128 @@
+"""`climatenerf evaluate`: the whole of it on a short fit, and what it refuses."""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from climatenerf import cli
+from climatenerf.errors import UserError
+from climatenerf.evaluation.report import check_place
+from climatenerf.storage import write_json
+
+REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "street"
+
+
+def complaint(capsys, *words):
+    capsys.readouterr()
+    assert cli.main([str(word) for word in words]) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    return err
+
+
+def test_it_wants_to_know_against_what(capsys, tmp_path):
+    assert "--reference" in complaint(capsys, "evaluate", tmp_path, "-o", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_without_a_run_is_refused(capsys, tmp_path):
+    err = complaint(capsys, "evaluate", tmp_path, "--reference", "-o", tmp_path / "out")
+    assert str(tmp_path) in err and not (tmp_path / "out").exists()
+
+
+def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
+    check_place(tmp_path / "new" / "report", ["clean"])
+    assert (tmp_path / "new" / "report").is_dir()
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "clean.jpg").write_bytes(b"mine")
+    with pytest.raises(UserError, match="overwritten"):
+        check_place(other, ["clean"])
+    write_json(other / "report.json", {"mine": 1})
+    with pytest.raises(UserError, match="no report"):
+        check_place(other, ["clean"])
+    write_json(other / "report.json", {"scores": {}})
+    check_place(other, ["clean"])
+    assert (other / "clean.jpg").read_bytes() == b"mine"
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A short fit of the reference street in small steps with small grids."""
+    from climatenerf.field.presets import PRESETS
+    from climatenerf.training import fit as fit_module
+    from climatenerf.training import run as run_module
+
+    folder = tmp_path_factory.mktemp("reference") / "run"
+    small = dataclasses.replace(
+        PRESETS["cpu"], geometry_log2_rows=14, appearance_log2_rows=14, cascades=4
+    )
+    settings = functools.partial(fit_module.FitSettings, samples_per_step=2**14)
+    words = ["fit", str(REFERENCE), "-o", str(folder), "--steps", "400", "--downscale", "4"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "cpu", small)
+        patch.setattr(fit_module, "FitSettings", settings)
+        patch.setattr(run_module, "PREVIEW_WIDTH", 64)
+        assert cli.main(words) == 0
+    return folder
+
+
+@pytest.mark.slow
+def test_the_whole_report(run_folder, tmp_path, capsys):
+    out = tmp_path / "report"
+    names = ["smog-mid", "flood-low", "snow-deep"]
+    words = ["evaluate", str(run_folder), "--reference", "-o", str(out), "--views", "t04"]
+    assert cli.main([*words, "--weathers", *names]) == 0
+    table = capsys.readouterr().out
+    assert "screen-reflection" in table and "report.md" in table
+    report = json.loads((out / "report.json").read_text())
+    assert report["scores"]["clean"] == report["clean"]
+    # Blurred as it is, the fit knows the street: better than grey, worse than the truth.
+    assert 12 < report["clean"]["psnr"] < 40 and 0 < report["clean"]["ssim"] < 1
+    geometry = report["geometry"]
+    assert 0 < geometry["depth_abs_rel"] < 0.6 and 0 < geometry["depth_rmse_m"] < 30
+    assert 0 < geometry["normal_ground_roof_median_deg"] < 80
+    assert 0 <= geometry["floater_mass"] < 0.9 and 0 <= geometry["sky_empty_fraction"] <= 1
+    assert 0.2 < report["labels"]["miou"] < 1
+    assert set(report["weather"]) == set(names)
+    for name in names:
+        assert 8 < report["weather"][name]["psnr"] < 40
+        with Image.open(out / f"{name}.jpg") as picture:
+            assert picture.width > 3 * 300
+    assert 0 < report["weather"]["smog-mid"]["transmittance_error"] < 0.3
+    assert report["weather"]["flood-low"]["water_iou"] > 0.5
+    assert report["weather"]["snow-deep"]["true_thickness_cm"] == pytest.approx(15, abs=2)
+    baselines = report["baselines"]
+    assert set(baselines["frame-noise"]) == set(names)
+    assert set(baselines["screen-reflection"]) == set(baselines["flat-plane"]) == {"flood-low"}
+    assert set(baselines["depth-fog"]) == {"smog-mid"}
+    assert set(baselines["white-paint"]) == {"snow-deep"}
+    warped = report["consistency"]
+    assert warped["clean"]["next"] < warped["clean"]["far"]
+    assert warped["baselines"]["frame-noise"]["smog"]["next"] > 1.5 * warped["smog"]["next"]
+    assert np.isfinite(report["completeness"]["mirror_psnr"])
+    # The same once more is the same report, and a weather that there is none of is named.
+    assert "flood-low" in complaint(capsys, *words, "--weathers", "flod-low")
+
+
+@pytest.mark.slow
+def test_a_run_of_another_place_is_refused(run_folder, tmp_path, capsys):
+    other = tmp_path / "run"
+    other.mkdir()
+    for path in run_folder.iterdir():
+        if path.is_file():
+            (other / path.name).write_bytes(path.read_bytes())
+    told = json.loads((other / "scene.json").read_text())
+    place = tmp_path / "place"
+    (place / "images").mkdir(parents=True)
+    for view in told["views"]:
+        (place / view["path"]).write_bytes(b"")
+    told["root_absolute"], told["root"] = str(place), str(place)
+    (other / "scene.json").write_text(json.dumps(told))
+    err = complaint(capsys, "evaluate", other, "--reference", "-o", tmp_path / "out")
+    assert "no reference set" in err and not (tmp_path / "out").exists()
