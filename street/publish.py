@@ -19,6 +19,7 @@ from street.write import mean_of, save_jpeg, save_png, truths, write_pictures, w
 
 SNOW = {"snow-thin": 0.03, "snow-deep": 0.15}  # m
 LEVELS = {"flood-low": 0.25, "flood-high": 0.6, "flood-waves": 0.6}  # m above the ground datum
+MOST = 3.0  # times the depth in the open: thicker snow is what hangs over an edge
 WAVE_TIME = 1.0  # s
 EXPOSURE_SPREAD = 0.12  # of the busy variant's pictures, as the logarithm's deviation
 TURN = ((0.5, -0.7, 0.4), 40.0)  # axis and degrees of the turned variant
@@ -50,6 +51,8 @@ def write_reference(store: Path, out: Path, width: int, height: int) -> None:
             passed = smog.transmittance(kind, truth["depth"], pose[2, 3], rise, datum)
             picture = encode(smog.smoggy(clean, passed))
             save_png(picture, out / "weather" / kind / f"{Path(name).stem}.png")
+            path = out / "weather" / kind / f"{Path(name).stem}.npz"
+            _save_arrays(path, transmittance=passed.astype(np.float16))
         for group, folder in (
             *((kind, out / "weather" / kind) for kind in (*LEVELS, *SNOW)),
             ("mirror", out / "mirror"),
@@ -90,7 +93,8 @@ def write_snow_truth(store: Path, out: Path, width: int, height: int) -> None:
                     _save_arrays(
                         out / "weather" / kind / f"{Path(name).stem}.npz",
                         depth=data["depth"],
-                        thickness=data["thickness"].astype(np.float16),
+                        # Over an edge the snow reaches half a cell beyond what it lies on.
+                        thickness=np.minimum(data["thickness"], MOST * depth).astype(np.float16),
                     )
 
 

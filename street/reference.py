@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from street.layout import build_scene, camera_poses, ground_datum, measuring_poses, passers_by
+from street.mirror import mirrored_view
 from street.publish import LEVELS, SNOW, WAVE_TIME, write_reference
 from street.render import load, render_view
 from street.smog import air_box, scattering_air
 from street.snowfall import snow_meshes
 from street.store import add, stored
-from street.water import mirror, still, wavy
+from street.water import still, wavy
 from street.write import write_demo
 
 WIDTH, HEIGHT = 384, 216
@@ -55,7 +56,7 @@ def groups() -> list[Group]:
         Group("flood-waves", test, 100, 2),
         Group("snow-deep", test, 49, 2),
         Group("snow-thin", test, 49, 2),
-        Group("mirror", test, 49, 2),
+        Group("mirror", test, 36, 1),
         Group("people", walk, 49, 2),
         Group("clean", test, 49, 3),
         Group("scattering", test[:1], 25, 1),
@@ -70,8 +71,6 @@ def open_group(group: Group, view: int, folder: Path, threads: int):
         water = still(datum + LEVELS[group.name])
     if group.name == "flood-waves":
         water = wavy(datum + LEVELS[group.name], WAVE_TIME, folder)
-    if group.name == "mirror":
-        water = mirror(datum + LEVELS["flood-high"])
     if group.name == "scattering":
         air = mi.load_dict(scattering_air())
         water = air_box(air)
@@ -100,7 +99,12 @@ def trace(group: Group, store: Path, threads: int) -> None:
                 start = time.monotonic()
                 seed = 1000 * number + index
                 scene, air = opened
-                fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed, air=air)
+                if group.name == "mirror":
+                    level = ground_datum()[0] + LEVELS["flood-high"]
+                    size = (WIDTH, HEIGHT)
+                    fresh = mirrored_view(scene, pose, level, size, group.samples, seed)
+                else:
+                    fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed, air=air)
                 add(path, fresh[..., :3])
                 took = time.monotonic() - start
                 print(f"{group.name} pass {number} {name} {took:.1f} s", flush=True)

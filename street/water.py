@@ -1,4 +1,4 @@
-"""Flood water for the path tracer: a smooth dielectric over a medium that absorbs, or a mirror."""
+"""Flood water for the path tracer: a smooth dielectric over a medium that absorbs."""
 
 from pathlib import Path
 
@@ -17,15 +17,6 @@ STEP = 0.03  # m: a fifth of the shortest wave
 def still(z: float) -> dict:
     """A level surface at height z, with absorbing water below."""
     return {"type": "rectangle", "to_world": _plane(z), **_water()}
-
-
-def mirror(z: float) -> dict:
-    """A perfect mirror at height z: what a still surface would show without Fresnel's law."""
-    return {
-        "type": "rectangle",
-        "to_world": _plane(z),
-        "bsdf": {"type": "conductor", "material": "none"},
-    }
 
 
 def wavy(z: float, time: float, folder: Path) -> dict:

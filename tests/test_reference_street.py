@@ -6,18 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from street import publish, render, smog, snowfall, water  # noqa: E402
 from street.geometry import box, quad  # noqa: E402
-from street.layout import build_scene, camera_poses, ground_datum, measuring_poses, passers_by  # noqa: E402
+from street.layout import (  # noqa: E402
+    build_scene,
+    camera_poses,
+    ground_datum,
+    look,
+    measuring_poses,
+    passers_by,
+)
+from street.mirror import mirrored_view  # noqa: E402
 from street.objects import bench, fence, table  # noqa: E402
 from street.sky import SUN_AZIMUTH, SUN_ELEVATION, direction  # noqa: E402
 from street.terrain import DIP_AT, DIP_DEPTH, ground_height  # noqa: E402
 from street.textures import make  # noqa: E402
-from street.truth import TRAIN_IDS, layers, sun_directions  # noqa: E402
+from street.truth import TRAIN_IDS, layers, pixel_rays, sun_directions  # noqa: E402
 
 
 @pytest.fixture
@@ -89,7 +98,7 @@ def test_the_same_seed_lets_the_same_snow_fall(yard):
 
 def test_waves_of_the_mesh_are_the_programs_own(tmp_path):
     from climatenerf.weather.parameters import Flood
-    from climatenerf.weather.waves import heights, make_waves
+    from climatenerf.weather.waves import at_time, heights, make_waves, slopes
 
     water.wavy(5.0, 1.0, tmp_path)
     raw = (tmp_path / "water.ply").read_bytes()
@@ -107,6 +116,13 @@ def test_waves_of_the_mesh_are_the_programs_own(tmp_path):
     waves = make_waves(
         Flood(level=0.0, wind_speed=water.WIND, wave_scale=water.WAVE_SCALE), water.SEED
     )
+    x, y = np.meshgrid(x0 + water.STEP * np.arange(80, 300), y0 + water.STEP * np.arange(80, 300))
+    places = torch.from_numpy(np.stack([x.ravel(), y.ravel()], -1)).float()
+    own = analytic[80:300, 80:300].reshape(-1, 2)
+    for time, same in ((1.0, True), (1.5, False)):
+        found = slopes(at_time(waves, time), places, torch.zeros(len(places)))[0].numpy()
+        share = ((found - own) ** 2).mean() / (own**2).mean()
+        assert (share < 0.01) == same, (time, share)
     spread = np.sqrt(sum(float(heights(waves, i, 1.0).var()) for i in range(len(waves.tiles))))
     assert z[inner].std() == pytest.approx(spread, rel=0.25)
     assert abs(z[0]).max() < 1e-5 and abs(z[:, -1]).max() < 1e-5, "calm at the border"
@@ -316,10 +332,10 @@ def test_traced_water_obeys_fresnel_and_beer(degrees):
         return float(np.array(mi.render(mi.load_dict(scene), seed=1))[..., :3].mean())
 
     black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-    assert seen({"bsdf": black}, sky=True) == pytest.approx(reflected, abs=0.01)
+    assert seen({"bsdf": black}, sky=True) == pytest.approx(reflected, abs=0.003)
     shining = {"bsdf": black, "emitter": {"type": "area", "radiance": 1.0}}
     left = (1 - reflected) * np.exp(-water.ABSORPTION * depth / inside) / water.IOR**2
-    assert seen(shining, sky=False) == pytest.approx(left, abs=0.012)
+    assert seen(shining, sky=False) == pytest.approx(left, abs=0.004)
 
 
 def test_smog_without_fall_off_is_exponential_and_haze_is_summed_right():
@@ -382,29 +398,35 @@ def test_true_smog_agrees_with_an_absorbing_medium_in_the_path_tracer(tmp_path):
     assert np.sqrt((apart**2).mean()) < 2.0 * np.sqrt((noise**2).mean())
 
 
-def test_a_mirror_shows_what_a_mirrored_camera_sees(tmp_path):
+def test_the_mirror_shows_what_a_mirrored_camera_sees():
+    """A ball beside the axis under a sky that is dark below: Mitsuba's own camera, mirrored."""
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("scalar_rgb")
-    flat = mi.ScalarTransform4f()
+    sky = np.zeros((32, 64, 3), np.float32)
+    sky[:16] = [0.4, 0.6, 0.9]
     red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.2, 0.1]}}
-
-    def scene(with_mirror, eye, target, up):
-        content = {
-            "type": "scene", "integrator": {"type": "path", "max_depth": 6},
-            "sky": {"type": "constant", "radiance": 0.5},
-            "ball": {"type": "sphere", "center": [0.3, 0, 1.0], "radius": 0.4, "bsdf": red},
-            "sensor": {
-                "type": "perspective", "fov": 20.0, "near_clip": 0.01,
-                "to_world": flat.look_at(origin=eye, target=target, up=up),
-                "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent", "sample_count": 256},
-            },
-        }  # fmt: skip
-        if with_mirror:
-            content["water"] = water.mirror(0.0)
-        return np.array(mi.render(mi.load_dict(content), seed=1))[..., :3]
-
-    seen = scene(True, [3, 0, 1.5], [0.3, 0, -1.0], [0, 0, 1])
-    mirrored = scene(False, [3, 0, -1.5], [0.3, 0, 1.0], [0, 0, -1])
-    # The mirrored camera's picture is turned left to right; only the ball's own light differs.
-    assert np.abs(seen - mirrored[:, ::-1]).mean() < 0.05
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 3},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": turn},
+        "ball": {"type": "sphere", "center": [0.6, 4.0, 0.9], "radius": 0.5, "bsdf": red},
+    })  # fmt: skip
+    pose, level = look(np.array([0.0, 0.0, 1.6]), 3.0, -30.0), 0.2
+    seen = mirrored_view(scene, pose, level, (64, 36), 64, 0)
+    flip = np.diag([1.0, 1.0, -1.0, 1.0])
+    flip[2, 3] = 2 * level
+    wanted = render.render_view(scene, flip @ pose, 64, 36, 256, 1)[..., :3]
+    dry = render.render_view(scene, pose, 64, 36, 256, 1)[..., :3]
+    rays = pixel_rays(pose, 64, 36)
+    t = (level - pose[2, 3]) / np.minimum(rays[..., 2], -1e-9)
+    assert (rays[..., 2] < 0).all()
+    ball = dry[..., 0] > 1.2 * dry[..., 2]  # seen directly, before the mirror
+    grown = np.pad(ball, 1)
+    beside = ~(grown[1:-1, 1:-1] | grown[:-2, 1:-1] | grown[2:, 1:-1] | grown[1:-1, :-2])
+    beside &= ~grown[1:-1, 2:]
+    assert 0.02 < ball.mean() < 0.5 and np.isfinite(t).all()
+    apart = np.abs(seen - wanted).max(-1)[beside]
+    assert np.median(apart) < 0.02 and (apart < 0.12).mean() > 0.97
+    red_there = (wanted[..., 0] > 1.2 * wanted[..., 2]) & beside
+    assert red_there.mean() > 0.02, "the mirrored ball is in the picture"
+    assert np.abs(seen - wanted).max(-1)[red_there].mean() < 0.05

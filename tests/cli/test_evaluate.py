@@ -46,9 +46,14 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
     write_json(other / "report.json", {"mine": 1})
     with pytest.raises(UserError, match="no report"):
         check_place(other, ["clean"])
-    write_json(other / "report.json", {"scores": {}})
+    write_json(other / "report.json", {"scores": {}, "pictures": ["haze.jpg"]})
+    (other / "haze.jpg").write_bytes(b"old")
+    with pytest.raises(UserError, match="overwritten"):
+        check_place(other, ["clean"])
+    assert (other / "clean.jpg").read_bytes() == b"mine" and (other / "haze.jpg").exists()
+    (other / "clean.jpg").unlink()
     check_place(other, ["clean"])
-    assert (other / "clean.jpg").read_bytes() == b"mine"
+    assert not (other / "haze.jpg").exists(), "none is left of what is not measured now"
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +100,9 @@ def test_the_whole_report(run_folder, tmp_path, capsys):
         with Image.open(out / f"{name}.jpg") as picture:
             assert picture.width > 3 * 300
     assert 0 < report["weather"]["smog-mid"]["transmittance_error"] < 0.3
-    assert report["weather"]["flood-low"]["water_iou"] > 0.5
+    assert report["weather"]["flood-low"]["water_iou"] > 0.7
+    assert report["weather"]["flood-low"]["waterline_error_px"] < 40
+    assert report["frame"] == {"scale": pytest.approx(1), "up_deg": 0.0, "datum_cm": 0.0}
     assert report["weather"]["snow-deep"]["true_thickness_cm"] == pytest.approx(15, abs=2)
     baselines = report["baselines"]
     assert set(baselines["frame-noise"]) == set(names)
@@ -106,7 +113,7 @@ def test_the_whole_report(run_folder, tmp_path, capsys):
     assert warped["clean"]["next"] < warped["clean"]["far"]
     assert warped["baselines"]["frame-noise"]["smog"]["next"] > 1.5 * warped["smog"]["next"]
     assert np.isfinite(report["completeness"]["mirror_psnr"])
-    # The same once more is the same report, and a weather that there is none of is named.
+    # A weather that there is none of is named.
     assert "flood-low" in complaint(capsys, *words, "--weathers", "flod-low")
 
 

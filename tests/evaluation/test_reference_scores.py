@@ -4,13 +4,14 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
-from climatenerf.scene import Camera
+from climatenerf.scene import Camera, Scene, View
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 ROAD, TERRAIN, LEAVES, SKY = 0, 9, 8, 10  # Cityscapes train ids
@@ -95,32 +96,39 @@ def test_floaters_and_sky_are_counted_where_they_are():
     assert (free[~truth.sky] < truth.depth[~truth.sky]).all() and np.isinf(free[truth.sky]).all()
 
 
+def waterline(depth, level, truth, mask):
+    return weather_scores.waterline_scores(
+        [depth], [mask], [truth.c2w], level, (truth,), 0.3, 1 / CAMERA.fx
+    )
+
+
 def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_distance():
     truth = truth_of(rise=0.1)  # water at 0.3 m ends at y = 3
-    line, _ = weather_scores.crossings(truth.points - truth.c2w[:3, 3], truth.points[..., 2] - 0.3)
+    from_eye = truth.points - truth.c2w[:3, 3]
+    line, _ = weather_scores.crossings(from_eye, truth.points[..., 2] - 0.3)
     np.testing.assert_allclose(line[:, 1], 3.0, atol=0.02)
-
-    def ours(level):
-        rays = truth.rays_d
-        t = (level - truth.c2w[2, 3]) / np.minimum(rays[..., 2], -1e-9)
-        wet = t < truth.depth
-        return {
-            "depth": np.where(wet, t, truth.depth),
-            "water_depth": np.where(wet, level - truth.points[..., 2], 0.0),
-            "mask_water": wet.astype(float),
-        }
-
-    right = weather_scores.waterline_scores([ours(0.3)], [truth.c2w], 0.3, (truth,), 0.3, 0.02)
-    assert right["waterline_error_cm"] < 0.5 and right["waterline_error_px"] < 0.1
-    assert right["waterline_height_error_cm"] < 2
-    assert right["water_iou"] == 1.0
+    wet = weather_scores.plane_first(truth, 0.3)
+    assert wet.any() and (truth.points[wet][:, 2] < 0.3).all()
+    right = waterline(truth.depth, 0.3, truth, wet)
+    assert right["waterline_error_cm"] < 0.01 and right["waterline_error_px"] < 0.01
+    assert right["waterline_height_error_cm"] < 2 and right["water_iou"] == 1.0
     # 2 cm too high on a slope of one in ten: the line lies 20 cm further.
-    high = weather_scores.waterline_scores([ours(0.32)], [truth.c2w], 0.32, (truth,), 0.3, 0.02)
+    high = waterline(truth.depth, 0.32, truth, weather_scores.plane_first(truth, 0.32))
     assert high["waterline_error_cm"] == pytest.approx(20.0, rel=0.05)
+    assert high["waterline_height_error_cm"] == pytest.approx(2.0, abs=0.5)
+    assert 0.9 < high["water_iou"] < 1
     # 10 m is said where there is no line of ours at all.
-    dry = ours(0.3) | {"mask_water": np.zeros(truth.depth.shape), "depth": truth.depth + 50.0}
-    none = weather_scores.waterline_scores([dry], [truth.c2w], 0.3, (truth,), 0.3, 0.02)
-    assert none["water_iou"] == 0.0
+    none = waterline(truth.depth, -5.0, truth, np.zeros(wet.shape))
+    assert none["waterline_error_cm"] == pytest.approx(1000.0) and none["water_iou"] == 0.0
+
+
+def test_a_shore_that_is_not_there_counts():
+    """A hump of ours in the middle of the water has a shore of its own."""
+    truth = truth_of(rise=0.1)
+    hump = truth.depth.copy()
+    hump[36:46, 10:54] *= 0.85
+    found = waterline(hump, 0.3, truth, weather_scores.plane_first(truth, 0.3))
+    assert found["waterline_error_cm"] > 1
 
 
 def test_snow_too_thin_by_two_centimetres_is_two_centimetres_off():
@@ -167,9 +175,8 @@ def test_tuning_finds_the_constants_that_made_the_truth():
     share = baselines.white_paint(dry)
     assert share[~np.isinf(dry.depth)].min() > 0.99 and share[np.isinf(dry.depth)].max() < 1e-6
     painted = baselines.display(baselines.painted(dry.linear, share, colour))
-    white = baselines.tuned_colour(
-        [dry.linear], [share], [np.round(255 * painted).astype(np.uint8)]
-    )
+    true = [np.round(255 * painted).astype(np.uint8)]
+    white = baselines.tuned_colour([dry.linear * (1 - share[..., None])], [share], true)
     np.testing.assert_allclose(white, colour, atol=0.01)
 
 
@@ -200,6 +207,47 @@ def test_fresnel_of_the_baselines_is_the_textbooks():
     angles = np.deg2rad([0.0, 30.0, 60.0, 75.0, 80.0, 85.0])
     found = baselines.fresnel(np.cos(angles), 1.333)
     np.testing.assert_allclose(found, [0.0204, 0.0214, 0.0597, 0.212, 0.348, 0.584], rtol=0.01)
+
+
+def test_a_colour_is_tuned_for_what_is_displayed():
+    """No one colour stands for dark and bright: the best on the screen is darker than the mean."""
+    rng = np.random.default_rng(1)
+    true = [np.where(rng.uniform(size=(20, 20, 1)) < 0.3, 250, 40).astype(np.uint8).repeat(3, -1)]
+    base, share = [np.zeros((20, 20, 3))], [np.ones((20, 20))]
+    found = baselines.tuned_colour(base, share, true)
+
+    def error(colour):
+        return ((baselines.display(colour) - true[0] / 255.0) ** 2).mean()
+
+    mean = baselines.linear_of(true[0]).mean((0, 1))
+    assert error(found) < 0.97 * error(mean)
+
+
+def test_the_air_of_the_truth_has_no_error():
+    passed = np.linspace(0, 1, 12).reshape(3, 4)
+    assert weather_scores.transmittance_scores([passed], [passed])["transmittance_error"] == 0
+    off = weather_scores.transmittance_scores([passed], [np.clip(passed + 0.1, 0, 2)])
+    assert off["transmittance_error"] == pytest.approx(0.1)
+
+
+def test_classes_are_what_most_views_that_see_a_place_say(tmp_path):
+    pose = looking_down()
+    depth = sloped_ground(pose)
+    views = []
+    for name, label, factor in (("a", ROAD, 1), ("b", ROAD, 1), ("c", LEAVES, 1), ("d", 13, 0.5)):
+        path = tmp_path / f"{name}.png"
+        values = np.where(np.isinf(depth), SKY, label).astype(np.uint8)
+        Image.fromarray(values).save(path)
+        view = View(f"{name}.jpg", tmp_path / f"{name}.jpg", 0, pose, label_path=path)
+        views.append((view, factor * depth))
+    scene = Scene(tmp_path, "test", (CAMERA,), tuple(view for view, _ in views))
+    depths = {view.name: seen for view, seen in views}
+    points = pose[:3, 3] + np.where(np.isinf(depth), 0, depth)[..., None] * world_rays(CAMERA, pose)
+    found = geometry.voted_labels(scene, depths, points, np.isinf(depth))
+    assert (found[~np.isinf(depth)] == geometry.ROAD).all(), "two against one; the fourth is hidden"
+    assert (found[np.isinf(depth)] == geometry.SKY).all()
+    nobody = geometry.voted_labels(scene, {}, points, np.isinf(depth))
+    assert (nobody[~np.isinf(depth)] == 255).all()
 
 
 def frames_of(pattern, step=0.5):

@@ -33,7 +33,7 @@ def run(options: Evaluate) -> int:
 
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.evaluation.report import check_place, table_text, write_report
-    from climatenerf.evaluation.scores import Place, evaluate
+    from climatenerf.evaluation.scores import Place, check_views, evaluate
     from climatenerf.field.checkpoint import load_field
     from climatenerf.scene import load_scene
     from climatenerf.storage import read_json
@@ -43,9 +43,12 @@ def run(options: Evaluate) -> int:
     config = check_config(options.run)
     scene = load_scene(options.run)
     reference = read_reference(scene.root, options.views, options.weathers)
+    place = Place(field, scene, reference)
+    check_views(place)
+    measured = options.run / "metrics.json"  # absent where a fit was stopped before its end
+    metrics = read_json(measured, "the run's measurements") if measured.exists() else {}
     names = ["clean", *(kind.name for kind in reference.weathers)]
     check_place(options.out, names)
-    metrics = read_json(options.run / "metrics.json", "the run's measurements")
     with progress.Bar("evaluate", len(names) + 7) as bar:
         scores = evaluate(
             Place(field, scene, reference), lambda what: bar.advance(1, {"now": what})
@@ -53,7 +56,7 @@ def run(options: Evaluate) -> int:
     about = {
         "run": options.run.resolve().name,
         "capture": scene.root.name,
-        "seconds": round(float(metrics.get("seconds", 0.0)), 1),
+        "seconds": metrics.get("seconds"),
         "steps": metrics.get("steps"),
         "downscale": config.get("downscale"),
         "views": [Path(truth.name).stem for truth in reference.truths],

@@ -19,6 +19,7 @@ REACHES = np.geomspace(0.05, 60.0, 64)  # m along a reflected ray
 THICK = 0.5  # m behind a depth that still counts as its surface
 NOISE, NOISE_CELLS = 0.08, (9, 16)  # deviation in display values; cells across a picture
 FACTORS = np.geomspace(0.25, 4.0, 33)  # of the nominal extinction that fog is tuned over
+GAINS = np.linspace(0.7, 1.3, 25)  # of a colour found in linear light
 NAMES = ("depth-fog", "flat-plane", "screen-reflection", "white-paint", "frame-noise")
 
 
@@ -142,17 +143,27 @@ def painted(
 
 
 def tuned_colour(
-    views: list[Float[np.ndarray, "h w 3"]],
+    bases: list[Float[np.ndarray, "h w 3"]],
     shares: list[Float[np.ndarray, "h w"]],
     true: list[UInt8[np.ndarray, "h w 3"]],
 ) -> Float[np.ndarray, "3"]:
-    """The colour that, laid over the views by `shares`, is nearest to the truth in linear light."""
+    """The colour that, added to linear pictures by `shares`, is nearest to the truth as displayed.
+
+    Least squares in linear light, then a search over `GAINS` of each channel.
+    """
     top, bottom = np.zeros(3), 1e-9  # nothing is covered: 0/0
-    for linear, share, picture in zip(views, shares, true, strict=True):
-        s = share[..., None]
-        top += (s * (linear_of(picture) - (1 - s) * linear)).sum((0, 1))
-        bottom += float((s**2).sum())
-    return np.clip(top / bottom, 0.0, 1.0)
+    for base, share, picture in zip(bases, shares, true, strict=True):
+        top += (share[..., None] * (linear_of(picture) - base)).sum((0, 1))
+        bottom += float((share**2).sum())
+    colour = np.clip(top / bottom, 0.0, 1.0)
+
+    def error(gain: float, c: int) -> float:
+        return sum(
+            float(((display(b[..., c] + s * gain * colour[c]) - t[..., c] / 255.0) ** 2).sum())
+            for b, s, t in zip(bases, shares, true, strict=True)
+        )
+
+    return colour * [min(GAINS, key=lambda gain, c=c: error(gain, c)) for c in range(3)]
 
 
 def frame_noise(picture: Float[np.ndarray, "h w 3"], seed: int) -> Float[np.ndarray, "h w 3"]:

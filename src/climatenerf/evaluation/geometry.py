@@ -28,7 +28,8 @@ ROUNDS = 20000  # places at once
 def depth_scores(depth: list[np.ndarray], truths: tuple[Truth, ...]) -> dict[str, float]:
     """Relative and absolute error of ray lengths, where the truth is nearer than `FARTHEST`.
 
-    A ray that meets nothing, or something beyond twice the truth, counts as twice the truth.
+    A ray that meets nothing, or something beyond twice the truth, counts as twice the truth, so
+    that a single hole does not outweigh all else.
     """
     relative, metres = [], []
     for ours, truth in zip(depth, truths, strict=True):

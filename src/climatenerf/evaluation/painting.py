@@ -32,28 +32,25 @@ def tune(
     air = smog.medium(weather.smog, ground_z)
     if air is not None:
         out["sigma"] = baselines.tuned_sigma(dry, real, air.sigma, np.array(air.colour))
-    linear = [each.linear for each in dry]
     if weather.flood.level is not None:
         level = ground_z + weather.flood.level
         wet = [baselines.wet_pixels(each, level)[0].astype(float) for each in dry]
-        out["flat"] = baselines.tuned_colour(linear, wet, real)
-        mirrored, body = [], []
-        for each, share in zip(dry, wet, strict=True):
+        out["flat"] = baselines.tuned_colour(_uncovered(dry, wet), wet, real)
+        bases, shares = [], []
+        for base, each, share in zip(_uncovered(dry, wet), dry, wet, strict=True):
             reflected, part = _mirrored(kind, ground_z, each)
-            mirrored.append(
-                baselines.painted(linear[len(body)], share, (part[..., None] * reflected))
-            )
-            body.append(share * (1 - part))
-        # What is left of the water's colour after its reflection: least squares over all of it.
-        top = sum(
-            (b[..., None] * (baselines.linear_of(r) - m)).sum((0, 1))
-            for b, m, r in zip(body, mirrored, real, strict=True)
-        )
-        out["body"] = np.clip(top / max(sum(float((b**2).sum()) for b in body), 1e-9), 0.0, 1.0)
+            bases.append(base + (share * part)[..., None] * reflected)
+            shares.append(share * (1 - part))
+        out["body"] = baselines.tuned_colour(bases, shares, real)
     if weather.snow.depth is not None:
         shares = [baselines.white_paint(each) for each in dry]
-        out["white"] = baselines.tuned_colour(linear, shares, real)
+        out["white"] = baselines.tuned_colour(_uncovered(dry, shares), shares, real)
     return out
+
+
+def _uncovered(dry: list[Dry], shares: list[np.ndarray]) -> list[np.ndarray]:
+    """What of the clean pictures is left beside what covers them."""
+    return [d.linear * (1 - s[..., None]) for d, s in zip(dry, shares, strict=True)]
 
 
 def painted(

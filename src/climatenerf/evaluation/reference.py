@@ -80,7 +80,10 @@ class WeatherTruth:
         return read_rgb((self.folder / view).with_suffix(".png"))
 
     def layers(self, view: str) -> dict[str, np.ndarray]:
-        """True layers, where this weather has some (snow: `depth` and `thickness`, m)."""
+        """True layers, where this weather has some.
+
+        Smog: `transmittance`. Snow: `depth` along the ray and vertical `thickness`, m.
+        """
         return _arrays((self.folder / view).with_suffix(".npz"))
 
 

@@ -23,19 +23,24 @@ GAIN = 2.0  # of the difference pictures
 def check_place(out: Path, pictures: list[str]) -> None:
     """Refuses a folder where a report would overwrite what is no report, and makes it.
 
+    Pictures of an earlier report are removed, so that none stays of what is not measured now.
+
     Args:
         out: folder to be.
-        pictures: names of the weathers.
+        pictures: names of those that will be written.
     """
-    old = out / FILE_NAME
-    if old.exists():
-        if "scores" not in read_json(old, "an earlier report"):
-            raise UserError(f"{old} is no report of climatenerf; choose another folder with -o")
-    else:
-        for name in (TEXT_NAME, OVERVIEW, *(f"{each}.jpg" for each in pictures)):
-            if (out / name).exists():
-                raise UserError(f"{out / name} would be overwritten; choose another -o")
+    old: set[str] = set()
+    if (out / FILE_NAME).exists():
+        earlier = read_json(out / FILE_NAME, "an earlier report")
+        if "scores" not in earlier:
+            raise UserError(f"{out / FILE_NAME} is no report; choose another folder with -o")
+        old = {TEXT_NAME, *map(str, earlier.get("pictures", []))}
+    for name in (TEXT_NAME, OVERVIEW, *(f"{each}.jpg" for each in pictures)):
+        if (out / name).exists() and name not in old:
+            raise UserError(f"{out / name} would be overwritten; choose another folder with -o")
     make_folder(out)
+    for name in old:
+        (out / name).unlink(missing_ok=True)
 
 
 def write_report(scores: Scores, about: dict[str, Any], out: Path) -> None:
@@ -67,6 +72,7 @@ def write_report(scores: Scores, about: dict[str, Any], out: Path) -> None:
             "schema_version": SCHEMA_VERSION,
             "climatenerf": climatenerf.__version__,
             "run": about,
+            "pictures": [OVERVIEW, *(f"{name}.jpg" for name in scores.pictures)],
             "scores": _finite(scores.table),
             **_finite(scores.table),
         },
@@ -77,6 +83,7 @@ def table_text(table: dict[str, Any]) -> str:
     """The scores as lines for a terminal."""
     lines = [
         f"clean            PSNR {_db(table['clean']['psnr'])}  SSIM {table['clean']['ssim']:.3f}",
+        _line("frame", table["frame"]),
         _line("geometry", table["geometry"]),
         _line("classes", table["labels"]),
         _line("mirrored cameras", table["completeness"]),

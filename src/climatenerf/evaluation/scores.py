@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from climatenerf.errors import UserError
 from climatenerf.evaluation import baselines, geometry, weather_scores
@@ -28,7 +28,6 @@ from climatenerf.render.stage import Stage, prepare
 from climatenerf.render.view import RENDER_STEP, camera_rays
 from climatenerf.render.world import World
 from climatenerf.scene import Camera, Scene, View
-from climatenerf.weather import smog
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
 
@@ -82,7 +81,7 @@ def evaluate(place: Place, tell: Tell) -> Scores:
     Raises:
         UserError: the run lacks a test view, was fitted to it, or has it in another size.
     """
-    check_place(place)
+    check_views(place)
     truths = place.reference.truths
     tell("clean views")
     dry = [dry_view(place, truth) for truth in truths]
@@ -91,7 +90,8 @@ def evaluate(place: Place, tell: Tell) -> Scores:
     scores = Scores({"clean": picture_scores(clean, real)})
     scores.pictures["clean"] = _rows(truths, clean, real)
     tell("geometry")
-    scores.table["geometry"] = geometry_scores(place, dry)
+    scores.table["frame"] = frame_scores(place)
+    scores.table["geometry"] = geometry_scores(place, dry, scores.table["frame"]["scale"])
     tell("classes")
     scores.table["labels"] = label_scores(place, dry)
     tell("mirrored cameras")
@@ -106,7 +106,7 @@ def evaluate(place: Place, tell: Tell) -> Scores:
     return scores
 
 
-def check_place(place: Place) -> None:
+def check_views(place: Place) -> None:
     """Refuses a run that cannot be measured honestly."""
     for truth in place.reference.truths:
         view = place.view(truth)
@@ -154,14 +154,14 @@ def dry_from(place: Place, camera: Camera, c2w: Float[np.ndarray, "4 4"]) -> Dry
     return Dry(linear.double().numpy(), layers["depth"], layers["normal"], rays_d, c2w, camera)
 
 
-def geometry_scores(place: Place, dry: list[Dry]) -> dict[str, float]:
-    """Depth, normals, floaters and sky."""
+def geometry_scores(place: Place, dry: list[Dry], scale: float) -> dict[str, float]:
+    """Depth, normals, floaters and sky; `scale` is that of the run's metres, see `frame_scores`."""
     truths = place.reference.truths
     normals = [each.normal @ each.c2w[:3, :3] for each in dry]
     absorbed, skyward = [], []
     for truth in truths:
         camera, c2w = place.pose(truth)
-        free = torch.from_numpy(geometry.free_space(truth).astype(np.float32).ravel())
+        free = torch.from_numpy((scale * geometry.free_space(truth)).astype(np.float32).ravel())
         lost = 1 - passing(place.fitted, camera, c2w, free.clamp_max(1e9))
         absorbed.append(lost.view(truth.depth.shape).numpy())
         whole = passing(place.fitted, camera, c2w, torch.full_like(free, 1e9))
@@ -190,9 +190,9 @@ def label_scores(place: Place, dry: list[Dry]) -> dict[str, float]:
     train = [view for view in place.scene.of_split("train") if view.label_path is not None]
     if not train:
         return {"miou": float("nan")}
-    step = max(1, len(train) // geometry.VOTERS)
+    chosen = np.unique(np.linspace(0, len(train) - 1, geometry.VOTERS).round().astype(int))
     world, depths = World(place.fitted, place.fitted.near), {}
-    for view in train[::step][: geometry.VOTERS]:
+    for view in (train[i] for i in chosen):
         camera = place.scene.cameras[view.camera]
         depths[view.name] = see_frame(world, camera, place.scene.c2w_world(view))[1]["depth"]
     labels = []
@@ -204,7 +204,10 @@ def label_scores(place: Place, dry: list[Dry]) -> dict[str, float]:
 
 
 def mirror_scores(place: Place) -> dict[str, float]:
-    """How complete the light field is: what a perfect mirror lying on the ground would show."""
+    """How complete the light field is: what a perfect mirror lying on the ground would show.
+
+    Over the pixels in which the mirror is truly seen, ours or not.
+    """
     reference = place.reference
     calm = Flood(level=reference.mirror_level, wind_speed=0.0)
     still = KeyframedWeather(Weather(flood=calm), {})
@@ -214,13 +217,37 @@ def mirror_scores(place: Place) -> dict[str, float]:
     world = dataclasses.replace(world, water=dataclasses.replace(world.water, mirror_only=True))
     errors = []
     for truth in reference.truths:
-        camera, c2w = place.pose(truth)
-        linear, layers = see_frame(world, camera, c2w)
-        wet = layers["mask_water"] > 0.99
-        ours = display_8bit(linear.double().numpy())[wet] / 255.0
-        errors.append(((ours - reference.mirrored(truth.name)[wet] / 255.0) ** 2).ravel())
+        linear, _ = see_frame(world, *place.pose(truth))
+        level = reference.scene.ground_z + reference.mirror_level
+        there = weather_scores.plane_first(truth, level)
+        ours = display_8bit(linear.double().numpy())[there] / 255.0
+        errors.append(((ours - reference.mirrored(truth.name)[there] / 255.0) ** 2).ravel())
     mse = float(np.concatenate(errors).mean()) if sum(map(len, errors)) else float("nan")
     return {"mirror_psnr": float(-10 * np.log10(max(mse, 1e-12)))}
+
+
+def frame_scores(place: Place) -> dict[str, float]:
+    """How the run's world lies in the true one: its metres, its up and its ground datum.
+
+    Depths and levels are compared in the run's own metres, so what is wrong with them is in all
+    scores that have a unit; this says how much it is.
+    """
+    truth = {Path(view.name).name: view for view in place.reference.scene.views}
+    both = [(v, truth[n]) for v in place.scene.views if (n := Path(v.name).name) in truth]
+    ours = np.stack([place.scene.c2w_world(v) for v, _ in both])
+    real = np.stack([place.reference.scene.c2w_world(v) for _, v in both])
+    spread = [np.sqrt(((p[:, :3, 3] - p[:, :3, 3].mean(0)) ** 2).sum()) for p in (ours, real)]
+    # Up of the run, in the true world, by each camera; they agree unless poses are refined.
+    up = np.einsum("nij,nj->ni", real[:, :3, :3], ours[:, 2, :3]).mean(0)
+    heights = [
+        (p[:, 2, 3] - scene.ground_z).mean()
+        for p, scene in ((ours, place.scene), (real, place.reference.scene))
+    ]
+    return {
+        "scale": float(spread[0] / spread[1]),
+        "up_deg": float(np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))),
+        "datum_cm": float(100 * (heights[1] - heights[0])),
+    }
 
 
 def one_weather(
@@ -241,7 +268,8 @@ def one_weather(
         level, scene = weather.flood.level, place.reference.scene
         eyes = [c2w for _, c2w in poses]
         own |= weather_scores.waterline_scores(
-            layers,
+            [each.depth for each in dry],
+            [found["mask_water"] for found in layers],
             eyes,
             place.scene.ground_z + level,
             truths,
@@ -253,7 +281,9 @@ def one_weather(
         own |= weather_scores.snow_scores(layers, truths, snow, 1.0 / poses[0][0].fx)
     if weather.smog.present:
         passed = [found["transmittance"] for found in layers]
-        own |= weather_scores.transmittance_scores(passed, _true_air(place, kind))
+        own |= weather_scores.transmittance_scores(
+            passed, [kind.layers(truth.name)["transmittance"] for truth in truths]
+        )
     scores.table["weather"][kind.name] = own
     scores.pictures[kind.name] = _rows(truths, ours, real)
     tuned[kind.name] = tune(kind, place.scene.ground_z, dry, real)
@@ -296,9 +326,11 @@ def consistency(place: Place, tuned: dict[str, dict], tell: Tell) -> dict[str, A
         for i in wanted:
             linear, layers = see_frame(world, path.cameras[i], path.c2w[i])
             picture = baselines.display(linear.double().numpy())
-            frames[i] = frame(i, picture, layers["depth"], layers["mask_water"] > 0)
+            frames[i] = frame(i, picture, layers["depth"], grown(layers["mask_water"] > 0.5))
         out[short] = _pairs(frames, starts)
         for baseline in baselines.NAMES:
+            if short == "flood" and baseline in ("flat-plane", "screen-reflection"):
+                continue  # water is left out, and beside it they are the clean picture
             painted_frames = {}
             for i in wanted:
                 picture = painted(kind, place.scene.ground_z, dry[i], tuned[name], baseline, i)
@@ -307,6 +339,16 @@ def consistency(place: Place, tuned: dict[str, dict], tell: Tell) -> dict[str, A
                 painted_frames[i] = frame(i, picture, dry[i].depth, frames[i].excluded)
             else:
                 out["baselines"].setdefault(baseline, {})[short] = _pairs(painted_frames, starts)
+    return out
+
+
+def grown(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """A mask and the pixels beside it."""
+    out = mask.copy()
+    out[1:] |= mask[:-1]
+    out[:-1] |= mask[1:]
+    out[:, 1:] |= mask[:, :-1]
+    out[:, :-1] |= mask[:, 1:]
     return out
 
 
@@ -325,20 +367,6 @@ def _stage(place: Place, weather: KeyframedWeather, time: float, poses: list[np.
     places = np.stack([pose[:3, 3] for pose in poses])
     moment = np.array([time])
     return prepare(place.fitted, place.scene, weather, places, moment, lambda what, share: None)
-
-
-def _true_air(place: Place, kind: WeatherTruth) -> list[np.ndarray]:
-    """True transmittance of each test view's air, from the true depth in the true world."""
-    scene = place.reference.scene
-    air = smog.medium(kind.weather.at(kind.time).smog, scene.ground_z)
-    assert air is not None
-    out = []
-    for truth in place.reference.truths:
-        rays_d = torch.from_numpy(truth.rays_d)
-        rays_o = torch.from_numpy(truth.c2w[:3, 3]).expand_as(rays_d)
-        depth = torch.from_numpy(truth.depth.astype(np.float64))
-        out.append(smog.transmittance(air, rays_o, rays_d, depth).numpy())
-    return out
 
 
 def _rows(

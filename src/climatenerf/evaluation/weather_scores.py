@@ -9,61 +9,59 @@ from climatenerf.render.normals import plane_normals
 
 JOINED, JOINED_SHARE = 0.5, 0.05  # m, and of the distance: neighbours this close are one surface
 NEAR = 30.0  # m: snow is compared up to here
+NO_LINE = 10.0  # m: said of a line that is not there, and the most of one that is
 LEAST_SNOW = 0.005  # m: less is bare ground
 
 Layers = dict[str, np.ndarray]
 
 
 def waterline_scores(
-    layers: list[Layers], eyes: list[Float[np.ndarray, "4 4"]], level: float,
+    depth: list[Float[np.ndarray, "h w"]], masks: list[Float[np.ndarray, "h w"]],
+    eyes: list[Float[np.ndarray, "4 4"]], level: float,
     truths: tuple[Truth, ...], true_level: float, pixel_angle: float,
 ) -> dict[str, float]:  # fmt: skip
     """Where the water ends, against where it truly does.
 
-    Both lines are found between neighbouring pixels of one surface, one above and one below the
+    Both lines are found between neighbouring pixels of one dry surface, one above and one below the
     water, at the share of the way where it crosses.
 
     Args:
-        layers: `depth`, `water_depth` and `mask_water` of each view.
-        eyes: poses of its cameras in our world.
+        depth: our ray lengths without water, m.
+        masks: shares of water in our flooded pictures.
+        eyes: poses of the cameras in our world.
         level: height of our water, m.
         truths: of the same views.
         true_level: height of the true water, m.
         pixel_angle: of a pixel, rad.
 
     Returns:
-        `waterline_error_cm`, the median distance of the true line from ours in the place;
-        `waterline_error_px`, the same in the picture, where far shores seen at grazing do not
-        count for more than they are looked at;
-        `waterline_height_error_cm`, the median height by which our ground misses the water there;
-        `water_iou` of the flooded pixels.
+        `waterline_error_cm`, the mean of the median distance of the true line from ours and of ours
+        from the true one, in the place; `waterline_error_px`, the same in the picture, where far
+        shores seen at grazing do not count for more than they are looked at;
+        `waterline_height_error_cm`, the median height by which our ground misses the water at the
+        true line; `water_iou` of the flooded pixels.
     """
-    apart, seen, rise, both, either = [], [], [], 0, 0
-    for ours, c2w, truth in zip(layers, eyes, truths, strict=True):
+    apart, seen, rise, both, either = ([], []), ([], []), [], 0, 0
+    for ours, mask, c2w, truth in zip(depth, masks, eyes, truths, strict=True):
         rays_c = truth.rays_d @ truth.c2w[:3, :3]  # camera axes
         height = truth.points[..., 2] - true_level
         height[truth.sky] = np.inf
         line, (i, j) = crossings(truth.depth[..., None] * rays_c, height)
-        rays = rays_c @ c2w[:3, :3].T
-        wet = ours["mask_water"] > 0.5
-        bed_z = level - ours["water_depth"]
-        sink = np.minimum(rays[..., 2], -1e-6)  # water is seen downwards only: 0/0 elsewhere
-        t = np.where(wet, (bed_z - c2w[2, 3]) / sink, ours["depth"])
         with np.errstate(invalid="ignore"):
-            own_height = c2w[2, 3] + t * rays[..., 2] - level
-        own_height = np.where(wet, -np.maximum(ours["water_depth"], 1e-4), own_height)
-        own_height[~np.isfinite(t)] = np.inf
-        own, _ = crossings(t[..., None] * rays_c, own_height)
+            own_height = c2w[2, 3] + ours * (rays_c @ c2w[2, :3]) - level
+        own_height[~np.isfinite(ours)] = np.inf
+        own, _ = crossings(ours[..., None] * rays_c, own_height)
         if len(line):
-            apart.append(_nearest(line, own))
-            seen.append(_nearest(_unit(line), _unit(own)) / pixel_angle)
+            for k, (a, b) in enumerate(((line, own), (own, line))):
+                apart[k].append(_nearest(a, b))
+                seen[k].append(_nearest(_unit(a), _unit(b)) / pixel_angle)
             here = 0.5 * (own_height.ravel()[i] + own_height.ravel()[j])
-            rise.append(np.abs(np.where(np.isfinite(here), here, 10.0)))
-        real = _plane_first(truth, true_level)
+            rise.append(np.minimum(np.abs(here), NO_LINE))
+        wet, real = mask > 0.5, plane_first(truth, true_level)
         both, either = both + (wet & real).sum(), either + (wet | real).sum()
     return {
-        "waterline_error_cm": _median_cm(apart),
-        "waterline_error_px": _median_cm(seen) / 100,
+        "waterline_error_cm": float(np.mean([_median_cm(each) for each in apart])),
+        "waterline_error_px": float(np.mean([_median_cm(each) for each in seen])) / 100,
         "waterline_height_error_cm": _median_cm(rise),
         "water_iou": float(both / either) if either else float("nan"),
     }
@@ -143,11 +141,12 @@ def transmittance_scores(
     passed: list[Float[np.ndarray, "h w"]], real: list[Float[np.ndarray, "h w"]]
 ) -> dict[str, float]:
     """Mean absolute error of the air's transmittance over all pixels."""
-    errors = [np.abs(a - b).ravel() for a, b in zip(passed, real, strict=True)]
+    pairs = zip(passed, real, strict=True)
+    errors = [np.abs(a - b.astype(np.float64)).ravel() for a, b in pairs]
     return {"transmittance_error": float(np.concatenate(errors).mean())}
 
 
-def _plane_first(truth: Truth, level: float) -> np.ndarray:
+def plane_first(truth: Truth, level: float) -> np.ndarray:
     """Where the truth shows the water's plane before anything else."""
     fall = -truth.rays_d[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -160,12 +159,12 @@ def _unit(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def _nearest(line: Float[np.ndarray, "n 3"], own: Float[np.ndarray, "m 3"]) -> np.ndarray:
-    """Distance of each place of a line from the nearest of ours; 10 m where there is none."""
+    """Distance of each place of a line from the nearest of another; `NO_LINE` if there is none."""
     if not len(own):
-        return np.full(len(line), 10.0)
+        return np.full(max(len(line), 1), NO_LINE)
     parts = [line[k : k + 512] for k in range(0, len(line), 512)]
     near = [np.sqrt(((p[:, None] - own[None]) ** 2).sum(-1).min(1)) for p in parts]
-    return np.minimum(np.concatenate(near), 10.0)
+    return np.minimum(np.concatenate(near), NO_LINE) if near else np.full(1, NO_LINE)
 
 
 def _median_cm(parts: list[np.ndarray]) -> float:
