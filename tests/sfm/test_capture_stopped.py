@@ -71,7 +71,13 @@ def test_killed_in_the_middle_and_run_again(tmp_path, how, status):
     photos = some_photos(tmp_path / "photos", 14)
     command = [*CAPTURE, str(photos), "-o", str(tmp_path / "scene")]
     database = tmp_path / "scene" / "work" / "database.db"
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where the tests themselves run in the background Ctrl-C is ignored, and that is inherited.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     for _ in range(600):
         if database.exists():  # features are being looked for, six photos at a time
             break
