@@ -43,6 +43,8 @@ def run(options: Evaluate) -> int:
     config = check_config(options.run)
     scene = load_scene(options.run)
     reference = read_reference(scene.root, options.views, options.weathers)
+    if options.out.resolve().is_relative_to(reference.folder.resolve()):
+        raise UserError(f"{options.out} lies in the reference set; choose another folder with -o")
     place = Place(field, scene, reference)
     check_views(place)
     measured = options.run / "metrics.json"  # absent where a fit was stopped before its end
