@@ -50,7 +50,7 @@ def run(options: Evaluate) -> int:
     measured = options.run / "metrics.json"  # absent where a fit was stopped before its end
     metrics = read_json(measured, "the run's measurements") if measured.exists() else {}
     names = ["clean", *(kind.name for kind in reference.weathers)]
-    check_place(options.out, names)
+    old = check_place(options.out, names)
     with progress.Bar("evaluate", len(names) + 7) as bar:
         scores = evaluate(
             Place(field, scene, reference), lambda what: bar.advance(1, {"now": what})
@@ -63,7 +63,7 @@ def run(options: Evaluate) -> int:
         "downscale": config.get("downscale"),
         "views": [Path(truth.name).stem for truth in reference.truths],
     }
-    write_report(scores, about, options.out)
+    write_report(scores, about, options.out, old)
     progress.result(table_text(scores.table))
     progress.result(f"report: {options.out / 'report.md'}")
     return 0

@@ -208,4 +208,4 @@ def _arrays(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise UserError(f"{path} is missing; the reference set is not whole") from None
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} cannot be read ({error}); make the set anew") from error
+        raise UserError(f"{path} is damaged; make the set anew") from error

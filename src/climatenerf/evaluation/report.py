@@ -20,10 +20,10 @@ CELL, SMALL_CELL = 384, 256  # pixels of a picture's width
 GAIN = 2.0  # of the difference pictures
 
 
-def check_place(out: Path, pictures: list[str]) -> None:
-    """Refuses a folder where a report would overwrite what is no report, and makes it.
+def check_place(out: Path, pictures: list[str]) -> set[str]:
+    """Refuses a folder where a report would overwrite what is no report, or that cannot be made.
 
-    Pictures of an earlier report are removed, so that none stays of what is not measured now.
+    Nothing is changed: what an earlier report left is named, to be removed by `write_report`.
 
     Args:
         out: folder to be.
@@ -38,19 +38,25 @@ def check_place(out: Path, pictures: list[str]) -> None:
     for name in (TEXT_NAME, OVERVIEW, *(f"{each}.jpg" for each in pictures)):
         if (out / name).exists() and name not in old:
             raise UserError(f"{out / name} would be overwritten; choose another folder with -o")
+    absent = not out.exists()
     make_folder(out)
-    for name in old:
-        (out / name).unlink(missing_ok=True)
+    if absent:
+        out.rmdir()  # measuring takes minutes and may be stopped
+    return old
 
 
-def write_report(scores: Scores, about: dict[str, Any], out: Path) -> None:
+def write_report(scores: Scores, about: dict[str, Any], out: Path, old: set[str]) -> None:
     """Writes REPORT/report.json, report.md, one picture a weather and one of them all.
 
     Args:
         scores: what was measured.
         about: of the run: its folder's name, minutes, steps.
         out: folder.
+        old: files in it that an earlier report left, from `check_place`.
     """
+    make_folder(out)
+    for name in old:  # none stays of what is not measured now
+        (out / name).unlink(missing_ok=True)
     overview = []
     for name, rows in scores.pictures.items():
         sheet = []
