@@ -15,12 +15,14 @@ MAY_IMPORT = {
     "ops": set(),
     "scene": BASE,
     "sfm": BASE | {"scene"},
+    "perception": BASE | {"scene"},
     "evaluation": BASE | {"scene", "field", "weather", "render", "ops", "samples"},
-    "field": BASE | {"ops", "samples"},
+    "field": BASE | {"scene", "ops", "samples"},
     "weather": BASE | {"ops", "samples"},
     "render": BASE | {"scene", "field", "weather", "ops", "samples"},
     "training": BASE | {"evaluation", "render", "scene", "field", "ops", "samples"},
-    "cli": BASE | {"training", "evaluation", "render", "weather", "field", "scene", "sfm"},
+    "cli": BASE
+    | {"training", "evaluation", "render", "weather", "field", "scene", "sfm", "perception"},
     "__main__": {"cli"},
     "climatenerf": set(),
 }

@@ -124,3 +124,15 @@ def posts_picture(camera: Camera, pose, posts, scale=4):
             pixels = camera.project(local) * scale
             draw.line([tuple(p) for p in pixels], fill=60, width=5 * scale)
     return image.resize((camera.width, camera.height), Image.Resampling.BOX).convert("RGB")
+
+
+def seen_at(scene, view, point):
+    """(x, y) of a point of the input frame in a view, pixels."""
+    local = np.linalg.inv(view.c2w) @ np.append(point, 1.0)
+    return scene.cameras[view.camera].project(local[:3])
+
+
+def pinhole(matrix, c2w, point):
+    """(x, y) of a point by the textbook: K [R | t] X, c2w with OpenCV axes."""
+    x, y, w = np.asarray(matrix)[:3, :3] @ (np.linalg.inv(c2w) @ np.append(point, 1.0))[:3]
+    return np.array([x / w, y / w])

@@ -120,7 +120,7 @@ def test_same_name_twice(tmp_path):
 def test_labels_and_masks_are_found(tmp_path):
     make(tmp_path, 4)
     write_images(tmp_path / "labels", names_of(2))
-    labels = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32)
+    labels = (np.arange(24 * 32) % 19).astype(np.uint8).reshape(24, 32)
     Image.fromarray(labels).save(tmp_path / "labels/000.png")
     mask = np.full((24, 32), 255, dtype=np.uint8)
     mask[:4, :4] = 0

@@ -20,7 +20,8 @@ class Fit:
     """Fit a radiance field to posed photographs."""
 
     scene: tyro.conf.Positional[Path]
-    """Folder of the capture: COLMAP, transforms.json or a scene folder."""
+    """Folder of the capture: COLMAP, transforms.json, a scene folder, Tanks and Temples (NSVF),
+    mip-NeRF 360, KITTI-360 or Mega-NeRF."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Run folder to make."""
     minutes: float = 5.0
@@ -44,6 +45,17 @@ class Fit:
     """Where their ends are in the pictures; default: marks.toml in the scene folder."""
     metric_input: bool = False
     """The capture is in metres with z up already."""
+    frames: str | None = None
+    """Frames of a KITTI-360 drive: first and last, such as 1538:1601."""
+    label_space: str | None = None
+    """What the numbers in label files mean: cityscapes-train-ids, cityscapes-ids or seven. Default:
+    what the capture says."""
+    labels: str | None = None
+    """Class labels: none, simple (sky by its looks, without a network), or a segmentation network's
+    name or folder. Default: the capture's label files, else simple if it surely shows sky."""
+    mono_depth: str | None = None
+    """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
+    capture's depth_relative files."""
     seed: int = 0
     """Of all randomness."""
 
@@ -65,17 +77,30 @@ def run(options: Fit) -> int:
         holdout=options.holdout,
         camera_height=options.camera_height,
         metric_input=options.metric_input,
+        frames=options.frames,
+        label_space=options.label_space,
     )
     scene = with_known_lengths(scene, options.known_length, options.marks)
     for warning in dict.fromkeys((*scene.warnings, *scale_warnings(scene))):
         progress.warn(warning)
     progress.say(frame_line(scene))
+    scene = with_perception(scene, options)
     metrics = fit_with_bars(scene, options)
     if metrics["interrupted"]:
         progress.say(f"Stopped early; continue with: {resuming(options)}")
     progress.result(summary(metrics))
     progress.result(f"run: {options.out}")
     return 0
+
+
+def with_perception(scene: Scene, options: Fit) -> Scene:
+    """The scene with the labels, and the capture with the relative depths, that are asked for."""
+    from climatenerf.perception import prepare_depth, prepare_labels
+
+    scene = prepare_labels(scene, options.labels, options.out, progress.track, progress.say)
+    if options.mono_depth not in (None, "none"):
+        prepare_depth(scene, options.mono_depth, progress.track, progress.say)
+    return scene
 
 
 def with_known_lengths(scene: Scene, lengths: tuple[str, ...], marks: Path | None) -> Scene:

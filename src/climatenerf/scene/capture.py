@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
+from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import View
 
 # No real pose, focal length or size comes near; beyond it squares and products overflow.
@@ -29,6 +30,8 @@ class Capture:
         views: All pictures that the poses name, whether the disk has them or not.
         points: Sparse points in the input frame, or None.
         own_split: Whether the views' splits are the capture's own.
+        metric: Whether the input frame is known to be in metres with z up.
+        label_space: What the numbers in its label files mean; see `label_spaces.py`.
         warnings: Sentences for the user.
     """
 
@@ -38,6 +41,8 @@ class Capture:
     views: tuple[View, ...]
     points: Float[np.ndarray, "n 3"] | None = None
     own_split: bool = False
+    metric: bool = False
+    label_space: str = TRAIN_IDS
     warnings: tuple[str, ...] = ()
 
 

@@ -13,9 +13,11 @@ from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
+from climatenerf.scene.label_spaces import to_train_ids
 from climatenerf.scene.scene import Scene, View
 
 UNKNOWN_LABEL = 255
+RELATIVE_DEPTH = "depth_relative"
 _ORIENTATION_TAG = 0x0112
 EXIF_TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -115,11 +117,19 @@ def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray
 
 
 def load_labels(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray, "h w"] | None:
-    """Cityscapes train ids (255 unknown) of a view, nearest neighbours; None if absent."""
-    if view.label_path is None:
+    """Cityscapes train ids (255 unknown) of a view, nearest neighbours; None if absent.
+
+    Whatever the scene's label space is, what comes out are train ids.
+
+    Raises:
+        UserError: The file cannot be read, has another shape than the picture, or an id that the
+            scene's label space does not have.
+    """
+    path = view.label_path
+    if path is None:
         return None
-    camera = scene.cameras[view.camera]
-    return _nearest(_fitting(read_labels(view.label_path), camera, view.label_path), downscale)
+    labels = to_train_ids(read_labels(path), scene.label_space, path)
+    return _nearest(_fitting(labels, scene.cameras[view.camera], path), downscale)
 
 
 def load_mask(view: View, scene: Scene, downscale: int = 1) -> Bool[np.ndarray, "h w"] | None:
@@ -141,6 +151,33 @@ def load_depth(view: View, scene: Scene, downscale: int = 1) -> Float[np.ndarray
         return None
     camera = scene.cameras[view.camera]
     return _nearest(_fitting(read_depth(view.depth_path), camera, view.depth_path), downscale)
+
+
+def load_relative_depth(
+    view: View, scene: Scene, downscale: int = 1
+) -> Float[np.ndarray, "h w"] | None:
+    """Inverse z-depth of a view up to a scale and a shift of its own; None if it has none.
+
+    From `depth_relative/NAME.npz` (one array, larger is nearer, any size), else from its depth
+    file. NaN where unknown.
+    """
+    path = (scene.root / RELATIVE_DEPTH / view.name).with_suffix(".npz")
+    if not path.is_file():
+        depth = load_depth(view, scene, downscale)
+        return None if depth is None else 1.0 / depth
+    try:
+        with np.load(path) as data:
+            values = data[data.files[0]]
+        if values.ndim != 2 or not values.size:
+            raise ValueError("it must have height x width numbers")
+        relative = Image.fromarray(values.astype(np.float32))
+    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(
+            f"The relative depth {path} cannot be read ({error}); replace it."
+        ) from None
+    camera = downscaled_camera(scene.cameras[view.camera], downscale)
+    size = (camera.width, camera.height)
+    return np.asarray(relative.resize(size, Image.Resampling.BILINEAR))
 
 
 def read_rgb(path: Path) -> UInt8[np.ndarray, "h w 3"]:

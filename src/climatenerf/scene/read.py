@@ -14,9 +14,13 @@ from climatenerf.scene.cameras import Camera
 from climatenerf.scene.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.colmap import model_folders, read_colmap
 from climatenerf.scene.images import Header, picture_header
+from climatenerf.scene.kitti360 import kitti360_root, parse_frames, read_kitti360
+from climatenerf.scene.label_spaces import checked_label_space
 from climatenerf.scene.levelling import level
+from climatenerf.scene.mega_nerf import is_mega_nerf, read_mega_nerf
 from climatenerf.scene.scale import by_camera_height
 from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_split
+from climatenerf.scene.tanks_temples import is_tanks_temples, read_tanks_temples
 from climatenerf.scene.transforms_json import read_transforms, transforms_files
 
 HOLDOUT_EVERY = 8
@@ -31,16 +35,22 @@ def read_scene(
     camera_height: float | None = None,
     metric_input: bool = False,
     gravity: Mapping[str, Sequence[float]] | None = None,
+    frames: str | tuple[int, int] | None = None,
+    label_space: str | None = None,
 ) -> Scene:
     """Read a capture of any supported format and level it.
 
     Args:
-        path: A folder (own scene, `transforms.json`, COLMAP) or a `.json` file.
+        path: A folder (own scene, `transforms.json`, COLMAP, Tanks and Temples, KITTI-360,
+            Mega-NeRF) or a `.json` file.
         holdout: None for the capture's own split or else every 8th picture by sorted name
             (first, ninth, ...); "0" for none; or names separated by commas.
         camera_height: Height of the cameras above the ground, metres, which sets the scale.
         metric_input: The poses are in metres with z up already; they are kept as they are.
         gravity: Down in the camera's axes by picture name, where the cameras told.
+        frames: First and last frame of a KITTI-360 drive, both included, as a pair or "1538:1601".
+        label_space: What the numbers in the label files mean, one of `LABEL_SPACES`; None for what
+            the capture says.
 
     Returns:
         The scene; `warnings` has what the user should know.
@@ -55,6 +65,8 @@ def read_scene(
         raise UserError(f"The camera height {camera_height:g} m must be above 0; correct it.")
     if camera_height is not None and metric_input:
         raise UserError("Give either the camera height or metric input, not both.")
+    if label_space is not None:
+        checked_label_space(label_space, "--label-space")
     relevel = camera_height is not None or metric_input
     if (path / FILE_NAME).is_file() or path.name == FILE_NAME:
         scene = load_scene(path)
@@ -63,16 +75,24 @@ def read_scene(
         poses = [checked_pose(v.c2w, v.name, where) for v in scene.views]
         views = tuple(replace(v, c2w=c) for v, c in zip(scene.views, poses, strict=True))
         capture = Capture(scene.root, scene.source, cameras, views, scene.points, own_split=True)
+        space = label_space or scene.label_space
     else:
-        scene, capture = None, _read_foreign(path)
+        scene, capture = None, _read_foreign(path, None if frames is None else parse_frames(frames))
+        space = label_space or capture.label_space
+    if frames is not None and (scene is not None or capture.source != "kitti360"):
+        raise UserError(
+            f"--frames picks frames of a KITTI-360 drive, which {path} is not; omit it."
+        )
     capture = _check_images(capture)
     views = _split(_find_extras(capture), capture.own_split, holdout, capture.root)
     if scene is not None and not relevel:
         kept = tuple(dict.fromkeys((*scene.warnings, *capture.warnings)))
-        return replace(scene, cameras=capture.cameras, views=views, warnings=kept)
+        return replace(
+            scene, cameras=capture.cameras, views=views, warnings=kept, label_space=space
+        )
     if scene is not None and camera_height is not None:
         # Up and place are known already, maybe from what the pictures no longer tell.
-        known = replace(scene, cameras=capture.cameras, views=views)
+        known = replace(scene, cameras=capture.cameras, views=views, label_space=space)
         scaled = by_camera_height(known, camera_height)
         if scaled is not None:
             return scaled
@@ -83,22 +103,31 @@ def read_scene(
         views=views,
         points=capture.points,
         warnings=capture.warnings,
+        label_space=space,
     )
+    # A height that the user gives is believed more than the data set.
+    metric_input |= capture.metric and camera_height is None
     return level(scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity)
 
 
-def _read_foreign(path: Path) -> Capture:
+def _read_foreign(path: Path, frames: tuple[int, int] | None) -> Capture:
     if path.is_file() and path.suffix.lower() != ".json":
         raise UserError(f"{path} is not a folder or a .json file; give the folder of a capture.")
     if transforms_files(path):
         return read_transforms(path)
     if path.is_dir() and model_folders(path):
         return read_colmap(path)
+    if is_tanks_temples(path):
+        return read_tanks_temples(path)
+    if kitti360_root(path):
+        return read_kitti360(path, frames)
+    if is_mega_nerf(path):
+        return read_mega_nerf(path)
     pictures = [p for p in (path, path / "images") if p.is_dir() and _has_pictures(p)]
     if not pictures:
         raise UserError(
             f"{path} holds no pictures and no poses; give a folder with images/ and sparse/0/ "
-            "(COLMAP) or a transforms.json."
+            "(COLMAP), a transforms.json, or one of the data sets in docs/formats.md."
         )
     raise UserError(
         f"{path} holds pictures but no poses in a known layout (scene.json, transforms.json, "

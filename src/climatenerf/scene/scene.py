@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
+from climatenerf.scene.label_spaces import TRAIN_IDS, checked_label_space
 from climatenerf.scene.ply import read_points, write_points
 from climatenerf.storage import atomic_path
 
@@ -35,7 +36,7 @@ class View:
         camera: Index into `Scene.cameras`.
         c2w: Camera-to-input-frame pose, 4x4, OpenCV axes, orthonormal rotation, input units.
         split: "train", or "heldout" for measuring only.
-        label_path: 8-bit picture of Cityscapes train ids (255 unknown), if there is one.
+        label_path: 8-bit picture of ids in the scene's label space, if there is one.
         mask_path: Picture whose black pixels are to be ignored, if there is one.
         depth_path: Z-depths, as `images.load_depth` reads them, if there are any.
         seen: Which of the scene's sparse points the picture shows, if that is known.
@@ -73,6 +74,7 @@ class Scene:
         lowest_ground_z: Height of the lowest ground, metres.
         up_report: How up was found: "used", then the degrees between it and each other method.
         warnings: Sentences for the user.
+        label_space: What the numbers in the label files mean; see `label_spaces.py`.
     """
 
     root: Path
@@ -89,6 +91,7 @@ class Scene:
     lowest_ground_z: float = 0.0
     up_report: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    label_space: str = TRAIN_IDS
 
     @property
     def scale(self) -> float:
@@ -133,7 +136,7 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "source": scene.source,
         "root": os.path.relpath(scene.root, folder),
         "root_absolute": str(scene.root),
-        "label_space": "cityscapes-train-ids",
+        "label_space": scene.label_space,
         "axes": "OpenCV camera-to-input",
         "cameras": [asdict(c) for c in scene.cameras],
         "views": [_view_to_json(v, scene.root) for v in scene.views],
@@ -254,6 +257,9 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
         lowest_ground_z=_number(data["lowest_ground_z"]),
         up_report=dict(data["up_report"]),
         warnings=tuple(_text(w) for w in data["warnings"]),
+        label_space=checked_label_space(
+            _text(data.get("label_space", TRAIN_IDS)), f"The label_space in {folder / FILE_NAME}"
+        ),
     )
 
 

@@ -1,0 +1,78 @@
+"""Where `fit` takes labels and relative depths from."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from scene.scene_builders import names_of, ring, write_colmap
+
+from climatenerf import cli
+from climatenerf.cli import fit
+from climatenerf.scene.images import load_labels
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "capture"
+    (folder / "images").mkdir(parents=True)
+    for seed, name in enumerate(names_of(9)):
+        values = np.random.default_rng(seed).integers(20, 120, (24, 32, 3), dtype=np.uint8)
+        values[:10] = 245
+        Image.fromarray(values).save(folder / "images" / name)
+    write_colmap(folder / "sparse" / "0", ring(9), names_of(9))
+    return folder
+
+
+@pytest.fixture
+def fitted(monkeypatch):
+    """The scenes that would have been fitted."""
+    scenes = []
+
+    def stand_in(scene, options):
+        scenes.append(scene)
+        return {"interrupted": True, "psnr": None, "steps": 1, "seconds": 1.0}
+
+    monkeypatch.setattr(fit, "fit_with_bars", stand_in)
+    return scenes
+
+
+def fit_of(capture, *words):
+    return cli.main(["fit", str(capture), "-o", str(capture.parent / "run"), *map(str, words)])
+
+
+def test_sky_is_found_where_nothing_is_given(capture, fitted, capsys):
+    assert fit_of(capture) == 0
+    err = capsys.readouterr().err
+    assert "--labels MODEL" in err and "labels: 100 %" in err
+    assert (load_labels(fitted[0].views[0], fitted[0])[:5] == 10).all()
+    assert len(list((capture / "labels").glob("*.png"))) == 9
+
+
+def test_none_ignores_the_labels_and_resuming_says_so(capture, fitted, capsys):
+    (capture / "labels").mkdir()
+    Image.new("L", (32, 24), 0).save(capture / "labels" / "000.png")
+    assert fit_of(capture) == fit_of(capture, "--labels", "none", "--mono-depth", "none") == 0
+    assert fitted[0].views[0].label_path and not fitted[1].views[0].label_path
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert "--labels none" in said
+    assert fit_of(capture, *said.split(" -o ")[1].split()[1:]) == 0, "the words are understood"
+    assert not fitted[2].views[0].label_path
+
+
+def test_unknown_models_are_refused_before_the_fit(capture, fitted, capsys):
+    assert fit_of(capture, "--labels", "simpel") == 2
+    assert "there is no model simpel" in capsys.readouterr().err
+    assert fit_of(capture, "--mono-depth", capture / "absent") == 2
+    assert "there is no model" in capsys.readouterr().err
+    assert not fitted
+
+
+def test_networks_of_the_user_s(capture, fitted, tmp_path, capsys):
+    pytest.importorskip("transformers", reason="pip install climatenerf[perception]")
+    from perception import networks
+
+    labels = networks.save_segformer(tmp_path / "segformer")
+    depth = networks.save_depth_anything(tmp_path / "depth")
+    assert fit_of(capture, "--labels", labels, "--mono-depth", depth) == 0
+    assert all(view.label_path for view in fitted[0].views)
+    assert len(list((capture / "depth_relative").glob("*.npz"))) == 9
+    assert capsys.readouterr().err.count("Licence of") == 2
