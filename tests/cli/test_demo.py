@@ -15,16 +15,17 @@ from climatenerf.cli import demo
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Small grids, large photos' pixels left out: a blurred street in seconds."""
+    from climatenerf.cli import fit as cli_fit
     from climatenerf.field.presets import PRESETS
-    from climatenerf.training import fit as fit_module
     from climatenerf.training import run as run_module
+    from climatenerf.training.settings import FitSettings
 
     tiny = dataclasses.replace(
         PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
     )
     monkeypatch.setitem(PRESETS, "cpu", tiny)
-    settings = functools.partial(fit_module.FitSettings, samples_per_step=2**14)
-    monkeypatch.setattr(fit_module, "FitSettings", settings)
+    settings = functools.partial(FitSettings, samples_per_step=2**14)
+    monkeypatch.setattr(cli_fit, "settings_of", lambda preset: settings(preset=preset))
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 64)
     monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))
 

@@ -59,19 +59,20 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
     """A short fit of the reference street in small steps with small grids."""
+    from climatenerf.cli import fit as cli_fit
     from climatenerf.field.presets import PRESETS
-    from climatenerf.training import fit as fit_module
     from climatenerf.training import run as run_module
+    from climatenerf.training.settings import FitSettings
 
     folder = tmp_path_factory.mktemp("reference") / "run"
     small = dataclasses.replace(
         PRESETS["cpu"], geometry_log2_rows=14, appearance_log2_rows=14, cascades=4
     )
-    settings = functools.partial(fit_module.FitSettings, samples_per_step=2**14)
+    settings = functools.partial(FitSettings, samples_per_step=2**14)
     words = ["fit", str(REFERENCE), "-o", str(folder), "--steps", "400", "--downscale", "4"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "cpu", small)
-        patch.setattr(fit_module, "FitSettings", settings)
+        patch.setattr(cli_fit, "settings_of", lambda preset: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0
     return folder

@@ -44,7 +44,8 @@ def test_sky_is_found_where_nothing_is_given(capture, fitted, capsys):
     err = capsys.readouterr().err
     assert "--labels MODEL" in err and "labels: 100 %" in err
     assert (load_labels(fitted[0].views[0], fitted[0])[:5] == 10).all()
-    assert len(list((capture / "labels").glob("*.png"))) == 9
+    assert not (capture / "labels").exists()
+    assert len(list(fitted[0].views[0].label_path.parent.glob("*.png"))) == 9
 
 
 def test_none_ignores_the_labels_and_resuming_says_so(capture, fitted, capsys):

@@ -24,19 +24,20 @@ SMALL = ["--size", "96x54", "--frames", "2"]
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
     """A short fit in small steps with small grids: a blurred street in some haze."""
+    from climatenerf.cli import fit as cli_fit
     from climatenerf.field.presets import PRESETS
-    from climatenerf.training import fit as fit_module
     from climatenerf.training import run as run_module
+    from climatenerf.training.settings import FitSettings
 
     folder = tmp_path_factory.mktemp("street") / "run"
     small = dataclasses.replace(
         PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
     )
-    settings = functools.partial(fit_module.FitSettings, samples_per_step=2**14)
+    settings = functools.partial(FitSettings, samples_per_step=2**14)
     words = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "cpu", small)
-        patch.setattr(fit_module, "FitSettings", settings)
+        patch.setattr(cli_fit, "settings_of", lambda preset: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0
     return folder

@@ -1,17 +1,17 @@
 """Scores against the reference truth: known answers on scenes made by hand."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
-from climatenerf.scene import Camera, Scene, View
+from climatenerf.scene import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 ROAD, TERRAIN, LEAVES, SKY = 0, 9, 8, 10  # Cityscapes train ids
@@ -230,26 +230,6 @@ def test_the_air_of_the_truth_has_no_error():
     assert off["transmittance_error"] == pytest.approx(0.1)
 
 
-def test_classes_are_what_most_views_that_see_a_place_say(tmp_path):
-    pose = looking_down()
-    depth = sloped_ground(pose)
-    views = []
-    for name, label, factor in (("a", ROAD, 1), ("b", ROAD, 1), ("c", LEAVES, 1), ("d", 13, 0.5)):
-        path = tmp_path / f"{name}.png"
-        values = np.where(np.isinf(depth), SKY, label).astype(np.uint8)
-        Image.fromarray(values).save(path)
-        view = View(f"{name}.jpg", tmp_path / f"{name}.jpg", 0, pose, label_path=path)
-        views.append((view, factor * depth))
-    scene = Scene(tmp_path, "test", (CAMERA,), tuple(view for view, _ in views))
-    depths = {view.name: seen for view, seen in views}
-    points = pose[:3, 3] + np.where(np.isinf(depth), 0, depth)[..., None] * world_rays(CAMERA, pose)
-    found = geometry.voted_labels(scene, depths, points, np.isinf(depth))
-    assert (found[~np.isinf(depth)] == geometry.ROAD).all(), "two against one; the fourth is hidden"
-    assert (found[np.isinf(depth)] == geometry.SKY).all()
-    nobody = geometry.voted_labels(scene, {}, points, np.isinf(depth))
-    assert (nobody[~np.isinf(depth)] == 255).all()
-
-
 def frames_of(pattern, step=0.5):
     """Two frames of a textured plane, taken `step` metres apart."""
     out = []
@@ -301,3 +281,15 @@ def test_a_folder_that_is_no_reference_set_is_refused(tmp_path):
     (tmp_path / "reference.json").write_text(json.dumps({"schema_version": 1}))
     with pytest.raises(UserError, match="damaged"):
         read_reference(tmp_path)
+
+
+def test_open_ground_is_what_nothing_stands_over():
+    """Of level ground all is open; under a wall that another view shows, and beside it, none."""
+    ground = truth_of()
+    found = geometry.open_ground((ground,))
+    assert len(found) > 10
+    middle = found.mean(0)
+    over = dataclasses.replace(ground, c2w=ground.c2w + np.outer([0, 0, 3.0, 0], [0, 0, 0, 1]))
+    # The same ground seen 3 m higher shelters all of the lower one, and is open itself.
+    both = geometry.open_ground((ground, over))
+    assert len(both) and both[:, 2].min() > middle[2] + 1.5

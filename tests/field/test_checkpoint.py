@@ -51,6 +51,25 @@ def test_a_loaded_field_renders_bit_identically(tmp_path, refined):
     assert not any(p.requires_grad for p in loaded.parameters())
 
 
+def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path):
+    field = random_field()
+    field.learned[:] = True
+    save_field(field, tmp_path)
+
+    def earlier(about, arrays):
+        about["schema_version"] = 1
+        about["size"] = {k: v for k, v in about["size"].items() if "surface" not in k}
+        for name in [name for name in arrays if name.startswith(("surface_", "learned"))]:
+            del arrays[name]
+
+    rewritten(tmp_path, earlier)
+    loaded = load_field(tmp_path)
+    x, d = points(field, 50), directions(50)
+    assert torch.equal(loaded.density(x), field.density(x))
+    assert torch.equal(loaded.colour(x, d), field.colour(x, d))
+    assert not loaded.knows_normals and not loaded.knows_classes
+
+
 def test_a_folder_without_a_field(tmp_path):
     with pytest.raises(UserError, match="climatenerf fit"):
         load_field(tmp_path)

@@ -63,7 +63,9 @@ def test_sky_is_found_said_and_kept(capture):
     assert (found[:5] == 10).all() and (found[10:] == 255).all()
     again, told = labelled(capture, None)
     assert told.seen == []
-    assert [v.label_path for v in again.views] == [v.label_path for v in read_scene(capture).views]
+    assert [v.label_path for v in again.views] == [v.label_path for v in scene.views]
+    assert not (capture / "labels").exists()  # nobody said that the capture may be written into
+    assert labelled(capture, "simple")[0].views[0].label_path == capture / "labels" / "000.png"
     record = json.loads((capture / "labels" / "made_by.json").read_text())
     assert record["schema_version"] == 1 and len(record["files"]) == 9
     assert record["files"]["000.png"]["model"] == "simple"

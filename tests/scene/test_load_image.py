@@ -6,7 +6,7 @@ from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.scene import Camera, Scene, View, load_image
-from climatenerf.scene.images import downscaled_camera, picture_header
+from climatenerf.scene.images import downscaled_camera, load_relative_depth, picture_header
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
 
@@ -123,3 +123,17 @@ def test_wrong_size(tmp_path):
     view, scene = save(tmp_path, Image.new("RGB", (10, 10)))
     with pytest.raises(UserError, match="10x10"):
         load_image(view, scene)
+
+
+def test_relative_depth_is_found_by_either_name(tmp_path):
+    view, scene = save(tmp_path, Image.fromarray(RGB))
+    other, _ = save(tmp_path, Image.fromarray(RGB), "a.jpg")
+    assert load_relative_depth(view, scene) is None
+    folder = tmp_path / "depth_relative"
+    folder.mkdir()
+    np.savez(folder / "a.npz", inverse_depth=np.full((24, 32), 2.0))
+    for photo in (view, other):
+        assert (load_relative_depth(photo, scene) == 2).all()
+    np.savez(folder / "a.jpg.npz", inverse_depth=np.full((24, 32), 3.0))
+    assert (load_relative_depth(view, scene) == 2).all()
+    assert (load_relative_depth(other, scene) == 3).all()

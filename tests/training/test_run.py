@@ -18,8 +18,8 @@ from climatenerf.scene import load_scene
 from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import run as run_module
-from climatenerf.training.fit import FitSettings
 from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
+from climatenerf.training.settings import FitSettings
 
 
 @pytest.fixture(scope="module")

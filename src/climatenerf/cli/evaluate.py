@@ -1,4 +1,8 @@
-"""``climatenerf evaluate RUN --reference -o REPORT``: a run's scores against the known truth."""
+"""``climatenerf evaluate RUN --reference -o REPORT``: a run's scores against the known truth.
+
+``climatenerf evaluate SCENE --ablation -o REPORT`` fits and measures it with one part left out at
+a time.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +19,7 @@ class Evaluate:
     """Measure a run against the truth: a table, report.json, and pictures."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder made by `climatenerf fit reference/street`."""
+    """Run folder made by `climatenerf fit reference/street`; with --ablation the reference set."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
     reference: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -24,10 +28,20 @@ class Evaluate:
     """Test views, such as t01 t04. Default: all."""
     weathers: tuple[str, ...] = ()
     """Weathers, such as flood-low smog-near. Default: all."""
+    ablation: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Fit a reference set with one part of the method left out at a time, and measure each."""
+    minutes: float = 4.0
+    """Time for each fit of the ablation."""
+    downscale: int = 2
+    """Photos are reduced this many times for the ablation."""
+    seeds: int = 2
+    """Fits of each row of the ablation."""
 
 
 def run(options: Evaluate) -> int:
     """Measures, prints the table, and says where the report is."""
+    if options.ablation:
+        return run_ablation(options)
     if not options.reference:
         raise UserError("say what to measure against: climatenerf evaluate RUN --reference -o OUT")
 
@@ -66,4 +80,37 @@ def run(options: Evaluate) -> int:
     write_report(scores, about, options.out, old)
     progress.result(table_text(scores.table))
     progress.result(f"report: {options.out / 'report.md'}")
+    return 0
+
+
+def run_ablation(options: Evaluate) -> int:
+    """Fits and measures every row, prints the table, and says where it is."""
+    if not options.minutes > 0 or options.downscale < 1 or options.seeds < 1:
+        raise UserError("--minutes must be above 0, --downscale and --seeds at least 1")
+    if options.reference or options.views or options.weathers:
+        raise UserError("--ablation stands alone; leave --reference, --views and --weathers out")
+    from climatenerf.scene import read_scene
+
+    scene = read_scene(options.run)
+
+    from climatenerf.training.ablation import TEXT_NAME, ablate, markdown, rows
+    from climatenerf.training.fit import Report
+
+    total = len(rows(options.minutes)) * options.seeds
+    with progress.Bar("ablation", float(total)) as bar:
+        done = 0
+
+        def report(name: str, state: Report) -> None:
+            bar.update(done + state.progress, {"row": name, "PSNR": f"{state.psnr:.1f}"})
+
+        def tell(name: str) -> None:
+            nonlocal done
+            done += 1
+            bar.update(float(done), {"measured": name})
+
+        data = ablate(
+            scene, options.out, options.minutes, options.downscale, options.seeds, report, tell
+        )
+    progress.result(markdown(data))
+    progress.result(f"report: {options.out / TEXT_NAME}")
     return 0

@@ -1,7 +1,7 @@
 """``climatenerf fit SCENE -o RUN``: a radiance field from posed photographs."""
 
 import shlex
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +12,7 @@ from climatenerf.errors import UserError
 from climatenerf.scene import Scene, read_scene
 from climatenerf.scene.known_length import FILE_NAME, apply_known_lengths, measure, read_marks
 from climatenerf.scene.scale import scale_warnings, scale_words
+from climatenerf.training.settings import FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
 
@@ -35,8 +36,12 @@ class Fit:
     own split, else every 8th by name."""
     resume: bool = False
     """Continue the run in the folder; --minutes then counts from its beginning."""
-    preset: Literal["cpu", "paper"] = "cpu"
-    """Size of the field."""
+    preset: Literal["cpu", "gpu", "paper"] = "cpu"
+    """Size of the field; paper also takes the paper's losses."""
+    loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Weight of a loss, such as sky=0, which switches it off; may be given again for others."""
+    refine_poses: bool = False
+    """Correct the cameras while fitting."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
     known_length: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
@@ -51,7 +56,7 @@ class Fit:
     """What the numbers in label files mean: cityscapes-train-ids, cityscapes-ids or seven. Default:
     what the capture says."""
     labels: str | None = None
-    """Class labels: none, simple (sky by its looks, without a network), or a segmentation network's
+    """Class labels: none, simple (sky and ground without a network), or a segmentation network's
     name or folder. Default: the capture's label files, else simple if it surely shows sky."""
     mono_depth: str | None = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
@@ -64,6 +69,7 @@ def run(options: Fit) -> int:
     """Reads the capture, fits, and says where the run is and how good."""
     if not options.minutes > 0 or (options.steps is not None and options.steps < 1):
         raise UserError("--minutes and --steps must be above 0; try --minutes 5")
+    fit_settings(options)  # what is wrong with them is to be known before photos are read
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
     given = options.camera_height is not None or options.metric_input or options.known_length
@@ -172,24 +178,28 @@ def resuming(options: Fit) -> str:
         value = getattr(options, option.name)
         # The run keeps its scale itself.
         kept = ("resume", "camera_height", "metric_input", "known_length", "marks")
-        if option.name not in kept and value != option.default:
-            words += [f"--{option.name}", str(value)]
+        if option.name in kept or value == option.default:
+            continue
+        flag = f"--{option.name.replace('_', '-')}"
+        if isinstance(value, bool):
+            words += [flag]
+        else:
+            words += [word for each in _each(value) for word in (flag, str(each))]
     return shlex.join(words)
+
+
+def _each(value: object) -> tuple:
+    return value if isinstance(value, tuple) else (value,)
 
 
 def fit_with_bars(scene, options: Fit) -> dict:
     """Fits with progress bars; returns the metrics."""
     # torch comes in here, so that help and errors in the input do not wait for it.
     progress.say("Preparing (the first run on a machine compiles kernels, about half a minute)")
-    from climatenerf.training.fit import FitSettings, Report
+    from climatenerf.training.fit import Report
     from climatenerf.training.run import fit_scene
 
-    settings = FitSettings(
-        preset=options.preset,
-        minutes=options.minutes,
-        steps=options.steps,
-        seed=options.seed,
-    )
+    settings = fit_settings(options)
     with progress.Bar("fit", 1.0) as bar:
 
         def report(state: Report) -> None:
@@ -209,6 +219,45 @@ def fit_with_bars(scene, options: Fit) -> dict:
         return fit_scene(
             scene, options.out, settings, options.downscale, options.resume, report, evaluated
         )
+
+
+def fit_settings(options: Fit) -> FitSettings:
+    """What the flags say of the fit, on top of what its preset says."""
+    settings = settings_of(options.preset)
+    weights = parse_losses(options.loss)
+    if options.mono_depth == "none":
+        weights["monocular"] = 0.0
+    return replace(
+        settings,
+        losses=replace(settings.losses, **weights),
+        minutes=options.minutes,
+        steps=options.steps,
+        refine_poses=options.refine_poses,
+        seed=options.seed,
+    )
+
+
+def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
+    """Weights of losses given as "sky=0".
+
+    Raises:
+        UserError: one has another form, no such loss, or a weight below 0.
+    """
+    names = [each.name for each in fields(Losses)]
+    weights = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        try:
+            weight = float(number)
+        except ValueError:
+            weight = -1.0
+        if name not in names or not 0 <= weight < 1e6:
+            raise UserError(
+                f'--loss wants a name and a weight of 0 or more, such as sky=0; got "{text}".'
+                f" Names: {', '.join(names)}"
+            )
+        weights[name] = weight
+    return weights
 
 
 def summary(metrics: dict) -> str:

@@ -11,6 +11,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.errors import UserError
+from climatenerf.scene import Scene
 from climatenerf.weather.description import (
     KeyframedWeather,
     combine,
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from climatenerf.render.stage import Stage
 
 MOST_RAYS = 2**26  # in one frame: 6 GB
-LAYER_NAMES = ("depth", "normal", "water_depth", "transmittance", "snow_thickness",
+LAYER_NAMES = ("depth", "normal", "label", "water_depth", "transmittance", "snow_thickness",
                "mask_water", "mask_snow", "mask_smog")  # fmt: skip
 
 
@@ -49,6 +50,8 @@ class Render:
     """Size of the frames, such as 480x270. Default: the photos' own."""
     supersample: int = 1
     """Rays per pixel along each side."""
+    appearance: str = "mean"
+    """Exposure and light of the frames: mean, or those of a training photo such as 0012.jpg."""
     layers: tuple[Literal["all", *LAYER_NAMES], ...] = ()  # type: ignore[valid-type]
     """Layers to keep beside the frames."""
     layer_format: tuple[Literal["npz", "png", "exr"], ...] = ("npz",)
@@ -85,6 +88,14 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
     field = load_field(options.run)
     check_config(options.run)
     scene = load_scene(options.run)
+    field.shown = appearance_of(options.appearance, scene)
+    if not field.knows_classes:
+        if "label" in options.layers:
+            raise UserError(
+                f"{options.run} was fitted without class labels, so it has no layer label; fit with"
+                " --labels"
+            )
+        layers = tuple(name for name in layers if name != "label")
     path = camera_path(options.path, scene, options.frames, size)
     for note in path.notes:
         progress.say(note)
@@ -97,6 +108,20 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
     )
     progress.result(f"movie: {movie}")
     return 0
+
+
+def appearance_of(name: str, scene: Scene) -> int | None:
+    """Index of the training photo whose exposure and light are shown; None for the mean."""
+    if name == "mean":
+        return None
+    views = scene.of_split("train")
+    for index, view in enumerate(views):
+        if name in (view.name, Path(view.name).name, Path(view.name).stem):
+            return index
+    raise UserError(
+        f'the run has no training photo "{name}" to take the appearance of; give "mean" or a name'
+        f" such as {views[0].name}"
+    )
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
@@ -190,7 +215,7 @@ def render_movie(
                 time = index / fps
                 camera, c2w = path.cameras[index], path.c2w[index]
                 picture, found = render_frame(
-                    stage.at(time), camera, c2w, supersample, "normal" in layers
+                    stage.at(time), camera, c2w, supersample, "normal" in layers, "label" in layers
                 )
                 name = f"{index:04d}"
                 (out / "movie.json").unlink(missing_ok=True)  # from here on it would be wrong

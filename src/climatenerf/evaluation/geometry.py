@@ -4,25 +4,25 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from climatenerf.evaluation.reference import Truth
-from climatenerf.scene import Camera, Scene
-from climatenerf.scene.images import load_labels
+from climatenerf.scene import Camera
+from climatenerf.scene.classes import (
+    BUILDING,
+    CLASS_NAMES,
+    MERGED,
+    ROAD,
+    TERRAIN,
+    VEGETATION,
+)
 
 FARTHEST = 50.0  # m: beyond it photos of a walk say little about distance
 MARGIN, MARGIN_SHARE = 0.1, 0.05  # m, and of the depth: matter this close before a surface is its
 EMPTY = 0.99  # transmittance of what counts as empty sky
-# Cityscapes train ids as the paper's seven classes; 255 is unknown.
-ROAD, BUILDING, VEGETATION, TERRAIN, SKY, PERSON, VEHICLE = range(7)
-CLASS_NAMES = ("road", "building", "vegetation", "terrain", "sky", "person", "vehicle")
-MERGED = np.full(256, 255, np.uint8)
-MERGED[[0, 1]] = ROAD
-MERGED[2:8] = BUILDING
-MERGED[8], MERGED[9], MERGED[10] = VEGETATION, TERRAIN, SKY
-MERGED[[11, 12]] = PERSON
-MERGED[13:19] = VEHICLE
+CLEAR, STANDING = (
+    1.0,
+    0.5,
+)  # m: how far around a place, and how high, nothing stands over open ground
+EVERY = 41  # of the pixels that show ground are asked for what is above them
 TALLEST_ROOF = 0.5  # upward part of a normal from which a building's surface is a roof
-VOTERS = 24  # training views that are asked for a test view's classes
-AGREE = 0.05  # of the distance: a view sees a place if its depth there is this near
-ROUNDS = 20000  # places at once
 
 
 def depth_scores(depth: list[np.ndarray], truths: tuple[Truth, ...]) -> dict[str, float]:
@@ -78,6 +78,32 @@ def free_space(truth: Truth) -> Float[np.ndarray, "h w"]:
     return np.maximum((1 - MARGIN_SHARE) * truth.depth - MARGIN, 0.0)
 
 
+def open_ground(truths: tuple[Truth, ...]) -> Float[np.ndarray, "n 3"]:
+    """Places on road and terrain under the open sky, in the true world, m.
+
+    What the test views show is all that is known to stand over the ground: a place is open if none
+    of it is higher than `STANDING` over the place within about `CLEAR` around.
+    """
+    places, heights = [], []
+    for truth in truths:
+        near = truth.depth < FARTHEST
+        kind = MERGED[truth.label]
+        heights.append(truth.points[near])
+        places.append(truth.points[near & ((kind == ROAD) | (kind == TERRAIN))][::EVERY])
+    place, above = np.concatenate(places), np.concatenate(heights)
+    tallest: dict[tuple[int, int], float] = {}
+    cells = np.floor(above[:, :2] / CLEAR).astype(int)
+    order = np.lexsort((above[:, 2], cells[:, 1], cells[:, 0]))
+    for (x, y), z in zip(cells[order].tolist(), above[order, 2].tolist(), strict=True):
+        tallest[x, y] = z  # the last of a cell is its highest
+    free = []
+    for x, y, z in place.tolist():
+        i, j = int(np.floor(x / CLEAR)), int(np.floor(y / CLEAR))
+        around = [tallest.get((i + a, j + b), -np.inf) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        free.append(max(around) < z + STANDING)
+    return place[np.array(free, bool)]
+
+
 def emptiness_scores(
     absorbed: list[Float[np.ndarray, "h w"]],
     skyward: list[Float[np.ndarray, "h w"]],
@@ -100,48 +126,6 @@ def emptiness_scores(
         "floater_mass": float(lost.mean()),
         "sky_empty_fraction": float((passed >= EMPTY).mean()) if passed.size else float("nan"),
     }
-
-
-def voted_labels(
-    scene: Scene,
-    depths: dict[str, Float[np.ndarray, "h w"]],
-    points: Float[np.ndarray, "h w 3"],
-    sky: Bool[np.ndarray, "h w"],
-) -> UInt8[np.ndarray, "h w"]:
-    """Classes of a new view by the vote of the training views that see the same places.
-
-    A field without classes of its own still has geometry, and the training photos have labels: a
-    place takes the class that most of the views give it which see it, by their own depth.
-
-    Args:
-        scene: the run's scene, with labels.
-        depths: our depth of some of its training views, by name.
-        points: places that the new view sees, world m.
-        sky: where it sees none.
-
-    Returns:
-        Merged classes; 255 where no view sees the place.
-    """
-    flat = points.reshape(-1, 3)
-    votes = np.zeros((len(flat), len(CLASS_NAMES)), np.int32)
-    for view in scene.views:
-        label = None if view.name not in depths else load_labels(view, scene)
-        if label is None:
-            continue
-        camera, c2w = scene.cameras[view.camera], scene.c2w_world(view)
-        depth = depths[view.name]
-        for start in range(0, len(flat), ROUNDS):
-            some = slice(start, start + ROUNDS)
-            local = (flat[some] - c2w[:3, 3]) @ c2w[:3, :3]
-            row, column, inside = nearest_pixels(camera, local)
-            distance = np.linalg.norm(local, axis=-1)
-            seen = inside & (np.abs(depth[row, column] - distance) < AGREE * distance)
-            kind = MERGED[label[row, column]]
-            seen &= (kind < len(CLASS_NAMES)) & (kind != SKY)
-            np.add.at(votes[some], (np.flatnonzero(seen), kind[seen]), 1)
-    out = np.where(votes.any(-1), votes.argmax(-1), 255).astype(np.uint8).reshape(points.shape[:2])
-    out[sky] = SKY
-    return out
 
 
 def nearest_pixels(

@@ -25,6 +25,7 @@ from climatenerf.ops import dispatch
 from climatenerf.render.camera_path import camera_path
 from climatenerf.render.frame import see_frame
 from climatenerf.render.stage import Stage, prepare
+from climatenerf.render.surface import see_surface
 from climatenerf.render.view import RENDER_STEP, camera_rays
 from climatenerf.render.world import World
 from climatenerf.scene import Camera, Scene, View
@@ -35,6 +36,7 @@ Picture = UInt8[np.ndarray, "h w 3"]
 Tell = Callable[[str], None]
 FOLLOWED = {"smog": "smog-mid", "flood": "flood-waves", "snow": "snow-deep"}
 PATH_FRAMES, STARTS, FAR = 400, (60, 180, 300), 8  # of the path over which frames are compared
+LIFTED = 0.3  # m
 SMALL = 2  # frames are compared at this part of the photos' size
 
 
@@ -93,7 +95,7 @@ def evaluate(place: Place, tell: Tell) -> Scores:
     scores.table["frame"] = frame_scores(place)
     scores.table["geometry"] = geometry_scores(place, dry, scores.table["frame"]["scale"])
     tell("classes")
-    scores.table["labels"] = label_scores(place, dry)
+    scores.table["labels"] = label_scores(place)
     tell("mirrored cameras")
     scores.table["completeness"] = mirror_scores(place)
     scores.table["weather"], scores.table["baselines"] = {}, {}
@@ -167,6 +169,7 @@ def geometry_scores(place: Place, dry: list[Dry], scale: float) -> dict[str, flo
         whole = passing(place.fitted, camera, c2w, torch.full_like(free, 1e9))
         skyward.append(whole.view(truth.depth.shape).numpy())
     return {
+        "open_sky": open_sky(place),
         **geometry.depth_scores([each.depth for each in dry], truths),
         **geometry.normal_scores(normals, truths),
         **geometry.emptiness_scores(absorbed, skyward, truths),
@@ -185,21 +188,37 @@ def passing(
     return left
 
 
-def label_scores(place: Place, dry: list[Dry]) -> dict[str, float]:
-    """Classes of the test views by the vote of training views, against the true ones."""
-    train = [view for view in place.scene.of_split("train") if view.label_path is not None]
-    if not train:
+@torch.no_grad()
+def open_sky(place: Place) -> float:
+    """Mean transmittance straight up from open ground: what shelters from snow where nothing is.
+
+    From `LIFTED` over the true ground, since ours may lie a little higher.
+    """
+    truth = place.reference.truths[0]
+    found = geometry.open_ground(place.reference.truths)
+    if not len(found):
+        return float("nan")
+    # Into the run's world by way of a camera that both know.
+    _, c2w = place.pose(truth)
+    local = (found - truth.c2w[:3, 3]) @ truth.c2w[:3, :3]
+    ours = c2w[:3, 3] + frame_scores(place)["scale"] * local @ c2w[:3, :3].T
+    rays_o = torch.from_numpy(ours.astype(np.float32))
+    rays_o[:, 2] += LIFTED
+    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(found), 3).contiguous()
+    start, end = torch.zeros(len(found)), torch.full((len(found),), 1e9)
+    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP)
+    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    return float(left.mean())
+
+
+def label_scores(place: Place) -> dict[str, float]:
+    """Classes of the test views by the field, against the true ones; none without labels."""
+    if all(view.label_path is None for view in place.scene.of_split("train")):
         return {"miou": float("nan")}
-    chosen = np.unique(np.linspace(0, len(train) - 1, geometry.VOTERS).round().astype(int))
-    world, depths = World(place.fitted, place.fitted.near), {}
-    for view in (train[i] for i in chosen):
-        camera = place.scene.cameras[view.camera]
-        depths[view.name] = see_frame(world, camera, place.scene.c2w_world(view))[1]["depth"]
     labels = []
-    for each in dry:
-        sky = np.isinf(each.depth)
-        points = each.c2w[:3, 3] + np.where(sky, 0.0, each.depth)[..., None] * each.rays_d
-        labels.append(geometry.voted_labels(place.scene, depths, points, sky))
+    for truth in place.reference.truths:
+        _, label = see_surface(place.fitted, *camera_rays(*place.pose(truth)))
+        labels.append(label.view(truth.depth.shape).numpy())
     return geometry.label_scores(labels, place.reference.truths)
 
 
@@ -250,16 +269,25 @@ def frame_scores(place: Place) -> dict[str, float]:
     }
 
 
+def weather_views(
+    place: Place, kind: WeatherTruth
+) -> list[tuple[Float[np.ndarray, "h w 3"], dict[str, np.ndarray]]]:
+    """Our pictures (linear) and layers of the test views in one weather."""
+    poses = [place.pose(truth) for truth in place.reference.truths]
+    stage = _stage(place, kind.weather, kind.time, [c2w for _, c2w in poses])
+    world = stage.at(kind.time)
+    seen = [see_frame(world, camera, c2w) for camera, c2w in poses]
+    return [(linear.double().numpy(), layers) for linear, layers in seen]
+
+
 def one_weather(
     place: Place, kind: WeatherTruth, dry: list[Dry], scores: Scores, tuned: dict
 ) -> None:
     """Renders one weather in all views, scores it, and does the same with the baselines."""
     truths = place.reference.truths
     poses = [place.pose(truth) for truth in truths]
-    stage = _stage(place, kind.weather, kind.time, [c2w for _, c2w in poses])
-    world = stage.at(kind.time)
-    seen = [see_frame(world, camera, c2w) for camera, c2w in poses]
-    ours = [display_8bit(linear.double().numpy()) for linear, _ in seen]
+    seen = weather_views(place, kind)
+    ours = [display_8bit(linear) for linear, _ in seen]
     layers = [found for _, found in seen]
     real = [kind.picture(truth.name) for truth in truths]
     own: dict[str, float] = picture_scores(ours, real)

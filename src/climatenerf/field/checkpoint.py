@@ -13,7 +13,7 @@ from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.storage import check_schema, read_safetensors, write_safetensors
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 FILE_NAME = "field.safetensors"
 
 
@@ -55,7 +55,11 @@ def load_field(run: Path) -> Field:
             size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
         )
         field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
-        field.load_state_dict({k: torch.from_numpy(v) for k, v in arrays.items()})
+        tensors = {k: torch.from_numpy(v) for k, v in arrays.items()}
+        if about["schema_version"] == 1:  # without normals and classes: nothing is learned of them
+            fresh = field.state_dict()
+            tensors |= {k: fresh[k] for k in fresh if k.startswith(("surface_", "learned"))}
+        field.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise UserError(
             f"{path} is damaged ({type(error).__name__}: {error}); fit the scene again"

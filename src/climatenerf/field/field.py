@@ -1,8 +1,10 @@
-"""The radiance field: two hash grids, a colour network, a directional sky, an occupancy grid.
+"""The radiance field: hash grids, their networks, a directional sky, an occupancy grid.
 
 Geometry depends on the geometry grid alone; the appearance grid, the view direction and a
-per-image vector give colour (paper §3.1). Callers speak world metres; inside, lengths are in grid
-units: (x - centre) / unit, where the ball of radius 1 holds the core of the scene.
+per-image vector give colour; a small third grid gives normals and classes (paper §3.1, where they
+read the appearance grid: then a change of appearance would change them). Callers speak world
+metres; inside, lengths are in grid units: (x - centre) / unit, where the ball of radius 1 holds the
+core of the scene.
 """
 
 import copy
@@ -17,8 +19,9 @@ from climatenerf.field.colour_space import decode_srgb
 from climatenerf.field.directions import spherical_harmonics
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
-from climatenerf.ops import cpu, dispatch
+from climatenerf.ops import cpu, dispatch, reference
 from climatenerf.render.samples import Samples
+from climatenerf.scene.classes import SOLID
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
 STEP_CONE = 1.0 / 160  # marching step per length travelled
@@ -51,7 +54,9 @@ class Field(nn.Module):
     centre: Tensor
     geometry_resolutions: Tensor
     appearance_resolutions: Tensor
+    surface_resolutions: Tensor
     sky_resolutions: Tensor
+    learned: Tensor
 
     def __init__(
         self,
@@ -84,6 +89,10 @@ class Field(nn.Module):
             _resolutions(size.coarsest, size.appearance_finest, size.appearance_levels),
         )
         self.register_buffer(
+            "surface_resolutions",
+            _resolutions(size.coarsest, size.surface_finest, size.surface_levels),
+        )
+        self.register_buffer(
             "sky_resolutions", _resolutions(size.coarsest, size.sky_finest, size.sky_levels)
         )
         self.geometry_grid = nn.Parameter(
@@ -100,12 +109,20 @@ class Field(nn.Module):
         self.colour_net = _layers(2 * size.appearance_levels, size.colour_hidden, 3)
         self.view_net = _layers(16 + size.embedding, size.colour_hidden)
         nn.init.zeros_(self.view_net[0][:16])  # colours alike from all sides to begin with
+        self.surface_grid = nn.Parameter(
+            torch.empty(size.surface_levels, 2**size.surface_log2_rows, 2).uniform_(-1e-4, 1e-4)
+        )
+        inputs = 2 * (size.surface_levels or size.appearance_levels)
+        self.surface_net = _layers(inputs, size.surface_hidden, 3 + len(SOLID))
         self.sky_grid = nn.Parameter(
             torch.empty(size.sky_levels, 2**size.sky_log2_rows, 2).uniform_(-1e-4, 1e-4)
         )
         inputs = 16 + 2 * size.sky_levels + size.embedding
         self.sky_net = _layers(inputs, size.sky_hidden, size.sky_hidden, 3)
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
+        # Whether normals and classes were learned: an untrained head says nothing.
+        self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))
+        self.shown: int | None = None
         # Coarse to begin with; `Occupancy.refine` halves the cells later.
         self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
 
@@ -123,8 +140,23 @@ class Field(nn.Module):
 
     @property
     def mean_embedding(self) -> Float[Tensor, "1 e"]:
-        """The appearance in which frames are rendered: the training images' mean."""
+        """The training images' mean appearance."""
         return self.embeddings.mean(0, keepdim=True)
+
+    @property
+    def shown_embedding(self) -> Float[Tensor, "1 e"]:
+        """The appearance in which frames are rendered: of the image `shown`, or the mean."""
+        return self.mean_embedding if self.shown is None else self.embeddings[[self.shown]]
+
+    @property
+    def knows_normals(self) -> bool:
+        """Whether the normals of `surface_at` were learned."""
+        return bool(self.learned[0])
+
+    @property
+    def knows_classes(self) -> bool:
+        """Whether the classes of `surface_at` were learned."""
+        return bool(self.learned[1])
 
     # --- geometry ----------------------------------------------------------------------------
 
@@ -238,13 +270,44 @@ class Field(nn.Module):
         )
         return u
 
+    def raw_density(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
+        """Logarithm of the density per contracted length at unit-cube coordinates."""
+        features = dispatch.hash_encode(u, self.geometry_grid, self.geometry_resolutions)
+        return dispatch.mlp(features, _pairs(self.geometry_net))[:, 0]
+
     def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Density (1/grid unit) at unit-cube coordinates, with gradients to the parameters."""
-        features = dispatch.hash_encode(u, self.geometry_grid, self.geometry_resolutions)
-        raw = dispatch.mlp(features, _pairs(self.geometry_net))[:, 0]
+        raw = self.raw_density(u)
         # 1/|q|^2 outside the core (see `reference.density`), from the contracted radius 2 - 1/|q|.
         shell = (2.0 - (4.0 * u - 2.0).norm(dim=-1)).clamp(1e-4, 1.0)
         return raw.clamp_max(15.0).exp() * shell.square()
+
+    def density_normal(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Unit vectors against the density's gradient at positions in grid units, no gradient.
+
+        Analytic, from the encoding's slopes; 0 where the density does not change.
+        """
+        with torch.enable_grad():
+            q = q.detach().requires_grad_()
+            grid = self.geometry_grid.detach()
+            layers = [(w.detach(), b.detach()) for w, b in _pairs(self.geometry_net)]
+            u = reference.contract(q)
+            raw = dispatch.mlp(dispatch.hash_encode(u, grid, self.geometry_resolutions), layers)
+            # Of the density's logarithm: same direction, and no overflow.
+            log_density = raw[:, 0] - q.square().sum(-1).clamp_min(1.0).log()
+            (slope,) = torch.autograd.grad(log_density.sum(), q)
+        return -nn.functional.normalize(slope, dim=-1)
+
+    def sloped_normal(
+        self, q: Float[Tensor, "n 3"], step: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n 3"]:
+        """As `density_normal`, by differences over `step` (grid units), with gradients to the
+        parameters: the corners of a tetrahedron give the slope by four densities."""
+        corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+        around = q[:, None] + step[:, None, None] * corners
+        raw = self.raw_density(reference.contract(around.reshape(-1, 3))).view(-1, 4, 1)
+        # 1e-6: where the density is even its direction's gradient would be NaN.
+        return -nn.functional.normalize((raw * corners).sum(1), dim=-1, eps=1e-6)
 
     @torch.no_grad()
     def keep_occupied(
@@ -319,6 +382,18 @@ class Field(nn.Module):
             dispatch.mlp(features, _pairs(self.colour_net), view @ weight + bias, ray)
         )
 
+    def surface_at(
+        self, u: Float[Tensor, "s 3"]
+    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s c"]]:
+        """Predicted normals (unit, world axes) and class logits (of `SOLID`) at unit-cube u."""
+        if self.size.surface_levels:
+            grid, resolutions = self.surface_grid, self.surface_resolutions
+        else:
+            grid, resolutions = self.appearance_grid, self.appearance_resolutions
+        raw = dispatch.mlp(dispatch.hash_encode(u, grid, resolutions), _pairs(self.surface_net))
+        # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
+        return nn.functional.normalize(raw[:, :3], dim=-1, eps=1e-6), raw[:, 3:]
+
     def sky_colour(
         self, d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]
     ) -> Float[Tensor, "n 3"]:
@@ -336,7 +411,7 @@ class Field(nn.Module):
         d: Float[Tensor, "n 3"],
         ray: Int[Tensor, "s"] | None = None,
     ) -> Float[Tensor, "s 3"]:
-        """Linear radiance of matter at world positions, in the mean appearance.
+        """Linear radiance of matter at world positions, in the appearance shown.
 
         Args:
             x: positions, m.
@@ -349,12 +424,12 @@ class Field(nn.Module):
         q = self.to_grid(x).contiguous().numpy()
         cpu.grid_positions(q, q, one_each, zero, u.numpy())
         rows = torch.arange(x.shape[0]) if ray is None else ray
-        return self.colour_at(u, rows, d, self.mean_embedding.expand(d.shape[0], -1))
+        return self.colour_at(u, rows, d, self.shown_embedding.expand(d.shape[0], -1))
 
     @torch.no_grad()
     def sky(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear radiance of the sky, in the mean appearance."""
-        return self.sky_colour(d, self.mean_embedding.expand(d.shape[0], -1))
+        """Linear radiance of the sky, in the appearance shown."""
+        return self.sky_colour(d, self.shown_embedding.expand(d.shape[0], -1))
 
 
 def _to_radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

@@ -24,6 +24,7 @@ class Occupancy(torch.nn.Module):
     density: Tensor
     occupied: Tensor
     seen: Tensor
+    barred: Tensor
 
     def __init__(self, cascades: int, side: int):
         super().__init__()
@@ -31,6 +32,11 @@ class Occupancy(torch.nn.Module):
         self.register_buffer("occupied", torch.ones(cascades, side, side, side, dtype=torch.uint8))
         # Cells that training images have seen matter in; filled when a fit ends.
         self.register_buffer("seen", torch.zeros(cascades, side, side, side, dtype=torch.uint8))
+
+        # Cells that are known to be empty from elsewhere: they never become occupied. It follows
+        # from the photos, so it is not stored.
+        barred = torch.zeros(cascades, side, side, side, dtype=torch.bool)
+        self.register_buffer("barred", barred, persistent=False)
 
     @property
     def side(self) -> int:
@@ -86,7 +92,8 @@ class Occupancy(torch.nn.Module):
         else:
             some = torch.randint(total, (100_000,), generator=generator)
             threshold = self._thresholds(some)
-            held[cells] = (flat[cells] * size > threshold[cells // self.side**3]).to(torch.uint8)
+            dense = flat[cells] * size > threshold[cells // self.side**3]
+            held[cells] = (dense & ~self.barred.view(-1)[cells]).to(torch.uint8)
 
     def _neighbours(self, cells: Int[Tensor, "n"], generator: torch.Generator) -> Int[Tensor, "n"]:
         """A cell next to each: holes in surfaces lie beside what is known, and close this way."""
@@ -115,7 +122,7 @@ class Occupancy(torch.nn.Module):
         cascades = torch.arange(self.density.shape[0])
         depth = self.density * (2.0 ** (cascades + 1) / self.side)[:, None, None, None]
         threshold = depth.mean((1, 2, 3), keepdim=True).clamp_max(OPACITY)
-        self.occupied = (depth > threshold).to(torch.uint8)
+        self.occupied = ((depth > threshold) & ~self.barred).to(torch.uint8)
 
     def refine(self) -> None:
         """Halves the cells, each of the eight inheriting its parent's density."""
@@ -123,5 +130,9 @@ class Occupancy(torch.nn.Module):
         for axis in (1, 2, 3):
             double = double.repeat_interleave(2, dim=axis)
         self.density = double
+        held = self.barred
+        for axis in (1, 2, 3):
+            held = held.repeat_interleave(2, dim=axis)
+        self.barred = held
         self.seen = torch.zeros_like(double, dtype=torch.uint8)
         self._threshold()

@@ -16,6 +16,11 @@ class FieldSize:
     appearance_log2_rows: int = 17
     appearance_finest: int = 4096
     colour_hidden: int = 64
+    surface_levels: int = 8
+    """Levels of the grid of normals and classes; 0: they read the appearance grid."""
+    surface_log2_rows: int = 15
+    surface_finest: int = 512
+    surface_hidden: int = 32
     coarsest: int = 16
     embedding: int = 8
     """Length of the appearance vector of each training image."""
@@ -32,6 +37,15 @@ class FieldSize:
 
 PRESETS = {
     "cpu": FieldSize(),
+    # Tables that a GPU's memory and bandwidth carry easily; not measured on one yet.
+    "gpu": FieldSize(
+        geometry_levels=12,
+        geometry_log2_rows=19,
+        geometry_hidden=64,
+        appearance_levels=16,
+        appearance_log2_rows=19,
+        surface_log2_rows=17,
+    ),
     # Supplement, "Training Details": 16 levels of 2^19 for density, 32 of 2^21 for the rest.
     "paper": FieldSize(
         geometry_levels=16,
@@ -40,5 +54,6 @@ PRESETS = {
         appearance_levels=32,
         appearance_log2_rows=21,
         colour_hidden=128,
+        surface_levels=0,
     ),
 }

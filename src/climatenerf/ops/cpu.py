@@ -126,6 +126,52 @@ def hash_encode_backward(u, grad_out, resolutions, grad_table):
                 rows[row, 1] += w * gb
 
 
+@njit(cache=True, fastmath=True, parallel=True)
+def hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
+    """Gradient of `hash_encode` to the positions: grad_out [2L,n] → grad_u [n,3].
+
+    A trilinear cell's slope along an axis is the difference of its two faces.
+    """
+    n = u.shape[0]
+    levels, size = table.shape[0], table.shape[1]
+    mask = np.uint32(size - 1)
+    one = np.float32(1.0)
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
+            for axis in range(3):
+                grad_u[p, axis] = 0.0
+        for level in range(levels):
+            resolution = resolutions[level]
+            dense = _is_dense(resolution, size)
+            rows = table[level]
+            for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
+                ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
+                px, py, pz = u[p, 0] * resolution, u[p, 1] * resolution, u[p, 2] * resolution
+                ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
+                fx, fy, fz = px - ix, py - iy, pz - iz
+                sx, sy, sz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+                for corner in range(8):
+                    dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
+                    row = _corner(
+                        np.uint32(ix + np.uint32(dx)),
+                        np.uint32(iy + np.uint32(dy)),
+                        np.uint32(iz + np.uint32(dz)),
+                        resolution,
+                        dense,
+                        mask,
+                    )
+                    value = ga * rows[row, 0] + gb * rows[row, 1]
+                    wx = fx if dx else one - fx
+                    wy = fy if dy else one - fy
+                    wz = fz if dz else one - fz
+                    sx += value * wy * wz * (one if dx else -one)
+                    sy += value * wx * wz * (one if dy else -one)
+                    sz += value * wx * wy * (one if dz else -one)
+                grad_u[p, 0] += resolution * sx
+                grad_u[p, 1] += resolution * sy
+                grad_u[p, 2] += resolution * sz
+
+
 @njit(cache=True, fastmath=True, inline="always")
 def _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden):
     """Density (1/grid unit) at one point: contraction, encoding, one hidden layer, exp."""

@@ -33,12 +33,20 @@ class _HashEncode(torch.autograd.Function):
     def backward(ctx, grad):
         u, resolutions = ctx.saved_tensors
         table = ctx.table
+        grad_u = None
+        if ctx.needs_input_grad[0]:
+            grad_u = torch.empty_like(u)
+            cpu.hash_encode_slopes(
+                _np(u), _np(grad.T), _np(table), _np(resolutions), grad_u.numpy()
+            )
+        if not ctx.needs_input_grad[1]:
+            return grad_u, None, None
         # A buffer kept on the table saves zeroing and copying megabytes each step: the optimiser
         # clears what it has used (training/optimiser.py).
         buffer = getattr(table, "grad_buffer", None)
         target = torch.zeros_like(table) if buffer is None else buffer
         cpu.hash_encode_backward(_np(u), _np(grad.T), _np(resolutions), target.numpy())
-        return None, (target if buffer is None else None), None
+        return grad_u, (target if buffer is None else None), None
 
 
 def hash_encode(
@@ -46,7 +54,7 @@ def hash_encode(
     table: Float[Tensor, "levels rows 2"],
     resolutions: Int[Tensor, "levels"],
 ) -> Float[Tensor, "n features"]:
-    """See `reference.hash_encode`; gradients to the table only."""
+    """See `reference.hash_encode`; gradients to the table and to the positions (once)."""
     if _fast(u, table):
         return _HashEncode.apply(u, table, resolutions)
     return reference.hash_encode(u, table, resolutions)

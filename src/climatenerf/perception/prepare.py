@@ -24,7 +24,8 @@ from climatenerf.perception.models import Network, licence_of
 from climatenerf.perception.monocular import DEFAULT as DEPTH_ANYTHING
 from climatenerf.perception.monocular import load_depth
 from climatenerf.perception.segmentation import load_segmentation
-from climatenerf.perception.simple import shows_sky, sky_labels
+from climatenerf.perception.simple import shows_sky, simple_labels
+from climatenerf.perception.simple_ground import ground_points
 from climatenerf.scene.images import load_image
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene, View
@@ -65,10 +66,11 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
 
     Args:
         scene: The levelled capture.
-        model: A network's name or folder; "simple" for sky without a network; "none" for no
-            labels at all; None for the labels that the capture has, or else sky by "simple" if
-            photos of it surely show some.
-        spare: Folder that takes the files of "simple" if the capture's may not be written.
+        model: A network's name or folder; "simple" for sky and ground without a network; "none"
+            for no labels at all; None for the labels that the capture has, or else those of
+            "simple" if photos surely show sky.
+        spare: Folder that takes the files of "simple" if nobody asked for it or the capture's may
+            not be written.
         track: Told of progress.
         say: Told what the user should know.
 
@@ -82,6 +84,7 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
     names = [_within(v.label_path, folder) for v in scene.views if v.label_path is not None]
     if all(name in entries for name in names):
         scene = replace(scene, label_space=TRAIN_IDS)
+    unasked = False
     if model is None:
         simple = all(name in entries and entries[name]["model"] == SIMPLE for name in names)
         if not simple or (names and not _writable(folder)):
@@ -90,20 +93,21 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
             say("The capture has no class labels, and no sky is found for sure: none are used.")
             return scene
         say(
-            "The capture has no class labels; sky is found by its looks. Labels of a network are"
-            " better: --labels MODEL, or files in labels/ (--labels none does without)."
+            "The capture has no class labels; sky is found by its looks, and ground by its points."
+            " Labels of a network are better: --labels MODEL, or files in labels/ (--labels none"
+            " does without)."
         )
-        model = SIMPLE
+        model, unasked = SIMPLE, not names
     if scene.label_space != TRAIN_IDS:
         raise UserError(
             f"the capture's own labels are {scene.label_space}, which labels of {model} cannot"
             " stand beside; leave --labels out to use its own, or take them away"
         )
     source = _simple(scene) if model == SIMPLE else _segmentation(scene, model)
-    if not _writable(folder):
-        if model != SIMPLE:
-            raise _read_only(folder)
-        folder = spare / LABELS
+    if unasked or (model == SIMPLE and not _writable(folder)):
+        folder = spare / LABELS  # nobody said that the capture may be written into
+    elif not _writable(folder):
+        raise _read_only(folder)
     paths = _prepare(scene, source, folder, track, say)
     views = tuple(replace(v, label_path=v.label_path or paths.get(v.name)) for v in scene.views)
     return replace(scene, views=views)
@@ -129,9 +133,11 @@ def prepare_depth(scene: Scene, model: str, track: Track, say: Say) -> dict[str,
 
 
 def _simple(scene: Scene) -> Source:
-    return Source(
-        LABELS, ".png", SIMPLE, lambda: (None, lambda view: sky_labels(view, scene)), _png
-    )
+    def load():
+        ground = ground_points(scene)
+        return None, lambda view: simple_labels(view, scene, ground)
+
+    return Source(LABELS, ".png", SIMPLE, load, _png)
 
 
 def _segmentation(scene: Scene, model: str) -> Source:

@@ -1,9 +1,10 @@
-"""Sky without a network: bright or blue, smooth, above the horizon, and open to the photo's top.
+"""Labels without a network: sky by its looks, and ground by the capture's points.
 
-The fall-back where nobody gives class labels. What it calls sky should be sky: a piece of matter
-that is wrongly taken for it becomes a hole in the scene, whereas sky that it misses costs little.
-So every doubt leads to 255, the unknown class, and indoors there is to be no sky at all. Ground is
-not looked for: paving, moss and a house's wall look alike, and geometry tells them apart.
+The fall-back where nobody gives class labels. Sky is bright or blue, smooth, above the horizon, and
+open to the photo's top. What is called sky should be sky: a piece of matter that is wrongly taken
+for it becomes a hole in the scene, whereas sky that is missed costs little. So every doubt leads to
+255, the unknown class, and indoors there is to be no sky at all. Ground is not found by its looks,
+as paving, moss and a house's wall look alike: see `simple_ground`.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
+from climatenerf.perception.simple_ground import GroundPoints, find_ground_in
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.images import UNKNOWN_LABEL, load_image
 from climatenerf.scene.scene import Scene, View
 
-SKY = 10
+SKY, GROUND = 10, 9
+"""Ground is called terrain: whether it is paved is not known."""
 WORKING_SIZE = 800
 """Photos are looked at with at most this many pixels on the longer side."""
 SAMPLE = 16
@@ -35,12 +38,15 @@ _KNOTS = 33
 _POINT_SPACE = 0.02  # of the photo's longer side: what a triangulated point keeps free of sky
 
 
-def sky_labels(view: View, scene: Scene) -> UInt8[np.ndarray, "h w"]:
-    """Class ids of a photo: 10 where it surely shows sky, 255 elsewhere.
+def simple_labels(
+    view: View, scene: Scene, ground: GroundPoints | None
+) -> UInt8[np.ndarray, "h w"]:
+    """Class ids of a photo: 10 where it surely shows sky, 9 for ground, 255 elsewhere.
 
     Args:
         view: Which photo.
         scene: The levelled capture; its horizon and sparse points bound the sky.
+        ground: Its `ground_points`; None to look for sky alone.
 
     Raises:
         UserError: The photo cannot be read.
@@ -52,9 +58,13 @@ def sky_labels(view: View, scene: Scene) -> UInt8[np.ndarray, "h w"]:
     )
     photo = Image.fromarray(load_image(view, scene))
     picture = photo.resize((small.width, small.height), Image.Resampling.BOX)
-    upward = _upward(small, scene.c2w_world(view)[2, :3])
-    sky = find_sky(np.asarray(picture), upward, _solid(scene, view, small))
+    picture = np.asarray(picture)
+    rays = _rays(small, scene.c2w_world(view)[:3, :3])
+    sky = find_sky(picture, rays[..., 2], _solid(scene, view, small))
     labels = np.where(sky, np.uint8(SKY), np.uint8(UNKNOWN_LABEL))
+    if ground is not None:
+        values = picture.astype(np.float32) / 255
+        labels[find_ground_in(view, scene, small, ground, rays, values) & ~sky] = GROUND
     full = Image.fromarray(labels).resize(photo.size, Image.Resampling.NEAREST)
     return np.asarray(full)
 
@@ -67,7 +77,7 @@ def shows_sky(scene: Scene) -> bool:
     """
     every = max(1, len(scene.views) // SAMPLE)
     sample = scene.views[every // 2 :: every][:SAMPLE]
-    found = [bool((sky_labels(view, scene) == SKY).any()) for view in sample]
+    found = [bool((simple_labels(view, scene, None) == SKY).any()) for view in sample]
     return sum(found) >= max(2, LEAST_SHARE * len(found))
 
 
@@ -131,21 +141,30 @@ def _roughness(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     return rough
 
 
-def _upward(camera: Camera, up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "h w"]:
-    """Sine of every pixel's ray above the horizon, between the knots of a coarse net of rays.
+def _rays(camera: Camera, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Directions of every pixel's ray, between the knots of a coarse net of rays.
 
     Args:
         camera: The intrinsics.
-        up: The world's up in the camera's axes.
+        rotation: From the camera's axes to the world's.
     """
     x = np.linspace(0.5, camera.width - 0.5, _KNOTS)
     y = np.linspace(0.5, camera.height - 0.5, _KNOTS)
     # To undo a lens's distortion at every pixel would take longer than all the rest.
-    net = camera.directions(np.stack(np.meshgrid(x, y), axis=-1)) @ up
-    rows = np.arange(camera.height) + 0.5
-    columns = np.arange(camera.width) + 0.5
-    tall = np.stack([np.interp(rows, y, knots) for knots in net.T], axis=-1)
-    return np.stack([np.interp(columns, x, knots) for knots in tall]).astype(np.float32)
+    net = camera.directions(np.stack(np.meshgrid(x, y), axis=-1)) @ rotation.T
+    tall = _between(net, y, np.arange(camera.height) + 0.5)
+    wide = _between(tall.swapaxes(0, 1), x, np.arange(camera.width) + 0.5)
+    return np.ascontiguousarray(wide.swapaxes(0, 1), np.float32)
+
+
+def _between(
+    knots: Float[np.ndarray, "k n c"], at: Float[np.ndarray, " k"], places: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "m n c"]:
+    """Values between knots along the first axis."""
+    share = np.interp(places, at, np.arange(len(at)))
+    low = np.minimum(share.astype(np.int64), len(at) - 2)
+    share = (share - low)[:, None, None].astype(np.float32)
+    return knots[low] * (1 - share) + knots[low + 1] * share
 
 
 def _border(shape: tuple[int, ...]) -> Bool[np.ndarray, "h w"]:

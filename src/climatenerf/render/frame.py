@@ -8,10 +8,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
+from climatenerf.field.field import Field
 from climatenerf.render.normals import plane_normals
+from climatenerf.render.surface import see_surface
 from climatenerf.render.trace import trace
 from climatenerf.render.view import camera_rays
-from climatenerf.render.world import World
+from climatenerf.render.world import FieldLike, World
 from climatenerf.scene.cameras import Camera
 from climatenerf.weather.flood import pixel_roll
 
@@ -22,6 +24,7 @@ def render_frame(
     c2w: Float[np.ndarray, "4 4"],
     supersample: int = 1,
     normals: bool = False,
+    labels: bool = False,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
     """The display picture (8 bit) and the measured layers of one camera.
 
@@ -32,8 +35,9 @@ def render_frame(
         supersample: rays per pixel along each side; colours are averaged in linear light, layers
             taken from the ray next to the pixel's centre.
         normals: also the layer `normal`.
+        labels: also the layer `label`, of a field that has learned classes.
     """
-    linear, layers = see_frame(world, camera, c2w, supersample, normals)
+    linear, layers = see_frame(world, camera, c2w, supersample, normals, labels)
     return (encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy(), layers
 
 
@@ -43,6 +47,7 @@ def see_frame(
     c2w: Float[np.ndarray, "4 4"],
     supersample: int = 1,
     normals: bool = False,
+    labels: bool = False,
 ) -> tuple[Float[Tensor, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
     """As `render_frame`, but the picture in linear light."""
     height, width = camera.height, camera.width
@@ -60,12 +65,32 @@ def see_frame(
         for each in fields(seen)
         if each.name != "rgb" and (each.name != "normal" or normals)
     }
-    if normals:
+    if normals or labels:
         directions, angle = _middle(rays_d, shape), 1.0 / camera.fx
-        solid = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
+        solid, kind = _surface(world.field, c2w[:3, 3], directions)
+        if labels and kind is not None:
+            layers["label"] = kind
+        if solid is None:
+            solid = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
+    if normals:
         known = (layers["normal"] != 0).any(-1, keepdims=True)  # of water and snow
         layers["normal"] = np.where(known, layers["normal"], solid)
     return linear, layers
+
+
+def _surface(
+    field: FieldLike, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
+) -> tuple[Float[np.ndarray, "h w 3"] | None, UInt8[np.ndarray, "h w"] | None]:
+    """Normals and classes that the field has learned for a picture's rays; None what it has not."""
+    if not isinstance(field, Field) or not (field.knows_normals or field.knows_classes):
+        return None, None
+    rays_d = torch.from_numpy(directions.reshape(-1, 3))
+    origin = torch.from_numpy(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
+    normal, label = see_surface(field, origin, rays_d)
+    return (
+        normal.view(directions.shape).numpy() if field.knows_normals else None,
+        label.view(directions.shape[:2]).numpy() if field.knows_classes else None,
+    )
 
 
 def _middle(values: Tensor, shape: tuple[int, int, int, int]) -> np.ndarray:

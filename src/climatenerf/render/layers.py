@@ -17,6 +17,7 @@ import climatenerf
 from climatenerf.errors import UserError
 from climatenerf.render.movie import write_png
 from climatenerf.scene import Camera, Scene
+from climatenerf.scene.classes import CLASS_NAMES
 from climatenerf.storage import atomic_path, write_json
 
 SIDECAR_SCHEMA = 1
@@ -44,9 +45,11 @@ class Layer:
     png_bits: Literal[8, 16]
 
 
+CLASSES = ", ".join(f"{number} {name}" for number, name in enumerate(CLASS_NAMES))
 LAYERS: dict[str, Layer] = {
     "depth": Layer("m", "distance along the ray; no surface: +inf (PNG 0)", 1e-3, 16),
     "normal": Layer("1", "surface normal in world axes; no surface: 0 0 0 (PNG 128)", None, 8),
+    "label": Layer("1", f"class of the dry scene: {CLASSES}", 1.0, 8),
     "water_depth": Layer("m", "water above the ground where water is seen, else 0", 1e-3, 16),
     "transmittance": Layer("1", "share of the surface's light that passes the air", 1 / 65535, 16),
     "snow_thickness": Layer("m", "snow upon the surface that is seen, else 0", 1e-4, 16),

@@ -32,7 +32,7 @@ def camera_rays(
 def field_radiance(
     field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
-    """Linear radiance along rays, in the mean appearance."""
+    """Linear radiance along rays, in the appearance shown."""
     out = []
     for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
         o, d = rays_o[start : start + RAYS_AT_ONCE], rays_d[start : start + RAYS_AT_ONCE]
@@ -44,7 +44,7 @@ def field_radiance(
         ray = samples.ray_index()[keep]
         offsets = offsets_of(ray, n)
         u = field.sample_positions(o, d, samples)[keep]
-        appearance = field.mean_embedding.expand(n, -1)
+        appearance = field.shown_embedding.expand(n, -1)
         colour = field.colour_at(u, ray, d, appearance)
         radiance = dispatch.accumulate(weights[keep], colour, offsets)
         out.append(radiance + left[:, None] * field.sky_colour(d, appearance))

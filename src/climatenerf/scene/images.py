@@ -158,11 +158,14 @@ def load_relative_depth(
 ) -> Float[np.ndarray, "h w"] | None:
     """Inverse z-depth of a view up to a scale and a shift of its own; None if it has none.
 
-    From `depth_relative/NAME.npz` (one array, larger is nearer, any size), else from its depth
-    file. NaN where unknown.
+    From `depth_relative/NAME.npz` or `NAME.jpg.npz` (one array, larger is nearer, any size), else
+    from its depth file. NaN where unknown.
     """
-    path = (scene.root / RELATIVE_DEPTH / view.name).with_suffix(".npz")
-    if not path.is_file():
+    name = scene.root / RELATIVE_DEPTH / view.name
+    # The longer name first: beside it, the shorter one may belong to `NAME.png`.
+    places = (name.with_name(f"{name.name}.npz"), name.with_suffix(".npz"))
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
         depth = load_depth(view, scene, downscale)
         return None if depth is None else 1.0 / depth
     try:

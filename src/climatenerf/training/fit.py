@@ -7,49 +7,31 @@ those that weigh, composites in linear light, and compares with the photos as di
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.extent import Extent
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
-from climatenerf.ops import dispatch
+from climatenerf.ops import dispatch, reference
 from climatenerf.render.samples import Samples, offsets_of
 from climatenerf.render.view import LEAST_WEIGHT
+from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.training import losses
+from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.pixels import Batch, TrainingPixels
 from climatenerf.training.points import PointRays
-
-
-@dataclass(frozen=True)
-class FitSettings:
-    """How a field is fitted."""
-
-    preset: str = "cpu"
-    minutes: float | None = 5.0
-    """Stop after this many minutes; None: by steps alone."""
-    steps: int | None = None
-    """Stop after this many steps; None: by minutes alone."""
-    samples_per_step: int = 2**16
-    grid_rate: float = 2e-2
-    """Learning rate of the hash grids at the start."""
-    net_rate: float = 1e-2
-    """Learning rate of networks, sky and appearance at the start."""
-    final_rate: float = 0.1
-    """Both rates end at this share of their start."""
-    distortion_weight: float = 1e-2
-    opacity_weight: float = 2e-4
-    solid_weight: float = 0.1
-    """Of light left on rays that point below the horizon, where no sky is."""
-    sky_weight: float = 1e-1
-    depth_weight: float = 1e-1
-    """Of the distance of matter from sparse points, where photos are known to show them."""
-    seed: int = 0
+from climatenerf.training.poses import RATE as POSE_RATE
+from climatenerf.training.poses import PoseCorrections
+from climatenerf.training.settings import FitSettings
+from climatenerf.training.sky_fill import fill_sky
+from climatenerf.training.transients import TransientMasks
 
 
 @dataclass(frozen=True)
@@ -91,20 +73,32 @@ class Fitting:
         self.settings = settings
         size = PRESETS[settings.preset]
         self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near)
-        labelled = pixels.sky is not None
+        self.masks, self.poses = TransientMasks(images), PoseCorrections(images)
+        self.relative = RelativeDepth(images)
+        self.generator = torch.Generator().manual_seed(settings.seed)
+        labelled = pixels.label is not None
+        self.fill = fill_sky(pixels, self.generator) if labelled else None
+        self.bar_sky()
+        kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
+        classed = bool((SOLID_CLASSES[kinds.long()] != UNKNOWN).any())
+        weigh = settings.losses
+        self.field.learned[:] = torch.tensor([weigh.normals > 0, weigh.classes > 0 and classed])
         self.field.sky_grid.requires_grad_(labelled)
         grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
+        grids += [self.field.surface_grid] if size.surface_levels else []
         self.grid_adam = GridAdam(grids)
         named = dict(self.field.named_parameters())
         # Appearance learns slowly: a vector per image is enough to paint every photo onto haze.
         groups = [
             {"params": _of(named, "geometry_net", "colour_net"), "shares": (1.0, 1.0)},
+            {"params": _of(named, "surface_net"), "shares": (1.0, 1.0)},
             {"params": _of(named, "view_net"), "shares": VIEW_SHARES},
             {"params": _of(named, "sky_net"), "shares": (1.0, 1.0) if labelled else SKY_SHARES},
             {"params": _of(named, "embeddings"), "shares": EMBEDDING_SHARES},
+            {"params": list(self.masks.parameters()), "shares": (0.0, 1.0)},
+            {"params": list(self.poses.parameters()), "shares": (0.0, POSE_SHARE)},
         ]
         self.net_adam = torch.optim.Adam(groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
-        self.generator = torch.Generator().manual_seed(settings.seed)
         self.steps = 0
         self.seconds = 0.0
         self.samples = 0
@@ -128,7 +122,10 @@ class Fitting:
         while self.progress < 1:
             start = time.perf_counter()
             self.update_occupancy()
-            batch = self.pixels.draw(self.rays, self.generator)
+            wants_triples = self.settings.losses.flat and self.progress > REFINE_AT
+            triples = int(TRIPLE_SHARE * self.rays) if wants_triples else 0
+            edges = EDGE_SHARE if self.progress > KEEP_AT else 0.0
+            batch = self.pixels.draw(self.rays, self.generator, triples, edges)
             error, samples = self.step(batch)
             seconds = time.perf_counter() - start
             rays = batch.rays_o.shape[0]
@@ -153,17 +150,23 @@ class Fitting:
     def compile_kernels(self) -> None:
         """Runs every kernel once on a few rays, so that compiling is not taken for fitting."""
         images = self.field.embeddings.shape[0]
-        twin = Fitting(self.pixels, images, self.extent, self.settings, self.points)
+        quick = replace(self.settings, carve=False)
+        twin = Fitting(self.pixels, images, self.extent, quick, self.points)
         twin.step(twin.pixels.draw(16, twin.generator))
         twin.field.grid_density(torch.zeros(16, 3))
+        twin.field.density_normal(torch.zeros(16, 3))
 
     def step(self, batch: Batch) -> tuple[float, int]:
         """One optimiser step; returns the mean squared display error and the samples used."""
         settings, field = self.settings, self.field
         n = batch.rays_o.shape[0]
+        if settings.refine_poses:
+            rays = self.poses.rays(batch.rays_o, batch.rays_d, batch.image, field.unit)
+            batch = replace(batch, rays_o=rays[0], rays_d=rays[1])
+        rays_o, rays_d = batch.rays_o.detach(), batch.rays_d.detach()
         samples = field.march(
-            batch.rays_o,
-            batch.rays_d,
+            rays_o,
+            rays_d,
             torch.full((n,), self.near()),
             torch.full((n,), 1e9),
             self.step_scale,
@@ -175,38 +178,42 @@ class Fitting:
         tau = samples.sigma * samples.dt
         before, _ = dispatch.render_weights(tau, samples.offsets)
         if self.progress > KEEP_AT:
-            field.keep_occupied(batch.rays_o, batch.rays_d, samples, before > SEEN_WEIGHT)
+            field.keep_occupied(rays_o, rays_d, samples, before > SEEN_WEIGHT)
         kept, chance = self.choose(before)
-        u = field.sample_positions(batch.rays_o, batch.rays_d, samples)[kept]
+        u = self.positions(batch, samples, kept)
         # Near a camera many rays crowd into little space that few other cameras see, and haze there
         # is learned first. Gradients scaled with the distance squared, as the rays' spread, undo
         # that (Philip & Deschaintre 2023, Eq. 5).
-        spread = (samples.t[kept] / (CROWDED * field.near)).square().clamp_max(1.0)
+        spread = torch.ones_like(chance)
+        if settings.crowded:
+            spread = (samples.t[kept] / (settings.crowded * field.near)).square().clamp_max(1.0)
         own = field.density_with_gradient(u) * dt[kept]
         tau = tau.index_copy(0, kept, scale_gradient(own, spread / chance))
         weights, left = dispatch.render_weights(tau, samples.offsets)
-        radiance = self.radiance(batch, u, samples, kept, weights, left, spread, chance)
 
-        error = losses.colour_loss(radiance, batch.rgb)
-        loss = error
-        if settings.distortion_weight:
-            loss = loss + settings.distortion_weight * losses.distortion_loss(
-                weights, t, dt, samples.offsets
-            )
-        if settings.opacity_weight:
-            loss = loss + settings.opacity_weight * losses.opacity_loss(left)
-        if settings.solid_weight:
-            below = (batch.rays_d[:, 2] < HORIZON) & (batch.is_sky == 0)
-            grown = min(1.0, max(0.0, self.progress / REFINE_AT - 0.5))
-            loss = loss + grown * settings.solid_weight * losses.solid_loss(left, below)
-        if settings.sky_weight and self.pixels.sky is not None:
-            loss = loss + settings.sky_weight * losses.sky_loss(left, batch.is_sky)
+        share = weights[kept] / chance
+        seen = (share.detach() > LEAST_WEIGHT).nonzero()[:, 0]
+        ray = samples.ray_index()[kept][seen]
+        radiance = self.radiance(batch, u[seen], ray, share[seen], left, spread[seen])
+        error = losses.colour_error(radiance, batch.rgb)
+        loss = self.colour_loss(error, batch)
+        loss = loss + self.geometry_loss(batch, samples, weights, left, t, dt)
+        loss = loss + self.surface_loss(
+            batch, u[seen], ray, share[seen].detach(), samples, kept[seen]
+        )
+        if settings.losses.sky_fill and self.fill is not None:
+            d, colour = self.fill.draw(SKY_LOOKS, self.generator)
+            shown = field.sky_colour(d, field.mean_embedding.detach().expand(d.shape[0], -1))
+            apart = losses.colour_error(shown, encode_srgb(colour)).sum() / SKY_LOOKS
+            loss = loss + settings.losses.sky_fill * apart
+        if settings.refine_poses:
+            loss = loss + self.poses.loss()
 
         used = samples.t.shape[0]
-        if settings.depth_weight and self.points is not None:
+        if settings.losses.points and self.points is not None:
             measured = self.points.draw(max(n // POINT_SHARE, 16), self.generator)
             loss_of_depth, more = self.depth_loss(measured)
-            loss, used = loss + settings.depth_weight * loss_of_depth, used + more
+            loss, used = loss + settings.losses.points * loss_of_depth, used + more
 
         self.net_adam.zero_grad()
         loss.backward()
@@ -215,7 +222,126 @@ class Fitting:
             group["lr"] = settings.net_rate * decay * group["shares"][self.progress > REFINE_AT]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * decay)
-        return error.item(), used
+        return error.mean().item(), used
+
+    def positions(
+        self, batch: Batch, samples: Samples, kept: Int[Tensor, "k"]
+    ) -> Float[Tensor, "k 3"]:
+        """Unit-cube coordinates of some samples; with gradients to the cameras if they move."""
+        if not self.settings.refine_poses:
+            return self.field.sample_positions(batch.rays_o, batch.rays_d, samples)[kept]
+        ray = samples.ray_index()[kept]
+        x = batch.rays_o[ray] + samples.t[kept, None] * batch.rays_d[ray]
+        return reference.contract(self.field.to_grid(x))
+
+    def colour_loss(self, error: Float[Tensor, "n"], batch: Batch) -> Float[Tensor, ""]:
+        """Mean squared error of the colours, without what is taken for transient."""
+        price = self.settings.losses.transient
+        if not price or self.progress <= REFINE_AT:
+            return error.mean()
+        # As long as all is wrong, nothing stands out.
+        price = max(price, OUTSTANDING * self.error)
+        # What can move is suspected sooner; but a word alone removes nothing.
+        movable = (batch.label == PERSON) | (batch.label == VEHICLE)
+        prices = torch.where(movable, price * SUSPECT, price)
+        return losses.masked_colour_loss(error, self.masks(batch.image, batch.place), prices)
+
+    def geometry_loss(
+        self,
+        batch: Batch,
+        samples: Samples,
+        weights: Float[Tensor, "s"],
+        left: Float[Tensor, "n"],
+        t: Float[Tensor, "s"],
+        dt: Float[Tensor, "s"],
+    ) -> Float[Tensor, ""]:
+        """All that moves matter beside the colours and the points; t and dt in grid units."""
+        weigh, n = self.settings.losses, left.shape[0]
+        loss = left.sum() * 0.0
+        if weigh.distortion:
+            loss = loss + weigh.distortion * losses.distortion_loss(weights, t, dt, samples.offsets)
+        if weigh.opacity:
+            loss = loss + weigh.opacity * losses.opacity_loss(left)
+        if weigh.solid:
+            below = (batch.rays_d[:, 2] < HORIZON) & (batch.label != SKY)
+            grown = min(1.0, max(0.0, self.progress / REFINE_AT - 0.5))
+            loss = loss + grown * weigh.solid * losses.solid_loss(left, below)
+        distance = dispatch.accumulate(weights, t[:, None], samples.offsets)[:, 0]
+        mean_distance = distance / (1 - left).clamp_min(1e-3)  # nothing there: 0/0
+        if weigh.sky and self.pixels.label is not None:
+            if self.settings.opaque_sky:
+                loss = loss + weigh.sky * losses.far_sky_loss(distance, batch.is_sky)
+            else:
+                agreed = self.agreed_sky(batch, mean_distance.detach(), left.detach())
+                # Leaves against the sky come first, clean edges last: too early, crowns are lost.
+                grown = min(1.0, max(SKY_AT_FIRST, 2 * self.progress - 0.5))
+                loss = loss + grown * weigh.sky * losses.sky_loss(left, agreed)
+        solid = left.detach() < 0.5
+        z = (mean_distance * batch.cosine).clamp_min(1e-3)  # of rays without matter: not counted
+        m = batch.in_line.shape[0]
+        if weigh.flat and m:
+            rows = torch.stack(
+                [torch.arange(m), torch.arange(n - 2 * m, n - m), torch.arange(n - m, n)]
+            )
+            label = batch.label[rows]
+            alike = (label == label[0]).all(0) & (label[0] != VEGETATION) & (label[0] != SKY)
+            counts = batch.in_line & alike & solid[rows].all(0)
+            loss = loss + weigh.flat * losses.flat_loss(z[rows].T, counts.float())
+        if weigh.monocular and batch.relative is not None and self.progress > REFINE_AT:
+            counts = solid & (batch.label != SKY) & torch.isfinite(batch.relative)
+            loss = loss + weigh.monocular * self.relative.loss(
+                1 / z, batch.relative, batch.image, counts
+            )
+        return loss
+
+    def agreed_sky(
+        self, batch: Batch, distance: Float[Tensor, "n"], left: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n"]:
+        """1 for rays labelled sky whose matter other photos see as sky too."""
+        witness = self.pixels.witness
+        if witness is None or not self.settings.carve:
+            return batch.is_sky
+        asked = ((batch.label == SKY) & (left < ASKED_LEFT)).nonzero()[:, 0]
+        x = batch.rays_o.detach()[asked] + (
+            distance[asked, None] * self.field.unit * batch.rays_d.detach()[asked]
+        )
+        agreed = torch.zeros_like(left)
+        agreed[asked] = witness.agreed(x, torch.zeros(asked.shape[0])).float()
+        return agreed
+
+    def surface_loss(
+        self,
+        batch: Batch,
+        u: Float[Tensor, "k 3"],
+        ray: Int[Tensor, "k"],
+        share: Float[Tensor, "k"],
+        samples: Samples,
+        index: Int[Tensor, "k"],
+    ) -> Float[Tensor, ""]:
+        """Classes and normals of some of the rays' samples (those that weigh, `index`)."""
+        weigh = self.settings.losses
+        if not (weigh.classes or weigh.normals or weigh.bend):
+            return u.sum() * 0.0
+        n = max(batch.rays_o.shape[0] // SURFACE_SHARE, 1)
+        some = slice(0, int(torch.searchsorted(ray, n)))
+        normal, logits = self.field.surface_at(u[some].detach())
+        own, of = share[some], ray[some]
+        loss = normal.sum() * 0.0
+        if weigh.classes and self.pixels.label is not None:
+            target = SOLID_CLASSES[batch.label[:n].long()]
+            composited = dispatch.accumulate(own, logits, offsets_of(of, n))
+            loss = loss + weigh.classes * losses.class_loss(composited, target, target != UNKNOWN)
+        if (weigh.normals or weigh.bend) and self.progress > REFINE_AT:
+            at = samples.t[index[some], None]
+            q = self.field.to_grid(batch.rays_o.detach()[of] + at * batch.rays_d.detach()[of])
+            if weigh.normals:
+                target = self.field.density_normal(q)
+                loss = loss + weigh.normals * losses.normal_loss(own, normal, target, n)
+            if weigh.bend:
+                step = BEND_STEP * samples.dt[index[some]] / self.field.unit
+                bent = self.field.sloped_normal(q, step)
+                loss = loss + weigh.bend * losses.normal_loss(own, bent, normal.detach(), n)
+        return loss
 
     def depth_loss(self, measured: PointRays) -> tuple[Tensor, int]:
         """How far matter is from the sparse points on their rays; and the samples used."""
@@ -258,32 +384,46 @@ class Fitting:
         self,
         batch: Batch,
         u: Float[Tensor, "k 3"],
-        samples: Samples,
-        kept: Int[Tensor, "k"],
-        weights: Float[Tensor, "s"],
+        ray: Int[Tensor, "k"],
+        share: Float[Tensor, "k"],
         left: Float[Tensor, "n"],
         spread: Float[Tensor, "k"],
-        chance: Float[Tensor, "k"],
     ) -> Float[Tensor, "n 3"]:
-        """Linear radiance of a batch's rays: matter in front of the directional sky."""
+        """Linear radiance of a batch's rays: matter (the samples given) in front of the sky."""
         n = batch.rays_o.shape[0]
-        share = weights[kept] / chance
-        seen = (share.detach() > LEAST_WEIGHT).nonzero()[:, 0]
-        ray = samples.ray_index()[kept][seen]
-        offsets = offsets_of(ray, n)
         appearance = self.field.embeddings[batch.image]
-        colour = self.field.colour_at(u[seen], ray, batch.rays_d, appearance)
-        colour = scale_gradient(colour, spread[seen, None])
-        own = dispatch.accumulate(share[seen], colour, offsets)
+        if not self.settings.appearance:
+            appearance = appearance.detach()
+        colour = self.field.colour_at(u, ray, batch.rays_d, appearance)
+        colour = scale_gradient(colour, spread[:, None])
+        own = dispatch.accumulate(share, colour, offsets_of(ray, n))
         # The drawn shares sum to the ray's opacity on average only; made to sum to it, they are far
         # less noisy.
-        drawn = torch.zeros(n).index_add(0, ray, share[seen].detach())
+        drawn = torch.zeros(n).index_add(0, ray, share.detach())
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
         sky = self.field.sky_colour(batch.rays_d, appearance)
-        if self.pixels.sky is not None:
+        if self.pixels.label is not None:
             # It learns from its own pixels alone; then it may learn fast, and in detail.
             sky = scale_gradient(sky, batch.is_sky[:, None])
         return own + left[:, None] * sky
+
+    def bar_sky(self) -> None:
+        """Bars the occupancy's cells that photos agree to be sky, unless a point lies in them."""
+        witness, occupancy = self.pixels.witness, self.field.occupancy
+        if witness is None or not self.settings.carve:
+            return
+        cells = (occupancy.occupied.view(-1) > 0).nonzero()[:, 0]
+        centre, size = occupancy.cell_centres(cells)
+        x = centre * self.field.unit + self.field.centre
+        radius = size * (self.field.unit * 3**0.5 / 2)
+        cells = cells[witness.agreed(x, radius)]
+        barred = occupancy.barred.view(-1)
+        barred[cells] = True
+        if self.points is not None:
+            ends = self.points.rays_o + self.points.depth[:, None] * self.points.rays_d
+            held, _ = self.field._cells(self.field.to_grid(ends))
+            barred[held] = False
+        occupancy.occupied.view(-1)[barred] = 0
 
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
@@ -295,6 +435,7 @@ class Fitting:
         late = self.progress > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
+            self.bar_sky()
 
     def adapt(self, rays: int, samples: int) -> None:
         """Keeps the samples per step at their budget, and makes marching finer with time.
@@ -333,11 +474,21 @@ EMBEDDING_SHARES = (0.0, 0.02)
 # seen from elsewhere too, and a wall before each camera would satisfy every photo.
 FIRST_NEAR = 0.6
 HORIZON = -0.05  # rays that sink more than this end on matter
-CROWDED = 3.0  # rays of one camera crowd within this many times the nearest distance
 CHOSEN = 32  # samples of a ray that get colour and gradients, about
 SEEN_WEIGHT = 0.05  # samples that weigh more show that their cell is occupied
 KEEP_AT = 0.5  # progress from which this is so: before, haze is to be pruned
 LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
+SURFACE_SHARE = 4  # rays for one whose classes and normals are learned from
+TRIPLE_SHARE = 1 / 6  # of the rays that are the middle of three in a line
+SKY_AT_FIRST = 0.2  # of the sky loss's weight, whole from three quarters of the fit
+EDGE_SHARE = 0.1  # of the other rays that are drawn from the sky's edges, late in the fit
+SKY_LOOKS = 64  # directions in which the sky is filled, a step
+ASKED_LEFT = 0.999  # rays with more light left have no matter to speak of
+OUTSTANDING = 6.0  # times the mean error: the least price of a mask
+SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
+BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
+POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
+SOLID_CLASSES = torch.from_numpy(SOLID_OF.astype(np.int64))
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this

@@ -1,10 +1,10 @@
-"""Losses of the paper (supplement, "Training Details"), each a pure function.
+"""Losses of the paper (supplement, "Training Details") and some more, each a pure function.
 
-Their weights are in `fit.FitSettings`: the paper's, but for the distortion's (docs/decisions.md).
-The paper's print "3^{-4}" is a mis-set 3e-4.
+Their weights are in `settings.Losses`.
 """
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -12,9 +12,9 @@ from climatenerf.field.colour_space import encode_srgb
 from climatenerf.ops import dispatch
 
 
-def colour_loss(linear: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
-    """Mean squared error of display values; `linear` is radiance, `target` display sRGB."""
-    return (encode_srgb(linear) - target).square().mean()
+def colour_error(linear: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Squared error of display values; `linear` is radiance, `target` display sRGB."""
+    return (encode_srgb(linear) - target).square().mean(-1)
 
 
 def distance_measure(t: Float[Tensor, "s"]) -> Float[Tensor, "s"]:
@@ -75,3 +75,56 @@ def solid_loss(transmittance: Float[Tensor, "n"], below: Bool[Tensor, "n"]) -> F
 def sky_loss(transmittance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Mean opacity of rays labelled sky: the sky has no density."""
     return ((1.0 - transmittance) * is_sky).mean()
+
+
+def far_sky_loss(distance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """The paper's form, exp(-distance) on sky rays: an opaque sky, far away.
+
+    `distance` is the composited one, in grid units: 0 where nothing is.
+    """
+    return ((-distance).exp() * is_sky).mean()
+
+
+def bending(z: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+    """Relative second difference of 1/z over pixels in a line: middle, left, right.
+
+    The inverse z-depth of a plane is affine in pixel coordinates, so planes bend by 0 however
+    they are tilted.
+    """
+    middle, left, right = z.unbind(-1)
+    return middle / left + middle / right - 2.0
+
+
+def flat_loss(z: Float[Tensor, "m 3"], counts: Float[Tensor, "m"]) -> Float[Tensor, ""]:
+    """Mean of e² / (e² + `CREASE`²), e the bending (Geman & McClure): edges of depth go free."""
+    squared = bending(z).square()
+    return (counts * squared / (squared + CREASE**2)).mean()
+
+
+def class_loss(
+    logits: Float[Tensor, "n c"], target: Int[Tensor, "n"], known: Bool[Tensor, "n"]
+) -> Float[Tensor, ""]:
+    """Cross-entropy of composited logits where the class is known, a mean over all rays."""
+    if not bool(known.any()):
+        return logits.sum() * 0.0
+    return F.cross_entropy(logits[known], target[known], reduction="sum") / logits.shape[0]
+
+
+def normal_loss(
+    weights: Float[Tensor, "s"],
+    predicted: Float[Tensor, "s 3"],
+    target: Float[Tensor, "s 3"],
+    rays: int,
+) -> Float[Tensor, ""]:
+    """Mean over rays of the weighted squared distance of unit normals (Verbin et al. 2022)."""
+    return (weights * (predicted - target).square().sum(-1)).sum() / rays
+
+
+def masked_colour_loss(
+    error: Float[Tensor, "n"], mask: Float[Tensor, "n"], price: Float[Tensor, "n"]
+) -> Float[Tensor, ""]:
+    """Mean of (1 - M)·error + price·M: see `transients.py`."""
+    return ((1.0 - mask) * error + price * mask).mean()
+
+
+CREASE = 0.03  # bending that counts as an edge rather than as noise

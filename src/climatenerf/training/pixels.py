@@ -5,17 +5,24 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.scene.cameras import Camera
+from climatenerf.scene.classes import MERGED, SKY, UNKNOWN
+from climatenerf.training.sky_witness import SkyWitness
 
-SKY = 10  # Cityscapes train id
+SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
+EDGE = 2  # pixels to both sides that are such an edge
 
 
 @dataclass
 class Batch:
-    """n rays drawn from the training images."""
+    """n rays drawn from the training images.
+
+    The last 2m of them, m = len(in_line), are the two sides of the first m: pixels in one line at
+    equal distances.
+    """
 
     rays_o: Float[Tensor, "n 3"]
     """Origins, world m."""
@@ -25,8 +32,21 @@ class Batch:
     """Index of the training image."""
     rgb: Float[Tensor, "n 3"]
     """Display sRGB in [0,1]."""
-    is_sky: Float[Tensor, "n"]
-    """1 where the image's label says sky, else 0."""
+    label: UInt8[Tensor, "n"]
+    """Merged class of the image's label, 255 unknown."""
+    place: Float[Tensor, "n 2"]
+    """Where in the image, (x, y) in (0,1)."""
+    cosine: Float[Tensor, "n"]
+    """Of the angle between the ray and the optical axis."""
+    in_line: Bool[Tensor, "m"]
+    """Which of the triples lie in their image as a whole."""
+    relative: Float[Tensor, "n"] | None
+    """Relative inverse z-depth (see `monocular.py`), NaN where unknown; None if there is none."""
+
+    @property
+    def is_sky(self) -> Float[Tensor, "n"]:
+        """1 where the image's label says sky, else 0."""
+        return (self.label == SKY).float()
 
 
 class TrainingPixels:
@@ -40,6 +60,7 @@ class TrainingPixels:
         images: Sequence[UInt8[np.ndarray, "h w 3"]],
         labels: Sequence[UInt8[np.ndarray, "h w"] | None] | None = None,
         masks: Sequence[np.ndarray | None] | None = None,
+        relative: Sequence[np.ndarray | None] | None = None,
     ):
         """Takes images in the size of their (already downscaled) cameras; c2w in world metres.
 
@@ -57,38 +78,118 @@ class TrainingPixels:
             raise ValueError("an image's size differs from its camera's")
         self.pixel_start = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
         self.rgb = torch.from_numpy(np.concatenate([i.reshape(-1, 3) for i in images]))
-        self.sky = None
+        self.width = torch.tensor([image.shape[1] for image in images])
+        self.height = torch.tensor([image.shape[0] for image in images])
+        self.label = None
+        self.witness = None
+        self.edge = torch.zeros(0, dtype=torch.long)
         if labels is not None and any(label is not None for label in labels):
-            self.sky = torch.cat(
-                [
-                    torch.zeros(int(n), dtype=torch.bool)
-                    if label is None
-                    else torch.from_numpy(label.reshape(-1) == SKY)
-                    for label, n in zip(labels, counts, strict=True)
-                ]
-            )
+            merged = [
+                np.full(image.shape[:2], UNKNOWN, np.uint8) if label is None else MERGED[label]
+                for label, image in zip(labels, images, strict=True)
+            ]
+            self.label = torch.from_numpy(np.concatenate([each.reshape(-1) for each in merged]))
+            edge = np.concatenate([sky_edge(each).reshape(-1) for each in merged])
+            self.edge = torch.from_numpy(np.flatnonzero(edge))
+            self.witness = SkyWitness([cameras[i] for i in camera_of], c2w, merged)
+        self.relative = None
+        if relative is not None and any(each is not None for each in relative):
+            flat = [
+                np.full(int(n), np.nan, np.float16) if each is None else each.reshape(-1)
+                for each, n in zip(relative, counts, strict=True)
+            ]
+            self.relative = torch.from_numpy(np.concatenate(flat).astype(np.float16))
         self.allowed = None
         if masks is not None and any(mask is not None for mask in masks):
             keep = [
                 np.ones(int(n), bool) if mask is None else mask.reshape(-1) > 0
                 for mask, n in zip(masks, counts, strict=True)
             ]
-            self.allowed = torch.from_numpy(np.flatnonzero(np.concatenate(keep)))
+            allowed = np.concatenate(keep)
+            self.allowed = torch.from_numpy(np.flatnonzero(allowed))
+            self.edge = self.edge[torch.from_numpy(allowed)[self.edge]]
 
-    def draw(self, n: int, generator: torch.Generator) -> Batch:
-        """n random pixels."""
+    def draw(
+        self, n: int, generator: torch.Generator, triples: int = 0, edges: float = 0.0
+    ) -> Batch:
+        """n random pixels.
+
+        Args:
+            n: how many.
+            generator: of randomness.
+            triples: as many of them are the middle of three in a line at equal distances.
+            edges: share of the rest that is drawn from the sky's edges: few pixels show where
+                matter ends and the sky begins, and much hangs on them.
+        """
+        free = n - 2 * triples
         if self.allowed is None:
-            pixel = torch.randint(self.rgb.shape[0], (n,), generator=generator)
+            pixel = torch.randint(self.rgb.shape[0], (free,), generator=generator)
         else:
-            pixel = self.allowed[torch.randint(self.allowed.shape[0], (n,), generator=generator)]
+            chosen = torch.randint(self.allowed.shape[0], (free,), generator=generator)
+            pixel = self.allowed[chosen]
+        if self.edge.numel():
+            count = int(edges * (free - triples))
+            chosen = torch.randint(self.edge.shape[0], (count,), generator=generator)
+            pixel[free - count :] = self.edge[chosen]
         image = torch.searchsorted(self.pixel_start, pixel, right=True) - 1
         within = pixel - self.pixel_start[image]
+        in_line = torch.zeros(0, dtype=torch.bool)
+        if triples:
+            left, right, in_line = self.sides(image[:triples], within[:triples], generator)
+            image = torch.cat([image, image[:triples], image[:triples]])
+            within = torch.cat([within, left, right])
+            pixel = self.pixel_start[image] + within
+        width = self.width[image]
+        place = torch.stack(
+            [
+                (within % width + 0.5) / width,
+                (within.div(width, rounding_mode="floor") + 0.5) / self.height[image],
+            ],
+            dim=-1,
+        )
         c2w = self.c2w[image]
         d = self.directions[self.direction_start[image] + within]
+        unknown = torch.full((n,), UNKNOWN, dtype=torch.uint8)
         return Batch(
             rays_o=c2w[:, :3, 3].contiguous(),
             rays_d=(c2w[:, :3, :3] @ d[:, :, None])[:, :, 0].contiguous(),
             image=image,
             rgb=self.rgb[pixel].float() / 255.0,
-            is_sky=torch.zeros(n) if self.sky is None else self.sky[pixel].float(),
+            label=unknown if self.label is None else self.label[pixel],
+            place=place,
+            cosine=d[:, 2],
+            in_line=in_line,
+            relative=None if self.relative is None else self.relative[pixel].float(),
         )
+
+    def sides(
+        self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator
+    ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Bool[Tensor, "m"]]:
+        """Two pixels on opposite sides of each pixel, and whether both lie in the image.
+
+        Where they do not, the pixel itself stands for both.
+        """
+        m = image.shape[0]
+        spacing = torch.tensor(SPACINGS)[torch.randint(len(SPACINGS), (m,), generator=generator)]
+        axis = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
+        step = axis[torch.randint(len(axis), (m,), generator=generator)] * spacing[:, None]
+        width, height = self.width[image], self.height[image]
+        x, y = within % width, within.div(width, rounding_mode="floor")
+        inside = (x >= spacing) & (x < width - spacing) & (y >= spacing) & (y < height - spacing)
+        shift = (step[:, 0] + step[:, 1] * width) * inside
+        return within - shift, within + shift, inside
+
+
+def sky_edge(label: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels within `EDGE` of the border between sky and what is known not to be sky."""
+    sky, other = label == SKY, (label != SKY) & (label != UNKNOWN)
+    near = []
+    for side in (sky, other):
+        padded = np.pad(side, EDGE)
+        shifted = [
+            padded[r : r + label.shape[0], c : c + label.shape[1]]
+            for r in range(2 * EDGE + 1)
+            for c in range(2 * EDGE + 1)
+        ]
+        near.append(np.any(shifted, axis=0))
+    return (sky | other) & near[0] & near[1]

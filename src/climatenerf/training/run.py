@@ -18,7 +18,13 @@ from climatenerf.field.extent import find_extent
 from climatenerf.field.field import Field
 from climatenerf.render.view import render_view
 from climatenerf.scene.cameras import Camera
-from climatenerf.scene.images import downscaled_camera, load_image, load_labels, load_mask
+from climatenerf.scene.images import (
+    downscaled_camera,
+    load_image,
+    load_labels,
+    load_mask,
+    load_relative_depth,
+)
 from climatenerf.scene.scene import Scene, View, load_scene, save_scene
 from climatenerf.storage import (
     atomic_path,
@@ -29,9 +35,10 @@ from climatenerf.storage import (
     write_json,
     write_safetensors,
 )
-from climatenerf.training.fit import FitSettings, Fitting, Report
+from climatenerf.training.fit import Fitting, Report
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
+from climatenerf.training.settings import FitSettings
 
 SCHEMA_VERSION = 1
 OPTIMISER = "optimiser.safetensors"
@@ -62,6 +69,7 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         [load_image(view, scene, downscale) for view in views],
         [load_labels(view, scene, downscale) for view in views],
         [load_mask(view, scene, downscale) for view in views],
+        [load_relative_depth(view, scene, downscale) for view in views],
     )
     if pixels.allowed is not None and not pixels.allowed.numel():
         raise UserError(
@@ -132,6 +140,9 @@ def fit_scene(
         interrupted = True
     fitting.field.occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
     checkpoint(fitting, run)
+    if settings.refine_poses:
+        scene = with_corrections(scene, fitting)
+        save_scene(scene, run)
     save_preview(fitting.field, scene, watch, run / "previews", fitting.steps)
     metrics = {
         "seconds": round(fitting.seconds, 1),
@@ -184,6 +195,9 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     state = {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
     for index, moments in fitting.net_adam.state_dict()["state"].items():
         state |= {f"net.{index}.{k}": torch.as_tensor(v) for k, v in moments.items()}
+    for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
+        state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
+    state["relative"] = fitting.relative.sums
     state["generator"] = fitting.generator.get_state()
     numbers = [fitting.steps, fitting.samples, fitting.rays]
     state["counters"] = torch.tensor(numbers)
@@ -191,6 +205,22 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
         [fitting.seconds, fitting.step_scale, fitting.error], dtype=torch.float64
     )
     write_safetensors(run / OPTIMISER, state, {})
+
+
+def with_corrections(scene: Scene, fitting: Fitting) -> Scene:
+    """The scene with its training views' poses as the fit has corrected them."""
+    views = scene.of_split("train")
+    given = torch.from_numpy(np.stack([scene.c2w_world(view) for view in views])).float()
+    corrected = fitting.poses.corrected(given, fitting.field.unit).double().numpy()
+    back = np.linalg.inv(scene.world_from_input)
+    moved = {}
+    for view, c2w in zip(views, corrected, strict=True):
+        pose = back @ c2w
+        pose[:3, :3] *= scene.scale
+        moved[view.name] = dataclasses.replace(view, c2w=pose)
+    return dataclasses.replace(
+        scene, views=tuple(moved.get(view.name, view) for view in scene.views)
+    )
 
 
 def check_folder(scene: Scene, run: Path, resume: bool) -> None:
@@ -264,6 +294,7 @@ def restore(fitting: Fitting, run: Path) -> None:
     with torch.no_grad():
         fitting.field.load_state_dict(field.state_dict())
     fitting.field.unit, fitting.field.near = field.unit, field.near
+    fitting.bar_sky()
     arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
     try:
         _restore_state(fitting, arrays)
@@ -286,6 +317,10 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
             moments.setdefault(int(index), {})[name] = value
     groups = fitting.net_adam.state_dict()["param_groups"]
     fitting.net_adam.load_state_dict({"state": moments, "param_groups": groups})
+    for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
+        own = {k: v for k, v in state.items() if k.startswith(f"{name}.")}
+        module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in own.items()})
+    fitting.relative.sums = state["relative"]
     fitting.generator.set_state(state["generator"])
     fitting.steps, fitting.samples, fitting.rays = state["counters"].tolist()
     fitting.seconds, fitting.step_scale, fitting.error = state["floats"].tolist()

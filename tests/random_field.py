@@ -21,6 +21,10 @@ SMALL = FieldSize(
     sky_log2_rows=9,
     sky_finest=16,
     sky_hidden=8,
+    surface_levels=3,
+    surface_log2_rows=9,
+    surface_finest=20,
+    surface_hidden=8,
     occupancy_side=16,
     cascades=3,
 )

@@ -1,0 +1,81 @@
+"""A sky for directions that no photo looked in: what is known, spread smoothly over the sphere.
+
+Reflections and light from above ask for all of the sky. A network asked where it learned nothing
+may answer with anything; so it learns there what the nearest known sky says.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from climatenerf.field.colour_space import decode_srgb
+from climatenerf.scene.classes import SKY
+from climatenerf.training.pixels import TrainingPixels
+
+ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of its sine, azimuth
+LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
+LOOKS = 400_000  # pixels that are looked at
+SPREADS = 400  # rounds of spreading: far more than the map is wide
+
+
+@dataclass(frozen=True)
+class SkyFill:
+    """Colours of the sky where no photo shows it."""
+
+    colour: Float[Tensor, "rows columns 3"]
+    """Linear radiance of the map."""
+    unseen: Bool[Tensor, "rows columns"]
+    """Cells that no photo shows."""
+
+    def draw(
+        self, n: int, generator: torch.Generator
+    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
+        """About n random directions that no photo shows, even over the sphere; their colours."""
+        at = torch.rand(n, 2, generator=generator) * torch.tensor([float(ROWS), float(COLUMNS)])
+        row, column = at.long().unbind(-1)
+        unseen = self.unseen[row, column]
+        at, row, column = at[unseen], row[unseen], column[unseen]
+        return direction(at[:, 0], at[:, 1]), self.colour[row, column]
+
+
+def direction(row: Float[Tensor, "n"], column: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+    """Unit vectors of places in the map."""
+    z = LOWEST + (1 - LOWEST) * row / ROWS
+    azimuth = 2 * np.pi * column / COLUMNS
+    flat = (1 - z.square()).clamp_min(0).sqrt()
+    return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=-1)
+
+
+def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | None:
+    """The sky of all photos on a map, and its gaps filled; None if no photo shows sky."""
+    batch = pixels.draw(LOOKS, generator)
+    sky = (batch.label == SKY) & (batch.rays_d[:, 2] > LOWEST)
+    if not bool(sky.any()):
+        return None
+    d, colour = batch.rays_d[sky], decode_srgb(batch.rgb[sky])
+    row = ((d[:, 2] - LOWEST) / (1 - LOWEST) * ROWS).long().clamp(0, ROWS - 1)
+    turn = torch.atan2(d[:, 1], d[:, 0]) / (2 * np.pi) % 1.0
+    column = (turn * COLUMNS).long().clamp(0, COLUMNS - 1)
+    cell = row * COLUMNS + column
+    total = torch.zeros(ROWS * COLUMNS, 3).index_add(0, cell, colour)
+    count = torch.bincount(cell, minlength=ROWS * COLUMNS).float()
+    seen = (count > 0).view(ROWS, COLUMNS)
+    known = (total / count.clamp_min(1)[:, None]).view(ROWS, COLUMNS, 3)
+    return SkyFill(spread(known, seen), ~seen)
+
+
+def spread(
+    known: Float[Tensor, "rows columns 3"], seen: Bool[Tensor, "rows columns"]
+) -> Float[Tensor, "rows columns 3"]:
+    """Unseen cells as the mean of their neighbours (Laplace's equation), seen ones as they are."""
+    held = seen[..., None]
+    colour = torch.where(held, known, known[seen].mean(0))
+    for _ in range(SPREADS):
+        above = torch.cat([colour[1:], colour[-1:].roll(COLUMNS // 2, 1)])  # over the zenith
+        below = torch.cat([colour[:1], colour[:-1]])
+        beside = colour.roll(1, 1) + colour.roll(-1, 1)
+        colour = torch.where(held, known, (above + below + beside) / 4)
+    return colour

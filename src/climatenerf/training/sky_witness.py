@@ -1,0 +1,101 @@
+"""Where photos agree that there is nothing: what lies on a ray that ends in the sky is empty.
+
+Nothing stands behind the sky, so every point of a sky ray is empty, whatever else stands about: the
+views' sky carves the scene as silhouettes carve a visual hull (Laurentini 1994). Labels err, so one
+view's word is not enough.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from climatenerf.scene.cameras import Camera
+from climatenerf.scene.classes import SKY, UNKNOWN
+
+VOICES = 64  # views that are asked, at most
+WIDEST = 400  # pixels of the maps that they are asked by
+REACH = 24  # pixels: within larger footprints nothing is claimed
+LEAST_VOICES, LEAST_SHARE = 2, 0.1  # views that must say sky, and of those that have it in view
+AT_ONCE = 2**17  # places
+
+
+class SkyWitness:
+    """Asks views whether a place is in front of their sky."""
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        c2w: Float[np.ndarray, "v 4 4"],
+        labels: Sequence[UInt8[np.ndarray, "h w"]],
+    ):
+        """Takes merged classes in the size of each view's camera; c2w in world metres."""
+        labelled = [i for i, label in enumerate(labels) if (label != UNKNOWN).any()]
+        chosen = np.unique(np.linspace(0, len(labelled) - 1, VOICES).round().astype(int))
+        asked = [labelled[i] for i in chosen]
+        maps = [sky_depth(cameras[i], labels[i]) for i in asked]
+        self.maps = [torch.from_numpy(each) for each, _ in maps]
+        self.intrinsics = [pinhole for _, pinhole in maps]
+        self.c2w = torch.from_numpy(np.asarray(c2w, np.float32)[asked])
+
+    @torch.no_grad()
+    def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """Whether enough views see nothing but sky within `radius` (m) of places x (world m)."""
+        out = torch.empty(x.shape[0], dtype=torch.bool)
+        for start in range(0, x.shape[0], AT_ONCE):
+            some = slice(start, start + AT_ONCE)
+            out[some] = self._agreed(x[some], radius[some])
+        return out
+
+    def _agreed(self, x: Tensor, radius: Tensor) -> Tensor:
+        voices = torch.zeros(x.shape[0], dtype=torch.int32)
+        watching = torch.zeros_like(voices)
+        for sky, (fx, fy, cx, cy), c2w in zip(self.maps, self.intrinsics, self.c2w, strict=True):
+            height, width = sky.shape
+            local = (x - c2w[:3, 3]) @ c2w[:3, :3]
+            z = local[:, 2]
+            ahead = z > radius
+            per_metre = 1.0 / z.clamp_min(1e-6)  # behind the eye: not asked
+            column = (fx * local[:, 0] * per_metre + cx).floor()
+            row = (fy * local[:, 1] * per_metre + cy).floor()
+            inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            index = (row * width + column).where(inside, torch.zeros_like(row)).long()
+            reach = sky.view(-1)[index] - 1.0  # 1 at the sky's edge
+            voices += inside & (reach >= radius * max(fx, fy) * per_metre)
+            watching += inside
+        return (voices >= LEAST_VOICES) & (voices >= LEAST_SHARE * watching)
+
+
+def sky_depth(
+    camera: Camera, label: UInt8[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "hs ws"], tuple[float, float, float, float]]:
+    """How many pixels within the sky each pixel lies, in a small picture without distortion.
+
+    1 at the sky's edge, 0 outside it, at most `REACH`. Also its fx, fy, cx, cy.
+    """
+    width = min(WIDEST, camera.width)
+    small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
+    row, column = np.mgrid[: small.height, : small.width] + 0.5
+    x, y = (column - small.cx) / small.fx, (row - small.cy) / small.fy
+    pixel = camera.project(np.stack([x, y, np.ones_like(x)], axis=-1))
+    with np.errstate(invalid="ignore"):
+        inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=-1)
+    place = np.where(inside[..., None], np.nan_to_num(pixel), 0).astype(np.int64)
+    whole = label == SKY
+    for _ in range(camera.width // width // 2):  # a wire thinner than a small pixel stays
+        whole = eroded(whole)
+    sky = inside & whole[place[..., 1], place[..., 0]]
+    depth = np.zeros(sky.shape, np.float32)
+    for _ in range(REACH):
+        depth += sky
+        sky = eroded(sky)
+    return depth, (small.fx, small.fy, small.cx, small.cy)
+
+
+def eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """What of a mask has no neighbour outside it; beyond the picture's border nothing is known."""
+    padded = np.pad(mask, 1)
+    rows = padded[:-2] & padded[1:-1] & padded[2:]
+    return rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]

@@ -1,0 +1,55 @@
+"""What one photo shows and the others do not: a mask for each image, learned with the scene.
+
+A passer-by is seen by one photo only and cannot be explained by a static scene. Each image has a
+mask M in [0,1] over it; where M is 1 its colours do not count, at a price. Minimising
+(1 - M) · error + price · M turns M on just where the error stays above the price (paper,
+"Transient Object Occlusion"; the price is its mask regulariser).
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+CELLS = (6, 12, 24, 48)  # along each side of an image, of the mask's levels
+HIDDEN = 16
+FEATURES = 2
+
+
+class TransientMasks(nn.Module):
+    """A small network over a pyramid of features of each image's own."""
+
+    def __init__(self, images: int):
+        super().__init__()
+        self.levels = nn.ParameterList(
+            # The image is a row of its own, so images never leak into each other.
+            [nn.Parameter(1e-2 * torch.randn(images, FEATURES, side, side)) for side in CELLS]
+        )
+        last = nn.Linear(HIDDEN, 1)
+        nn.init.constant_(last.bias, -4.0)  # all is believed to begin with
+        self.net = nn.Sequential(nn.Linear(FEATURES * len(CELLS), HIDDEN), nn.ReLU(), last)
+
+    def forward(self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        """M of pixels: 1 where a photo shows what is not of the scene.
+
+        Args:
+            image: index of the image.
+            place: (x, y) in the image, (0,1).
+        """
+        return torch.sigmoid(self.net(self.features(image, place))[:, 0])
+
+    def features(
+        self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]
+    ) -> Float[Tensor, "n features"]:
+        """Bilinear lookups of every level, side by side."""
+        found = []
+        for level in self.levels:
+            side = level.shape[-1]
+            p = (place * side - 0.5).clamp(0, side - 1)
+            low = p.long().clamp_max(side - 2)
+            (fx, fy), (x, y) = (p - low).unbind(-1), low.unbind(-1)
+            flat = level.permute(0, 2, 3, 1).reshape(-1, FEATURES)
+            at = (image * side + y) * side + x
+            top = flat[at] * (1 - fx)[:, None] + flat[at + 1] * fx[:, None]
+            bottom = flat[at + side] * (1 - fx)[:, None] + flat[at + side + 1] * fx[:, None]
+            found.append(top * (1 - fy)[:, None] + bottom * fy[:, None])
+        return torch.cat(found, dim=-1)

@@ -1,0 +1,116 @@
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_scene import TINY, make_scene
+
+from climatenerf.errors import UserError
+from climatenerf.field.presets import PRESETS
+from climatenerf.scene import read_scene
+from climatenerf.training import ablation
+from climatenerf.training import run as run_module
+from climatenerf.training.settings import PAPER, FitSettings, Losses, settings_of
+
+REFERENCE = Path(__file__).parents[2] / "reference" / "street"
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    monkeypatch.setitem(PRESETS, "cpu", TINY)
+    monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
+
+
+def differences(one, other):
+    """Names of the settings and losses in which two differ."""
+    own = {
+        f.name for f in dataclasses.fields(FitSettings) if f.name != "losses"
+        and getattr(one, f.name) != getattr(other, f.name)
+    }  # fmt: skip
+    return own | {
+        f.name
+        for f in dataclasses.fields(Losses)
+        if getattr(one.losses, f.name) != getattr(other.losses, f.name)
+    }
+
+
+def test_each_row_leaves_out_just_what_it_says():
+    rows = ablation.rows(4.0)
+    full = rows["full"]
+    assert full == FitSettings(minutes=4.0)
+    assert {name: differences(full, row) for name, row in rows.items() if name != "plain NGP"} == {
+        "no appearance": {"appearance"},
+        "no distortion": {"distortion"},
+        "no normals": {"normals", "flat"},
+        "no sky": {"sky", "sky_fill", "carve"},
+        "no depth": {"points", "monocular"},
+        "full": set(),
+    }
+    plain = rows["plain NGP"]
+    assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
+    assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
+
+
+def test_the_papers_weights_are_the_papers():
+    """Its print 3^{-4} and so on is 3e-4: the first public code has these."""
+    weights = PAPER.losses
+    assert (weights.classes, weights.normals, weights.distortion) == (4e-2, 7e-4, 3e-4)
+    assert (weights.sky, weights.opacity) == (1e-1, 2e-4)
+    assert settings_of("paper") is PAPER and settings_of("cpu").losses == Losses()
+    assert settings_of("gpu").preset == "gpu"
+
+
+def test_a_finished_row_is_kept_and_one_of_other_settings_refused(tmp_path):
+    scene = make_scene(tmp_path / "toy")
+    settings = FitSettings(minutes=None, steps=2, samples_per_step=2**12)
+    run, steps = tmp_path / "run", []
+    ablation.fit_row(scene, run, settings, 1, lambda state: steps.append(state.step))
+    assert steps == [1, 2]
+    field = (run / "field.safetensors").read_bytes()
+    ablation.fit_row(scene, run, settings, 1, lambda state: steps.append(state.step))
+    assert steps == [1, 2] and (run / "field.safetensors").read_bytes() == field
+    for other, downscale in ((dataclasses.replace(settings, seed=1), 1), (settings, 2)):
+        with pytest.raises(UserError, match="other settings"):
+            ablation.fit_row(scene, run, other, downscale, lambda state: None)
+
+
+def test_a_capture_without_truth_is_refused_before_any_fit(tmp_path):
+    scene = make_scene(tmp_path / "toy")
+    with pytest.raises(UserError, match="reference"):
+        ablation.ablate(scene, tmp_path / "out", 1.0, 1, 1, print, print)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_table_has_means_and_half_the_range():
+    data = {
+        "minutes": 2.0,
+        "downscale": 2,
+        "capture": "street",
+        "rows": {"plain NGP": [{"psnr": 20.0}, {"psnr": 21.0}], "full": [{"psnr": 25.0}]},
+    }
+    text = ablation.markdown(data)
+    assert "| plain NGP | 20.5 ± 0.5 | - |" in text and "| full | 25 | - |" in text
+
+
+def test_pictures_of_depth_and_normals():
+    depth = np.array([[1.0, 4.0, np.inf]])
+    assert ablation.depth_picture(depth)[0, :, 0].tolist() == [255, 128, 0]
+    normal = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]])
+    assert ablation.normal_picture(normal)[0].tolist() == [[128, 128, 255], [0, 0, 0]]
+
+
+@pytest.mark.slow
+def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
+    full = FitSettings(minutes=None, steps=250, samples_per_step=2**14)
+    bare = dataclasses.replace(full, losses=dataclasses.replace(full.losses, sky=0.0), carve=False)
+    monkeypatch.setattr(ablation, "rows", lambda minutes: {"no sky": bare, "full": full})
+    monkeypatch.setattr(ablation, "WEATHERS", ("smog-mid",))
+    data = ablation.ablate(
+        read_scene(REFERENCE), tmp_path, 1.0, 4, 1, lambda name, state: None, lambda name: None
+    )
+    rows = {name: each[0] for name, each in data["rows"].items()}
+    assert rows["full"]["sky_empty_fraction"] > rows["no sky"]["sky_empty_fraction"]
+    assert json.loads((tmp_path / "ablation.json").read_text())["rows"].keys() == rows.keys()
+    assert (tmp_path / "ablation.jpg").stat().st_size > 10_000
+    assert "smog-mid" in (tmp_path / "ablation.md").read_text()

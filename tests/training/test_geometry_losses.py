@@ -1,0 +1,98 @@
+"""Flatness, classes and normals as losses: known values, invariances, gradients."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.scene.cameras import Camera
+from climatenerf.training import losses
+from climatenerf.training.pixels import TrainingPixels
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 30.0, 25.0)
+
+
+def plane_depth(normal, offset):
+    """z-depth of every pixel to the plane n·x = offset."""
+    flat = CAMERA.directions()
+    flat = flat / flat[..., 2:]
+    return offset / (flat @ np.asarray(normal))
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.0, -0.95, 0.3), (0.3, 0.1, 0.9)])
+def test_planes_do_not_bend_however_tilted(normal):
+    """Over pixels in any line, at any distance."""
+    z = torch.tensor(plane_depth(normal, 3.0))
+    for down, right in ((0, 1), (5, 0), (8, 8), (3, -3)):
+        middle = z[20, 30]
+        left, right_ = z[20 - down, 30 - right], z[20 + down, 30 + right]
+        assert abs(losses.bending(torch.stack([middle, left, right_])[None])) < 1e-6
+
+
+def test_a_bump_bends_and_an_edge_costs_no_more_than_one():
+    bump, edge = torch.tensor([[0.97, 1.0, 1.0]]), torch.tensor([[1.0, 1.0, 9.0]])
+    assert losses.bending(bump) == pytest.approx(2 * (0.97 - 1.0), rel=1e-4)
+    counts = torch.ones(1)
+    assert 0.5 < losses.flat_loss(bump, counts) < losses.flat_loss(edge, counts) <= 1.0
+    assert losses.flat_loss(edge, torch.zeros(1)) == 0
+
+
+def test_an_edge_feels_next_to_no_pull_and_a_bump_much():
+    pulls = []
+    for row in ([0.98, 1.0, 1.0], [1.0, 1.0, 9.0]):
+        z = torch.tensor([row], requires_grad=True)
+        losses.flat_loss(z, torch.ones(1)).backward()
+        assert z.grad is not None
+        pulls.append(float(z.grad.abs().max()))
+    assert pulls[1] < 0.01 * pulls[0]
+
+
+def test_class_loss_is_cross_entropy_where_known_and_none_elsewhere():
+    logits = torch.tensor([[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]])
+    target = torch.tensor([0, 255, 1])
+    known = torch.tensor([True, False, True])
+    expected = (math.log(1 + math.exp(-2)) + math.log(2)) / 3
+    assert losses.class_loss(logits, target, known) == pytest.approx(expected)
+    nothing = losses.class_loss(logits.requires_grad_(), target, torch.zeros(3, dtype=torch.bool))
+    assert nothing == 0 and torch.isfinite(nothing)
+
+
+def test_normal_loss_of_known_directions():
+    weights = torch.tensor([0.5, 0.25])
+    up, side = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
+    same = losses.normal_loss(weights, torch.stack([up, up]), torch.stack([up, up]), 2)
+    across = losses.normal_loss(weights, torch.stack([up, up]), torch.stack([side, -up]), 2)
+    assert same == 0 and across == pytest.approx((0.5 * 2 + 0.25 * 4) / 2)
+
+
+def test_the_papers_sky_loss_wants_matter_far_away():
+    is_sky = torch.tensor([1.0, 1.0, 0.0])
+    near = losses.far_sky_loss(torch.tensor([0.0, 1.0, 0.0]), is_sky)
+    far = losses.far_sky_loss(torch.tensor([8.0, 8.0, 0.0]), is_sky)
+    assert near == pytest.approx((1 + math.exp(-1)) / 3) and far < 1e-3
+
+
+def test_triples_lie_in_a_line_at_equal_distances_in_one_image():
+    camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
+    images = [np.zeros((14, 20, 3), np.uint8)] * 3
+    images = [np.full_like(image, index) for index, image in enumerate(images)]
+    pixels = TrainingPixels([camera], [0, 0, 0], np.stack([np.eye(4)] * 3), images)
+    n, m = 900, 200
+    batch = pixels.draw(n, torch.Generator().manual_seed(0), m)
+    assert batch.rays_d.shape == (n, 3) and batch.in_line.shape == (m,)
+    middle, left, right = (
+        part[batch.in_line]
+        for part in (slice(0, m), slice(n - 2 * m, n - m), slice(n - m, n))
+        for part in [batch.place[part] * torch.tensor([20.0, 14.0])]
+    )
+    assert 0.2 < batch.in_line.float().mean() < 1
+    assert torch.allclose((left + right) / 2, middle, atol=1e-4)
+    apart = (left - middle).abs().amax(-1).round()
+    assert set(apart.tolist()) == {1.0, 2.0, 4.0}  # 8 does not fit 14 rows here
+    for some in (slice(n - 2 * m, n - m), slice(n - m, n)):
+        assert torch.equal(batch.image[some], batch.image[:m])
+    outside = ~batch.in_line
+    assert torch.equal(batch.place[n - m :][outside], batch.place[:m][outside])
+    # Colours belong to the pixels: each image is of one colour.
+    assert torch.allclose(batch.rgb[:, 0] * 255, batch.image.float(), atol=1e-3)

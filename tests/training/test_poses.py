@@ -1,0 +1,85 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_scene import TINY, make_scene
+
+from climatenerf.field.extent import find_extent
+from climatenerf.field.presets import PRESETS
+from climatenerf.training.fit import Fitting
+from climatenerf.training.poses import PoseCorrections, rotations
+from climatenerf.training.run import load_pixels
+from climatenerf.training.settings import FitSettings
+
+
+@pytest.fixture(autouse=True)
+def tiny(monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+
+
+def test_perturbed_poses_come_back(tmp_path):
+    """Cameras turned by some four degrees: a third is found again soon, and only if asked."""
+    scene = make_scene(tmp_path)
+    views = scene.of_split("train")
+    true = torch.from_numpy(np.stack([scene.c2w_world(v) for v in views])).float()
+    torch.manual_seed(0)
+    wrong = 0.05 * torch.randn(len(views), 3)
+    given = true.clone()
+    given[:, :3, :3] = rotations(wrong) @ true[:, :3, :3]
+    pixels = load_pixels(scene, 1)
+    pixels.c2w = given
+    extent = find_extent(true.numpy().astype(float), None)
+    settings = FitSettings(
+        preset="tiny", minutes=None, steps=400, samples_per_step=2**14, refine_poses=True
+    )
+    fitting = Fitting(pixels, len(views), extent, settings)
+    fitting.run(lambda _: None)
+    found = fitting.poses.corrected(given, fitting.field.unit).detach()
+    left = [
+        (poses[:, :3, :3] @ true[:, :3, :3].transpose(1, 2)).diagonal(dim1=1, dim2=2).sum(-1)
+        for poses in (given, found)
+    ]
+    before, after = (torch.rad2deg(torch.acos(((t - 1) / 2).clamp(-1, 1))).median() for t in left)
+    assert after < 0.75 * before, (before, after)
+    still = Fitting(pixels, len(views), extent, replace(settings, refine_poses=False, steps=100))
+    still.run(lambda _: None)
+    assert torch.equal(still.poses.turn, torch.zeros_like(still.poses.turn))
+
+
+def test_rotations_are_rotations_and_known_ones():
+    turn = torch.randn(20, 3)
+    r = rotations(turn)
+    assert torch.allclose(r @ r.transpose(1, 2), torch.eye(3).expand(20, 3, 3), atol=1e-5)
+    assert torch.allclose(torch.linalg.det(r), torch.ones(20), atol=1e-5)
+    quarter = rotations(torch.tensor([[0.0, 0.0, torch.pi / 2]]))[0]
+    assert torch.allclose(quarter @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6)
+
+
+def test_no_correction_leaves_rays_and_poses_as_they_are_and_has_finite_gradients():
+    poses = PoseCorrections(3)
+    image = torch.tensor([0, 2, 1])
+    o, d = torch.randn(3, 3), torch.nn.functional.normalize(torch.randn(3, 3), dim=-1)
+    o2, d2 = poses.rays(o, d, image, 5.0)
+    assert torch.equal(o2, o) and torch.allclose(d2, d)
+    (o2.sum() + (d2 * torch.randn(3, 3)).sum() + poses.loss()).backward()
+    assert poses.turn.grad is not None and torch.isfinite(poses.turn.grad).all()
+    assert (poses.turn.grad != 0).any()
+    c2w = torch.eye(4).repeat(3, 1, 1)
+    assert torch.allclose(poses.corrected(c2w, 5.0), c2w)
+
+
+def test_corrected_poses_throw_the_corrected_rays():
+    poses = PoseCorrections(2)
+    with torch.no_grad():
+        poses.turn.copy_(0.1 * torch.randn(2, 3))
+        poses.shift.copy_(0.1 * torch.randn(2, 3))
+    c2w = torch.eye(4).repeat(2, 1, 1)
+    c2w[1, :3, :3] = rotations(torch.randn(1, 3))[0]
+    c2w[:, :3, 3] = torch.randn(2, 3)
+    image, ahead = torch.tensor([0, 1]), torch.tensor([0.1, -0.2, 0.97])
+    with torch.no_grad():
+        o, d = poses.rays(c2w[:, :3, 3], c2w[:, :3, :3] @ ahead, image, 4.0)
+        corrected = poses.corrected(c2w, 4.0)
+    assert torch.allclose(corrected[:, :3, 3], o, atol=1e-6)
+    assert torch.allclose(corrected[:, :3, :3] @ ahead, d, atol=1e-6)

@@ -1,0 +1,131 @@
+"""The views' sky carves the scene: what it empties, what it must not, and on how many words."""
+
+import numpy as np
+import torch
+
+from climatenerf.scene.cameras import Camera
+from climatenerf.scene.classes import BUILDING, SKY, UNKNOWN
+from climatenerf.training import sky_witness
+from climatenerf.training.sky_witness import SkyWitness, sky_depth
+
+CAMERA = Camera(80, 60, 60.0, 60.0, 40.0, 30.0)
+TOWER = (np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 2.0]))
+GROUND = 0.0
+
+
+def poses(count, distance=6.0, height=1.0):
+    """Level cameras on a circle, looking at the tower."""
+    found = []
+    for i in range(count):
+        turn = 2 * np.pi * i / count
+        eye = np.array([distance * np.cos(turn), distance * np.sin(turn), height])
+        forward = np.array([0.0, 0.0, height]) - eye
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0, 0, 1.0])
+        c2w = np.eye(4)
+        c2w[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=-1)
+        found.append(c2w)
+    return np.stack(found)
+
+
+def labels(camera, c2w):
+    """True labels: the tower, the ground, and sky elsewhere."""
+    d = camera.directions() @ c2w[:3, :3].T
+    eye = c2w[:3, 3]
+    with np.errstate(divide="ignore"):
+        near = np.minimum((TOWER[0] - eye) / d, (TOWER[1] - eye) / d).max(-1)
+        far = np.maximum((TOWER[0] - eye) / d, (TOWER[1] - eye) / d).min(-1)
+    solid = ((near < far) & (far > 0)) | (d[..., 2] < 0)
+    return np.where(solid, BUILDING, SKY).astype(np.uint8)
+
+
+def witness(count=12, change=None):
+    c2w = poses(count)
+    maps = [labels(CAMERA, pose) for pose in c2w]
+    return SkyWitness([CAMERA] * count, c2w, change(maps) if change else maps)
+
+
+def places(n=4000, seed=0):
+    spread = torch.rand(n, 3, generator=torch.Generator().manual_seed(seed))
+    return (spread - torch.tensor([0.5, 0.5, 0.1])) * torch.tensor([8.0, 8.0, 5.0])
+
+
+def in_matter(x, margin=0.0):
+    low, high = (torch.tensor(each).float() for each in TOWER)
+    inside = ((x > low - margin) & (x < high + margin)).all(-1)
+    return inside | (x[:, 2] < GROUND + margin)
+
+
+def test_the_tower_and_the_ground_stay_and_the_air_beside_them_goes():
+    x = places()
+    agreed = witness().agreed(x, torch.full((len(x),), 0.1))
+    assert not (agreed & in_matter(x, 0.1)).any()
+    beside = (x[:, :2].norm(dim=-1) > 1.0) & (x[:, :2].norm(dim=-1) < 2.5)
+    beside &= (x[:, 2] > 1.3) & (x[:, 2] < 2.0)
+    assert agreed[beside].float().mean() > 0.8, agreed[beside].float().mean()
+
+
+def test_larger_footprints_are_emptied_less():
+    x, one = places(), witness()
+    shares = [one.agreed(x, torch.full((len(x),), r)).float().mean() for r in (0.0, 0.2, 0.8)]
+    assert shares[0] > shares[1] > shares[2]
+
+
+def test_one_view_alone_empties_nothing():
+    """All others have no word: they show matter everywhere, or no labels at all."""
+    x = places()
+    for other in (BUILDING, UNKNOWN):
+        alone = witness(
+            change=lambda maps, o=other: [maps[0]] + [np.full_like(m, o) for m in maps[1:]]
+        )
+        assert not alone.agreed(x, torch.zeros(len(x))).any()
+
+
+def test_a_wrong_label_in_one_view_of_many_removes_no_matter():
+    def err(maps):
+        return [np.full_like(maps[0], SKY), *maps[1:]]
+
+    x = places()
+    x = x[in_matter(x, -0.1)]
+    assert len(x) > 100
+    assert not witness(12, err).agreed(x, torch.zeros(len(x))).any()
+
+
+def test_few_voices_among_many_watchers_are_not_enough(monkeypatch):
+    """Two wrong views of 30 are below a tenth; of 12 they would be above it."""
+
+    def err(maps):
+        return [np.full_like(maps[0], SKY)] * 2 + maps[2:]
+
+    x = torch.tensor([[0.0, 0.0, 1.0]])
+    assert not witness(30, err).agreed(x, torch.zeros(1)).any()
+    assert witness(12, err).agreed(x, torch.zeros(1)).any()
+
+
+def test_depth_within_the_sky_counts_pixels_from_its_edge():
+    label = np.full((20, 30), BUILDING, np.uint8)
+    label[3:12, 5:20] = SKY
+    camera = Camera(30, 20, 25.0, 25.0, 15.0, 10.0)
+    depth, intrinsics = sky_depth(camera, label)
+    assert intrinsics == (25.0, 25.0, 15.0, 10.0)
+    assert depth[3, 10] == 1 and depth[7, 12] == 5 and depth[2, 10] == 0
+    assert depth.max() == 5
+
+
+def test_a_thin_wire_in_a_large_photo_is_not_lost(monkeypatch):
+    """One pixel wide, it would fall between the pixels of the small map."""
+    monkeypatch.setattr(sky_witness, "WIDEST", 40)
+    label = np.full((90, 120), SKY, np.uint8)
+    label[:, 61] = BUILDING
+    depth, _ = sky_depth(Camera(120, 90, 100.0, 100.0, 60.0, 45.0), label)
+    assert (depth[5:-5, 20] == 0).all()
+    assert (depth[15, 8:14] > 0).all()
+
+
+def test_a_distorted_camera_is_asked_at_the_right_pixel():
+    bent = Camera(80, 60, 60.0, 60.0, 40.0, 30.0, k1=-0.15)
+    c2w = poses(12)
+    one = SkyWitness([bent] * 12, c2w, [labels(bent, pose) for pose in c2w])
+    x = places()
+    agreed = one.agreed(x, torch.full((len(x),), 0.1))
+    assert agreed.any() and not (agreed & in_matter(x, 0.1)).any()

@@ -1,0 +1,66 @@
+import torch
+
+from climatenerf.training import losses
+from climatenerf.training.transients import TransientMasks
+
+PRICE = 0.02
+
+
+def train(error_at, images=4, steps=600):
+    """Masks of images whose squared error at (image, place) is given."""
+    torch.manual_seed(0)
+    masks = TransientMasks(images)
+    adam = torch.optim.Adam(masks.parameters(), lr=1e-2)
+    for _ in range(steps):
+        image, place = torch.randint(images, (1024,)), torch.rand(1024, 2)
+        error = error_at(image, place)
+        loss = losses.masked_colour_loss(error, masks(image, place), torch.full((1024,), PRICE))
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+    return masks
+
+
+def person(image, place):
+    """Someone stands in the left half of image 1, waist high."""
+    return (image == 1) & (place[:, 0] > 0.2) & (place[:, 0] < 0.4) & (place[:, 1] > 0.3)
+
+
+def test_what_one_photo_shows_is_masked_there_and_nowhere_else():
+    masks = train(lambda image, place: 0.003 + 0.1 * person(image, place))
+    image, place = torch.randint(4, (8000,)), torch.rand(8000, 2)
+    with torch.no_grad():
+        m = masks(image, place)
+    there = person(image, place)
+    assert m[there].mean() > 0.8, m[there].mean()
+    assert m[~there].mean() < 0.03, m[~there].mean()
+    assert m[image != 1].max() < 0.2  # images do not leak into each other
+
+
+def test_a_static_capture_is_left_alone():
+    """Noise and fine texture stay below the price on average."""
+    masks = train(lambda image, place: 0.03 * torch.rand(len(image)) ** 2)
+    with torch.no_grad():
+        m = masks(torch.randint(4, (8000,)), torch.rand(8000, 2))
+    assert (m > 0.5).float().mean() < 0.02
+
+
+def test_masked_loss_is_lowest_at_the_price():
+    """Turning M on pays exactly where the error is above the price."""
+    price = torch.tensor([PRICE])
+    for error, best in ((2 * PRICE, 1.0), (0.5 * PRICE, 0.0)):
+        found = [
+            float(losses.masked_colour_loss(torch.tensor([error]), torch.tensor([m]), price))
+            for m in (0.0, 1.0)
+        ]
+        assert (found[1] < found[0]) == (best == 1.0)
+
+
+def test_features_are_bilinear_and_finite_at_the_border():
+    masks = TransientMasks(3)
+    place = torch.tensor([[0.0, 0.0], [1.0, 1.0], [0.5, 0.999999]])
+    out = masks.features(torch.tensor([0, 2, 1]), place)
+    assert torch.isfinite(out).all()
+    level = masks.levels[0]
+    assert torch.allclose(out[0, :2], level[0, :, 0, 0])
+    assert torch.allclose(out[1, :2], level[2, :, -1, -1])
