@@ -14,8 +14,10 @@ import pytest
 from PIL import Image
 
 from climatenerf import cli
+from climatenerf.cli.fit import Fit, fit_settings, resuming
 from climatenerf.cli.render import LAYER_NAMES
 from climatenerf.storage import read_safetensors, write_safetensors
+from climatenerf.training.settings import PAPER
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
 SMALL = ["--size", "96x54", "--frames", "2"]
@@ -107,6 +109,31 @@ def test_the_command_to_go_on_with_repeats_the_flags():
     assert resuming(begun) == (
         "climatenerf fit 'my photos' -o run --resume --minutes 60 --downscale 2 --seed 4"
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--loss", "foo=1"], "Names: distortion"),
+        (["--loss", "sky"], "--loss wants"),
+        (["--loss", "sky=-1"], "--loss wants"),
+        (["--loss", "bend=1", "--loss", "normals=0"], "needs predicted normals"),
+    ],
+)
+def test_losses_that_cannot_be_used(tmp_path, capsys, words, expected):
+    assert expected in complaint(capsys, "fit", STREET, "-o", tmp_path / "run", *words)
+    assert not (tmp_path / "run").exists()
+
+
+def test_losses_come_from_flags_on_top_of_the_preset():
+    fit = Fit(Path("a"), Path("b"), preset="paper", loss=("sky=0", "flat=0.5"))
+    settings = fit_settings(fit)
+    assert settings.losses == dataclasses.replace(PAPER.losses, sky=0.0, flat=0.5)
+    assert settings.preset == "paper" and settings.opaque_sky
+    assert fit_settings(dataclasses.replace(fit, mono_depth="none")).losses.monocular == 0
+    words = resuming(fit)
+    assert "--loss sky=0 --loss flat=0.5" in words and "--preset paper" in words
+    assert resuming(Fit(Path("a"), Path("b"), refine_poses=True)).endswith("--refine-poses")
 
 
 @pytest.mark.parametrize(
@@ -224,13 +251,14 @@ def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypa
     assert sidecar["weather"]["smog"]["visibility"] == "60 m"
     assert sidecar["weather"]["snow"]["depth"] == "0.15 m"
     assert sidecar["units"]["length"] == "m" and "scale" in sidecar and "versions" in sidecar
-    assert len(sidecar["frames"]) == 2
+    assert len(sidecar["frames"]) == 2 and sidecar["appearance_of_training_view"] is None
+    known = set(LAYER_NAMES) - {"label"}  # the embedded street's labels know the sky alone
     for frame in sidecar["frames"]:
         assert (frame["camera"]["width"], frame["camera"]["height"]) == (96, 54)
         assert np.array(frame["c2w_world"]).shape == (4, 4)
-        assert set(frame["layers"]) == set(LAYER_NAMES)
+        assert set(frame["layers"]) == known
         layers = {}
-        for name in LAYER_NAMES:
+        for name in known:
             layers[name] = np.load(tmp_path / frame["layers"][name][0])[name]
             assert not np.isnan(layers[name]).any(), name
             assert layers[name].shape[:2] == (54, 96)
@@ -396,6 +424,8 @@ def test_unknown_names_to_hold_out(tmp_path, capsys):
         (["--size", "8192x8192", "--supersample", "4"], "too large"),
         (["--weather", "absent.toml"], "absent.toml"),
         (["--smog.visibility", "1 mm"], "smog.visibility"),
+        (["--layers", "label"], "without class labels"),
+        (["--appearance", "nobody.jpg"], "no training photo"),
     ],
 )
 def test_render_mistakes(run_folder, tmp_path, capsys, words, expected):

@@ -67,6 +67,10 @@ def test_sloped_normals_approach_the_analytic_ones_and_move_the_density():
         far = field.sloped_normal(q, torch.full((400,), 0.3))
     agree = (analytic * near).sum(-1)
     assert agree.median() > 0.999 and agree.mean() > (analytic * far).sum(-1).mean() + 0.1
+    outside = 3.0 * torch.nn.functional.normalize(q, dim=-1)
+    with torch.no_grad():
+        slope = field.sloped_normal(outside, torch.full((400,), 2e-3))
+    assert (slope * field.density_normal(outside)).sum(-1).median() > 0.999
     field.requires_grad_(True)
     field.sloped_normal(q, torch.full((400,), 1e-2))[:, 0].sum().backward()
     assert (field.geometry_grid.grad != 0).any()

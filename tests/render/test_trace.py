@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from analytic_fields import AnalyticField, Box, HalfSpace
-from field.random_field import directions, random_field
+from random_field import directions, random_field
 
 from climatenerf.render.frame import render_frame
 from climatenerf.render.trace import trace

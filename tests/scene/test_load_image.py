@@ -137,3 +137,23 @@ def test_relative_depth_is_found_by_either_name(tmp_path):
     np.savez(folder / "a.jpg.npz", inverse_depth=np.full((24, 32), 3.0))
     assert (load_relative_depth(view, scene) == 2).all()
     assert (load_relative_depth(other, scene) == 3).all()
+
+
+def test_relative_depth_that_cannot_be_used_is_one_sentence(tmp_path):
+    view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
+    path = tmp_path / "depth_relative" / "a.npz"
+    path.parent.mkdir()
+    with path.open("wb") as file:
+        np.save(file, np.ones((24, 32)))  # an NPY by another name
+    for spoil in (
+        lambda: None,
+        lambda: np.savez(path, x=np.ones((2, 24, 32))),
+        lambda: np.savez(path, x=np.ones((24, 32), complex)),
+        lambda: np.savez(path, x=np.array([["a"] * 32] * 24)),
+        lambda: np.savez(path),
+        lambda: path.write_bytes(b"PK junk"),
+    ):
+        spoil()
+        with pytest.raises(UserError, match="relative depth") as caught:
+            load_relative_depth(view, scene)
+        assert "pickle" not in str(caught.value)

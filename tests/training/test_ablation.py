@@ -43,12 +43,13 @@ def test_each_row_leaves_out_just_what_it_says():
         "no appearance": {"appearance"},
         "no distortion": {"distortion"},
         "no normals": {"normals", "flat"},
-        "no sky": {"sky", "sky_fill", "carve"},
+        "no sky": {"sky_labels"},
         "no depth": {"points", "monocular"},
         "full": set(),
     }
     plain = rows["plain NGP"]
     assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
+    assert not plain.sky_labels
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 
@@ -73,6 +74,22 @@ def test_a_finished_row_is_kept_and_one_of_other_settings_refused(tmp_path):
     for other, downscale in ((dataclasses.replace(settings, seed=1), 1), (settings, 2)):
         with pytest.raises(UserError, match="other settings"):
             ablation.fit_row(scene, run, other, downscale, lambda state: None)
+
+
+def test_a_row_stopped_midway_is_finished_later(tmp_path):
+    scene = make_scene(tmp_path / "toy")
+    settings = FitSettings(minutes=None, steps=6, samples_per_step=2**12)
+    run, steps = tmp_path / "run", []
+
+    def stop(state):
+        steps.append(state.step)
+        if state.step == 3 and len(steps) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ablation.fit_row(scene, run, settings, 1, stop)
+    ablation.fit_row(scene, run, settings, 1, stop)
+    assert steps == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_capture_without_truth_is_refused_before_any_fit(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from climatenerf.scene.cameras import Camera
+from climatenerf.scene.classes import SKY
 from climatenerf.training import losses
 from climatenerf.training.pixels import TrainingPixels
 
@@ -96,3 +97,49 @@ def test_triples_lie_in_a_line_at_equal_distances_in_one_image():
     assert torch.equal(batch.place[n - m :][outside], batch.place[:m][outside])
     # Colours belong to the pixels: each image is of one colour.
     assert torch.allclose(batch.rgb[:, 0] * 255, batch.image.float(), atol=1e-3)
+
+
+def test_sky_below_the_horizon_is_none():
+    """A level camera whose whole picture is labelled sky: what sinks by 3 degrees is unknown."""
+    camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
+    level = np.eye(4)
+    level[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks along y, z up
+    label = np.full((14, 20), 10, np.uint8)
+    pixels = TrainingPixels([camera], [0], level[None], [np.zeros((14, 20, 3), np.uint8)], [label])
+    assert pixels.label is not None
+    kept = (pixels.label.view(14, 20) == SKY).numpy()
+    down = (np.arange(14) + 0.5 - 7) / 20
+    assert kept[down < 0].all() and not kept[down > 0.1].any()
+    assert (label == 10).all()  # the caller's own array stays
+
+
+def test_no_side_of_a_triple_is_a_masked_pixel():
+    camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
+    mask = np.ones((14, 20), bool)
+    mask[:, 10:] = False
+    image = np.where(mask, 0, 255).astype(np.uint8)[..., None].repeat(3, -1)
+    pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image], None, [mask])
+    batch = pixels.draw(900, torch.Generator().manual_seed(0), 250)
+    assert batch.rgb.max() == 0 and batch.place[:, 0].max() < 0.5
+    assert 0.1 < batch.in_line.float().mean() < 0.9
+
+
+def test_labels_that_know_nothing_are_none():
+    camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
+    image, label = np.zeros((14, 20, 3), np.uint8), np.full((14, 20), 255, np.uint8)
+    pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image], [label])
+    assert pixels.label is None and pixels.witness is None and not pixels.knows_sky
+
+
+def test_without_sky_what_was_labelled_so_is_unknown():
+    camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
+    up = np.diag([1.0, -1.0, -1.0, 1.0])
+    up[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    label = np.full((14, 20), 10, np.uint8)
+    label[:, 10:] = 2
+    images = [np.zeros((14, 20, 3), np.uint8)]
+    pixels = TrainingPixels([camera], [0], up[None], images, [label])
+    assert pixels.knows_sky and pixels.edge.numel()
+    other = pixels.without_sky()
+    assert not other.knows_sky and not other.edge.numel() and other.witness is None
+    assert other.label is not None and (other.label != 255).any() and pixels.knows_sky

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from toy_scene import TINY, make_scene
+from toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
@@ -15,11 +15,13 @@ from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.render.view import render_view
 from climatenerf.scene import load_scene
+from climatenerf.scene.classes import BUILDING, SKY
 from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import run as run_module
 from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.sky_witness import SkyWitness
 
 
 @pytest.fixture(scope="module")
@@ -166,6 +168,57 @@ def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path)
     fitting.seconds = again.seconds  # the one thing that may differ
     assert fitting.steps == 40
     assert_same(fitting, again)
+
+
+def labelled(fitting):
+    """A fit of the same pixels, of which bright ones are sky and the rest built."""
+    pixels = fitting.pixels
+    bright = pixels.rgb.float().mean(-1) > 128
+    pixels.label = torch.where(bright, SKY, BUILDING).to(torch.uint8)
+    sizes = (pixels.pixel_start[1:] - pixels.pixel_start[:-1]).tolist()
+    maps = [part.view(36, 48).numpy() for part in pixels.label.split(sizes)]
+    pixels.witness = SkyWitness([CAMERA] * len(maps), pixels.c2w.numpy(), maps)
+    return run_module.Fitting(pixels, len(maps), fitting.extent, fitting.settings)
+
+
+def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
+    """Masks, relative depth's sums and the cells that the sky bars are in the checkpoint."""
+    fitting = labelled(begin(scene, steps=40))
+    assert fitting.field.occupancy.barred.any()
+    with pytest.raises(KeyboardInterrupt):
+        fitting.run(stop_at(20))
+    write_json(tmp_path / "config.json", run_module._config(fitting.settings, 1, fitting.field))
+    checkpoint(fitting, tmp_path)
+    again = labelled(begin(scene, steps=40))
+    restore(again, tmp_path)
+    assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
+    assert again.field.knows_classes
+    fitting.run(nothing)
+    again.run(nothing)
+    fitting.seconds = again.seconds
+    assert_same(fitting, again)
+    assert all(map(torch.equal, fitting.masks.parameters(), again.masks.parameters()))
+
+
+def test_refined_poses_are_kept_and_not_left_behind(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=20, refine_poses=True)
+    moved = load_scene(tmp_path / "run")
+    pairs = [(a.c2w, b.c2w) for a, b in zip(scene.views, moved.views, strict=True)]
+    train = [view.split == "train" for view in scene.views]
+    assert [not np.array_equal(a, b) for a, b in pairs] == train
+    assert max(np.abs(a - b).max() for a, b in pairs) < 0.3
+    with pytest.raises(UserError, match="--refine-poses"):
+        fitted(scene, tmp_path / "run", steps=22, resume=True)
+    fitted(scene, tmp_path / "run", steps=22, resume=True, refine_poses=True)
+
+
+def test_a_run_of_an_earlier_version_is_not_resumed(scene, tmp_path):
+    fitted(scene, tmp_path / "run")
+    config = read_json(tmp_path / "run" / "config.json")
+    del config["settings"]["losses"]
+    write_json(tmp_path / "run" / "config.json", config)
+    with pytest.raises(UserError, match="earlier version"):
+        fitted(scene, tmp_path / "run", steps=8, resume=True)
 
 
 def test_resuming_counts_on(scene, tmp_path):

@@ -91,6 +91,22 @@ def test_a_wrong_label_in_one_view_of_many_removes_no_matter():
     assert not witness(12, err).agreed(x, torch.zeros(len(x))).any()
 
 
+def test_neighbouring_frames_have_one_voice():
+    """Two wrong views side by side, as a network errs on a film, against two that are far apart."""
+
+    def err(maps, wrong):
+        return [np.full_like(m, SKY) if i in wrong else m for i, m in enumerate(maps)]
+
+    x = torch.tensor([[0.0, 0.0, 1.0]])
+    c2w = poses(12)
+    c2w[1, :3, 3] = c2w[0, :3, 3] + [0.0, 0.2, 0.0]
+    maps = [labels(CAMERA, pose) for pose in c2w]
+    close = SkyWitness([CAMERA] * 12, c2w, err(maps, {0, 1}))
+    far = SkyWitness([CAMERA] * 12, c2w, err(maps, {0, 6}))
+    assert not close.agreed(x, torch.zeros(1)).any()
+    assert far.agreed(x, torch.zeros(1)).any()
+
+
 def test_few_voices_among_many_watchers_are_not_enough(monkeypatch):
     """Two wrong views of 30 are below a tenth; of 12 they would be above it."""
 

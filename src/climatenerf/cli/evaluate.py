@@ -42,6 +42,8 @@ def run(options: Evaluate) -> int:
     """Measures, prints the table, and says where the report is."""
     if options.ablation:
         return run_ablation(options)
+    if (options.minutes, options.downscale, options.seeds) != (4.0, 2, 2):
+        raise UserError("--minutes, --downscale and --seeds belong to --ablation; leave them out")
     if not options.reference:
         raise UserError("say what to measure against: climatenerf evaluate RUN --reference -o OUT")
 

@@ -12,6 +12,7 @@ from climatenerf.errors import UserError
 from climatenerf.scene import Scene, read_scene
 from climatenerf.scene.known_length import FILE_NAME, apply_known_lengths, measure, read_marks
 from climatenerf.scene.scale import scale_warnings, scale_words
+from climatenerf.training.folder import check_folder
 from climatenerf.training.settings import FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
@@ -37,7 +38,8 @@ class Fit:
     resume: bool = False
     """Continue the run in the folder; --minutes then counts from its beginning."""
     preset: Literal["cpu", "gpu", "paper"] = "cpu"
-    """Size of the field; paper also takes the paper's losses."""
+    """Size of the field. gpu: larger tables (no GPU kernels yet). paper: the paper's sizes and
+    losses; its sky is opaque, by each photo's own labels, and shelters from snow."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Weight of a loss, such as sky=0, which switches it off; may be given again for others."""
     refine_poses: bool = False
@@ -90,6 +92,7 @@ def run(options: Fit) -> int:
     for warning in dict.fromkeys((*scene.warnings, *scale_warnings(scene))):
         progress.warn(warning)
     progress.say(frame_line(scene))
+    check_folder(scene, options.out, options.resume)  # labels may take minutes to make
     scene = with_perception(scene, options)
     metrics = fit_with_bars(scene, options)
     if metrics["interrupted"]:
@@ -225,6 +228,8 @@ def fit_settings(options: Fit) -> FitSettings:
     """What the flags say of the fit, on top of what its preset says."""
     settings = settings_of(options.preset)
     weights = parse_losses(options.loss)
+    if weights.get("bend") and weights.get("normals") == 0:
+        raise UserError("--loss bend needs predicted normals; leave --loss normals=0 out")
     if options.mono_depth == "none":
         weights["monocular"] = 0.0
     return replace(

@@ -115,9 +115,16 @@ def appearance_of(name: str, scene: Scene) -> int | None:
     if name == "mean":
         return None
     views = scene.of_split("train")
-    for index, view in enumerate(views):
-        if name in (view.name, Path(view.name).name, Path(view.name).stem):
-            return index
+    names = [(view.name, Path(view.name).name, Path(view.name).stem) for view in views]
+    found = [i for i, own in enumerate(names) if name == own[0]] or [
+        i for i, own in enumerate(names) if name in own
+    ]
+    if len(found) > 1:
+        raise UserError(
+            f'"{name}" means {len(found)} photos; give the whole name, such as {names[found[0]][0]}'
+        )
+    if found:
+        return found[0]
     raise UserError(
         f'the run has no training photo "{name}" to take the appearance of; give "mean" or a name'
         f" such as {views[0].name}"
@@ -201,6 +208,7 @@ def render_movie(
     before = files_of_render(out)
     records: list[FrameRecord] = []
     about: dict[str, Any] = {"path": path.name, "notes": list(path.notes), "fps": fps}
+    about["appearance_of_training_view"] = stage.field.shown  # null: the mean
     about |= {"supersample": supersample, "frames_wanted": len(path)}
     if stage.waves is not None:
         about["significant_wave_height_m"] = stage.waves.significant_height

@@ -17,10 +17,8 @@ from climatenerf.scene.classes import (
 FARTHEST = 50.0  # m: beyond it photos of a walk say little about distance
 MARGIN, MARGIN_SHARE = 0.1, 0.05  # m, and of the depth: matter this close before a surface is its
 EMPTY = 0.99  # transmittance of what counts as empty sky
-CLEAR, STANDING = (
-    1.0,
-    0.5,
-)  # m: how far around a place, and how high, nothing stands over open ground
+CLEAR = 1.0  # m: how far around a place nothing stands over open ground,
+STANDING = 0.5  # m: and from which height it counts
 EVERY = 41  # of the pixels that show ground are asked for what is above them
 TALLEST_ROOF = 0.5  # upward part of a normal from which a building's surface is a roof
 

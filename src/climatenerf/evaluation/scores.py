@@ -212,8 +212,8 @@ def open_sky(place: Place) -> float:
 
 
 def label_scores(place: Place) -> dict[str, float]:
-    """Classes of the test views by the field, against the true ones; none without labels."""
-    if all(view.label_path is None for view in place.scene.of_split("train")):
+    """Classes of the test views by the field, against the true ones; none if it learned none."""
+    if not place.fitted.knows_classes:
         return {"miou": float("nan")}
     labels = []
     for truth in place.reference.truths:

@@ -305,7 +305,9 @@ class Field(nn.Module):
         parameters: the corners of a tetrahedron give the slope by four densities."""
         corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
         around = q[:, None] + step[:, None, None] * corners
-        raw = self.raw_density(reference.contract(around.reshape(-1, 3))).view(-1, 4, 1)
+        flat = around.reshape(-1, 3)
+        thinned = flat.square().sum(-1).clamp_min(1.0).log()
+        raw = (self.raw_density(reference.contract(flat)) - thinned).view(-1, 4, 1)
         # 1e-6: where the density is even its direction's gradient would be NaN.
         return -nn.functional.normalize((raw * corners).sum(1), dim=-1, eps=1e-6)
 

@@ -46,25 +46,34 @@ def licence_of(name: str) -> str:
     return found[0] if found else "not known here; see where the model is from"
 
 
-def load_parts(name: str, load: Callable[[str, bool], Parts]) -> Parts:
-    """What `load(name, local_files_only)` gives: from the disk if it is there, else by download.
+def check_name(name: str) -> None:
+    """Refuses what cannot be a network, before anything is loaded.
 
     Raises:
-        UserError: `transformers` is missing, or there is no usable network of this name.
+        UserError: `transformers` is missing, or the name is neither a folder nor OWNER/NAME.
     """
     if importlib.util.find_spec("transformers") is None:
         raise UserError(
             f"the model {name} needs the transformers package; install it with"
             ' pip install "climatenerf[perception]"'
         )
-    from safetensors import SafetensorError
-
-    folder = Path(name).expanduser()
-    if not folder.is_dir() and not re.fullmatch(r"[\w-][\w.-]*/[\w.-]+", name):
+    if not Path(name).expanduser().is_dir() and not re.fullmatch(r"[\w-][\w.-]*/[\w.-]+", name):
         raise UserError(
             f"there is no model {name}: give the folder of one, or its name on the Hugging Face"
             " Hub as OWNER/NAME"
         )
+
+
+def load_parts(name: str, load: Callable[[str, bool], Parts]) -> Parts:
+    """What `load(name, local_files_only)` gives: from the disk if it is there, else by download.
+
+    Raises:
+        UserError: `transformers` is missing, or there is no usable network of this name.
+    """
+    check_name(name)
+    from safetensors import SafetensorError
+
+    folder = Path(name).expanduser()
     # Whatever the files hold, the library says it with one of these.
     unusable = (OSError, ValueError, RuntimeError, ImportError, KeyError, SafetensorError)
     if folder.is_dir():

@@ -20,7 +20,7 @@ from PIL import Image
 
 import climatenerf
 from climatenerf.errors import UserError
-from climatenerf.perception.models import Network, licence_of
+from climatenerf.perception.models import Network, check_name, licence_of
 from climatenerf.perception.monocular import DEFAULT as DEPTH_ANYTHING
 from climatenerf.perception.monocular import load_depth
 from climatenerf.perception.segmentation import load_segmentation
@@ -93,7 +93,8 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
             say("The capture has no class labels, and no sky is found for sure: none are used.")
             return scene
         say(
-            "The capture has no class labels; sky is found by its looks, and ground by its points."
+            "The capture has no class labels; as a fall-back sky is found by its looks, and ground"
+            " by its points."
             " Labels of a network are better: --labels MODEL, or files in labels/ (--labels none"
             " does without)."
         )
@@ -103,6 +104,8 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
             f"the capture's own labels are {scene.label_space}, which labels of {model} cannot"
             " stand beside; leave --labels out to use its own, or take them away"
         )
+    if model != SIMPLE:
+        check_name(model)  # also where every photo has labels already
     source = _simple(scene) if model == SIMPLE else _segmentation(scene, model)
     if unasked or (model == SIMPLE and not _writable(folder)):
         folder = spare / LABELS  # nobody said that the capture may be written into
@@ -186,9 +189,14 @@ def _prepare(scene: Scene, source: Source, folder: Path, track: Track, say: Say)
             "sha256": hashlib.sha256(data).hexdigest(),
             "photo_sha256": photos[view.name],
         }
-        entries[path.relative_to(folder).as_posix()] = entry
+        name = path.relative_to(folder).as_posix()
+        before, entries[name] = entries.get(name), entry
         try:
             write_bytes(path, data)
+        except BaseException:
+            if before is not None and path.is_file() and _digest(path) == before["sha256"]:
+                entries[name] = before  # the earlier file is still there
+            raise
         finally:
             # Also when stopped just here: a file that nothing tells of would count as the user's.
             write_json(folder / RECORD, {"schema_version": SCHEMA_VERSION, "files": entries})

@@ -169,14 +169,21 @@ def load_relative_depth(
         depth = load_depth(view, scene, downscale)
         return None if depth is None else 1.0 / depth
     try:
-        with np.load(path) as data:
+        data = np.load(path)
+        if not isinstance(data, np.lib.npyio.NpzFile):
+            raise ValueError("it is no NPZ")
+        with data:
             values = data[data.files[0]]
+        if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
+            raise ValueError("it must hold real numbers")
         if values.ndim != 2 or not values.size:
             raise ValueError("it must have height x width numbers")
         relative = Image.fromarray(values.astype(np.float32))
     except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error) as error:
+        # Numbers are never stored as Python objects, and those are not to be trusted.
+        reason = "it holds no numbers" if "pickle" in str(error) else error
         raise UserError(
-            f"The relative depth {path} cannot be read ({error}); replace it."
+            f"The relative depth {path} cannot be read ({reason}); replace it."
         ) from None
     camera = downscaled_camera(scene.cameras[view.camera], downscale)
     size = (camera.width, camera.height)

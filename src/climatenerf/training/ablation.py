@@ -33,7 +33,8 @@ from climatenerf.scene import Scene, load_scene
 from climatenerf.scene.classes import MERGED, ROAD, TERRAIN
 from climatenerf.storage import make_folder, read_json, write_bytes, write_json
 from climatenerf.training.fit import Report
-from climatenerf.training.run import check_folder, fit_scene
+from climatenerf.training.folder import OPTIMISER
+from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 
 SCHEMA_VERSION = 1
@@ -63,14 +64,19 @@ def rows(minutes: float) -> dict[str, FitSettings]:
 
     nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
     plain = dataclasses.replace(
-        full, losses=Losses(**nothing), appearance=False, carve=False, crowded=0.0
+        full,
+        losses=Losses(**nothing),
+        appearance=False,
+        sky_labels=False,
+        carve=False,
+        crowded=0.0,
     )
     return {
         "plain NGP": plain,
         "no appearance": dataclasses.replace(full, appearance=False),
         "no distortion": without(distortion=0.0),
         "no normals": without(normals=0.0, flat=0.0),
-        "no sky": dataclasses.replace(without(sky=0.0, sky_fill=0.0), carve=False),
+        "no sky": dataclasses.replace(full, sky_labels=False),
         "no depth": without(points=0.0, monocular=0.0),
         "full": full,
     }
@@ -138,16 +144,18 @@ def fit_row(
 ) -> None:
     """One fit, unless the folder holds it finished already."""
     wanted = json.loads(json.dumps(dataclasses.asdict(settings)))
-    if (run / "metrics.json").is_file():
+    begun = (run / "config.json").is_file() and (run / OPTIMISER).is_file()
+    if begun:
         config = read_json(run / "config.json", "the run's configuration")
         if config.get("settings") != wanted or config.get("downscale") != downscale:
             raise UserError(
                 f"{run} was fitted with other settings; choose another folder with -o, or remove it"
             )
-        if read_json(run / "metrics.json", "the run's measurements").get("psnr") is not None:
+    if begun and (run / "metrics.json").is_file():
+        metrics = read_json(run / "metrics.json", "the run's measurements")
+        if metrics.get("interrupted") is False and "views" in metrics:
             return
-    check_folder(scene, run, resume=False)
-    metrics = fit_scene(scene, run, settings, downscale, False, report, lambda done, total: None)
+    metrics = fit_scene(scene, run, settings, downscale, begun, report, lambda done, total: None)
     if metrics["interrupted"]:
         raise KeyboardInterrupt
 

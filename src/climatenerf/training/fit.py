@@ -25,7 +25,7 @@ from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION
 from climatenerf.training import losses
 from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
-from climatenerf.training.pixels import Batch, TrainingPixels
+from climatenerf.training.pixels import HORIZON, Batch, TrainingPixels
 from climatenerf.training.points import PointRays
 from climatenerf.training.poses import RATE as POSE_RATE
 from climatenerf.training.poses import PoseCorrections
@@ -76,14 +76,17 @@ class Fitting:
         self.masks, self.poses = TransientMasks(images), PoseCorrections(images)
         self.relative = RelativeDepth(images)
         self.generator = torch.Generator().manual_seed(settings.seed)
-        labelled = pixels.label is not None
-        self.fill = fill_sky(pixels, self.generator) if labelled else None
+        if not settings.sky_labels:
+            self.pixels = pixels = pixels.without_sky()
+        self.knows_sky = pixels.knows_sky
+        sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
+        self.fill = fill_sky(pixels, self.generator) if self.knows_sky else None
         self.bar_sky()
         kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
         classed = bool((SOLID_CLASSES[kinds.long()] != UNKNOWN).any())
         weigh = settings.losses
         self.field.learned[:] = torch.tensor([weigh.normals > 0, weigh.classes > 0 and classed])
-        self.field.sky_grid.requires_grad_(labelled)
+        self.field.sky_grid.requires_grad_(self.knows_sky)
         grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
         grids += [self.field.surface_grid] if size.surface_levels else []
         self.grid_adam = GridAdam(grids)
@@ -93,7 +96,7 @@ class Fitting:
             {"params": _of(named, "geometry_net", "colour_net"), "shares": (1.0, 1.0)},
             {"params": _of(named, "surface_net"), "shares": (1.0, 1.0)},
             {"params": _of(named, "view_net"), "shares": VIEW_SHARES},
-            {"params": _of(named, "sky_net"), "shares": (1.0, 1.0) if labelled else SKY_SHARES},
+            {"params": _of(named, "sky_net"), "shares": sky_shares},
             {"params": _of(named, "embeddings"), "shares": EMBEDDING_SHARES},
             {"params": list(self.masks.parameters()), "shares": (0.0, 1.0)},
             {"params": list(self.poses.parameters()), "shares": (0.0, POSE_SHARE)},
@@ -268,7 +271,7 @@ class Fitting:
             loss = loss + grown * weigh.solid * losses.solid_loss(left, below)
         distance = dispatch.accumulate(weights, t[:, None], samples.offsets)[:, 0]
         mean_distance = distance / (1 - left).clamp_min(1e-3)  # nothing there: 0/0
-        if weigh.sky and self.pixels.label is not None:
+        if weigh.sky and self.knows_sky:
             if self.settings.opaque_sky:
                 loss = loss + weigh.sky * losses.far_sky_loss(distance, batch.is_sky)
             else:
@@ -346,6 +349,10 @@ class Fitting:
     def depth_loss(self, measured: PointRays) -> tuple[Tensor, int]:
         """How far matter is from the sparse points on their rays; and the samples used."""
         field, n = self.field, measured.depth.shape[0]
+        if self.settings.refine_poses:
+            rays = (measured.rays_o, measured.rays_d, measured.image)
+            rays_o, rays_d = (each.detach() for each in self.poses.rays(*rays, field.unit))
+            measured = replace(measured, rays_o=rays_o, rays_d=rays_d)
         samples = field.march(
             measured.rays_o,
             measured.rays_d,
@@ -402,17 +409,23 @@ class Fitting:
         drawn = torch.zeros(n).index_add(0, ray, share.detach())
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
         sky = self.field.sky_colour(batch.rays_d, appearance)
-        if self.pixels.label is not None:
+        if self.knows_sky:
             # It learns from its own pixels alone; then it may learn fast, and in detail.
             sky = scale_gradient(sky, batch.is_sky[:, None])
         return own + left[:, None] * sky
 
-    def bar_sky(self) -> None:
-        """Bars the occupancy's cells that photos agree to be sky, unless a point lies in them."""
+    def bar_sky(self, everywhere: bool = True) -> None:
+        """Bars the occupancy's cells that photos agree to be sky, unless a point lies by them.
+
+        Args:
+            everywhere: ask of all cells; else of those that are occupied, which is quicker.
+        """
         witness, occupancy = self.pixels.witness, self.field.occupancy
         if witness is None or not self.settings.carve:
             return
-        cells = (occupancy.occupied.view(-1) > 0).nonzero()[:, 0]
+        cells = torch.arange(occupancy.occupied.numel())
+        if not everywhere:
+            cells = cells[occupancy.occupied.view(-1) > 0]
         centre, size = occupancy.cell_centres(cells)
         x = centre * self.field.unit + self.field.centre
         radius = size * (self.field.unit * 3**0.5 / 2)
@@ -421,8 +434,11 @@ class Fitting:
         barred[cells] = True
         if self.points is not None:
             ends = self.points.rays_o + self.points.depth[:, None] * self.points.rays_d
-            held, _ = self.field._cells(self.field.to_grid(ends))
-            barred[held] = False
+            held = torch.zeros_like(occupancy.occupied, dtype=torch.float32)
+            cells, inside = self.field._cells(self.field.to_grid(ends))
+            held.view(-1)[cells[inside]] = 1.0
+            near = torch.nn.functional.max_pool3d(held[:, None], 3, stride=1, padding=1)
+            barred[near.view(-1) > 0] = False
         occupancy.occupied.view(-1)[barred] = 0
 
     def update_occupancy(self) -> None:
@@ -435,7 +451,7 @@ class Fitting:
         late = self.progress > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
-            self.bar_sky()
+            self.bar_sky(everywhere=False)
 
     def adapt(self, rays: int, samples: int) -> None:
         """Keeps the samples per step at their budget, and makes marching finer with time.
@@ -473,7 +489,6 @@ EMBEDDING_SHARES = (0.0, 0.02)
 # Matter nearer than this to a camera (grid units) is not believed at first: what stands near is
 # seen from elsewhere too, and a wall before each camera would satisfy every photo.
 FIRST_NEAR = 0.6
-HORIZON = -0.05  # rays that sink more than this end on matter
 CHOSEN = 32  # samples of a ray that get colour and gradients, about
 SEEN_WEIGHT = 0.05  # samples that weigh more show that their cell is occupied
 KEEP_AT = 0.5  # progress from which this is so: before, haze is to be pruned

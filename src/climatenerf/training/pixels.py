@@ -1,5 +1,6 @@
 """All training pixels as one long list of rays with their colours."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from climatenerf.scene.classes import MERGED, SKY, UNKNOWN
 from climatenerf.training.sky_witness import SkyWitness
 
 SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
+HORIZON = -0.05  # rays that sink more than this end on matter: levelling is good to a degree or two
 EDGE = 2  # pixels to both sides that are such an edge
 
 
@@ -39,7 +41,7 @@ class Batch:
     cosine: Float[Tensor, "n"]
     """Of the angle between the ray and the optical axis."""
     in_line: Bool[Tensor, "m"]
-    """Which of the triples lie in their image as a whole."""
+    """Which of the triples lie in their image, and outside its mask, as a whole."""
     relative: Float[Tensor, "n"] | None
     """Relative inverse z-depth (see `monocular.py`), NaN where unknown; None if there is none."""
 
@@ -83,12 +85,19 @@ class TrainingPixels:
         self.label = None
         self.witness = None
         self.edge = torch.zeros(0, dtype=torch.long)
-        if labels is not None and any(label is not None for label in labels):
+        if labels is not None:
             merged = [
                 np.full(image.shape[:2], UNKNOWN, np.uint8) if label is None else MERGED[label]
                 for label, image in zip(labels, images, strict=True)
             ]
-            self.label = torch.from_numpy(np.concatenate([each.reshape(-1) for each in merged]))
+            for label, i, pose in zip(merged, camera_of, c2w, strict=True):
+                # Networks take puddles and wet walls for the sky that they mirror.
+                rises = directions[i].numpy() @ np.asarray(pose)[2, :3]
+                label[(label == SKY) & (rises.reshape(label.shape) < HORIZON)] = UNKNOWN
+            flat = np.concatenate([each.reshape(-1) for each in merged])
+            # Labels that know nothing are none.
+            self.label = torch.from_numpy(flat) if (flat != UNKNOWN).any() else None
+        if self.label is not None and bool((self.label == SKY).any()):
             edge = np.concatenate([sky_edge(each).reshape(-1) for each in merged])
             self.edge = torch.from_numpy(np.flatnonzero(edge))
             self.witness = SkyWitness([cameras[i] for i in camera_of], c2w, merged)
@@ -99,15 +108,28 @@ class TrainingPixels:
                 for each, n in zip(relative, counts, strict=True)
             ]
             self.relative = torch.from_numpy(np.concatenate(flat).astype(np.float16))
-        self.allowed = None
+        self.allowed, self.usable = None, None
         if masks is not None and any(mask is not None for mask in masks):
             keep = [
                 np.ones(int(n), bool) if mask is None else mask.reshape(-1) > 0
                 for mask, n in zip(masks, counts, strict=True)
             ]
-            allowed = np.concatenate(keep)
-            self.allowed = torch.from_numpy(np.flatnonzero(allowed))
-            self.edge = self.edge[torch.from_numpy(allowed)[self.edge]]
+            self.usable = torch.from_numpy(np.concatenate(keep))
+            self.allowed = self.usable.nonzero()[:, 0]
+            self.edge = self.edge[self.usable[self.edge]]
+
+    def without_sky(self) -> "TrainingPixels":
+        """The same pixels, with what is labelled sky unknown."""
+        other = copy.copy(self)
+        other.witness, other.edge = None, self.edge[:0]
+        if self.label is not None:
+            other.label = torch.where(self.label == SKY, UNKNOWN, self.label).to(torch.uint8)
+        return other
+
+    @property
+    def knows_sky(self) -> bool:
+        """Whether any pixel is labelled sky."""
+        return self.label is not None and bool((self.label == SKY).any())
 
     def draw(
         self, n: int, generator: torch.Generator, triples: int = 0, edges: float = 0.0
@@ -165,9 +187,9 @@ class TrainingPixels:
     def sides(
         self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator
     ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Bool[Tensor, "m"]]:
-        """Two pixels on opposite sides of each pixel, and whether both lie in the image.
+        """Two pixels on opposite sides of each pixel, and whether both may be drawn.
 
-        Where they do not, the pixel itself stands for both.
+        Where one lies outside the image or its mask, the pixel itself stands for both.
         """
         m = image.shape[0]
         spacing = torch.tensor(SPACINGS)[torch.randint(len(SPACINGS), (m,), generator=generator)]
@@ -177,6 +199,10 @@ class TrainingPixels:
         x, y = within % width, within.div(width, rounding_mode="floor")
         inside = (x >= spacing) & (x < width - spacing) & (y >= spacing) & (y < height - spacing)
         shift = (step[:, 0] + step[:, 1] * width) * inside
+        if self.usable is not None:
+            start = self.pixel_start[image] + within
+            inside = inside & self.usable[start - shift] & self.usable[start + shift]
+            shift = shift * inside
         return within - shift, within + shift, inside
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.scene.scene import Scene
@@ -20,20 +20,25 @@ class PointRays:
     """Unit directions."""
     depth: Float[Tensor, "m"]
     """Ray length of the point, m."""
+    image: Int[Tensor, "m"]
+    """Index of the training image."""
 
     def draw(self, n: int, generator: torch.Generator) -> "PointRays":
         """n random ones of them."""
         chosen = torch.randint(self.depth.shape[0], (n,), generator=generator)
-        return PointRays(self.rays_o[chosen], self.rays_d[chosen], self.depth[chosen])
+        return PointRays(
+            self.rays_o[chosen], self.rays_d[chosen], self.depth[chosen], self.image[chosen]
+        )
 
 
 def find_point_rays(scene: Scene) -> PointRays | None:
     """One ray for each point that each training view shows, or None if that is not known."""
     points = scene.points_world()
-    eyes, ends = [np.empty((0, 3))], [np.empty((0, 3))]
-    for view in scene.of_split("train"):
+    eyes, ends, of = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, int)]
+    for index, view in enumerate(scene.of_split("train")):
         if points is not None and view.seen is not None:
             ends.append(points[view.seen])
+            of.append(np.full(len(ends[-1]), index))
             eyes.append(np.broadcast_to(scene.c2w_world(view)[:3, 3], ends[-1].shape))
     eye, end = np.concatenate(eyes), np.concatenate(ends)
     depth = np.linalg.norm(end - eye, axis=-1)
@@ -43,5 +48,8 @@ def find_point_rays(scene: Scene) -> PointRays | None:
         return None
     rays_d = (end - eye)[kept] / depth[kept, None]
     return PointRays(
-        *(torch.from_numpy(v.astype(np.float32)) for v in (eye[kept], rays_d, depth[kept]))
+        rays_o=torch.from_numpy(eye[kept].astype(np.float32)),
+        rays_d=torch.from_numpy(rays_d.astype(np.float32)),
+        depth=torch.from_numpy(depth[kept].astype(np.float32)),
+        image=torch.from_numpy(np.concatenate(of)[kept].astype(np.int64)),
     )

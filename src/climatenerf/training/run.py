@@ -36,12 +36,12 @@ from climatenerf.storage import (
     write_safetensors,
 )
 from climatenerf.training.fit import Fitting, Report
+from climatenerf.training.folder import OPTIMISER, check_folder
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.settings import FitSettings
 
 SCHEMA_VERSION = 1
-OPTIMISER = "optimiser.safetensors"
 CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0
 PREVIEW_WIDTH = 240
@@ -118,7 +118,7 @@ def fit_scene(
         restore(fitting, run)
     make_folder(run / "previews")
     write_json(run / "config.json", _config(settings, downscale, fitting.field))
-    save_scene(scene, run)
+    save_scene(with_corrections(scene, fitting), run)
 
     watch = views[len(views) // 2]
     last = {"checkpoint": time.monotonic(), "preview": time.monotonic()}
@@ -131,6 +131,7 @@ def fit_scene(
             last["preview"] = time.monotonic()
         if now - last["checkpoint"] > CHECKPOINT_EVERY:
             checkpoint(fitting, run)
+            save_scene(with_corrections(scene, fitting), run)
             last["checkpoint"] = time.monotonic()
 
     interrupted = False
@@ -140,9 +141,8 @@ def fit_scene(
         interrupted = True
     fitting.field.occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
     checkpoint(fitting, run)
-    if settings.refine_poses:
-        scene = with_corrections(scene, fitting)
-        save_scene(scene, run)
+    scene = with_corrections(scene, fitting)
+    save_scene(scene, run)
     save_preview(fitting.field, scene, watch, run / "previews", fitting.steps)
     metrics = {
         "seconds": round(fitting.seconds, 1),
@@ -190,7 +190,10 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     looks = torch.Generator().manual_seed(fitting.settings.seed)
     for _ in range(4):
         batch = fitting.pixels.draw(16384, looks)
-        fitting.field.mark_seen(batch.rays_o, batch.rays_d)
+        rays = (batch.rays_o, batch.rays_d, batch.image)
+        with torch.no_grad():  # no corrections leave rays as they are
+            rays_o, rays_d = fitting.poses.rays(*rays, fitting.field.unit)
+        fitting.field.mark_seen(rays_o, rays_d)
     save_field(fitting.field, run)
     state = {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
     for index, moments in fitting.net_adam.state_dict()["state"].items():
@@ -198,6 +201,7 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
         state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
     state["relative"] = fitting.relative.sums
+    state["barred"] = torch.from_numpy(np.packbits(fitting.field.occupancy.barred.numpy()))
     state["generator"] = fitting.generator.get_state()
     numbers = [fitting.steps, fitting.samples, fitting.rays]
     state["counters"] = torch.tensor(numbers)
@@ -208,7 +212,9 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
 
 
 def with_corrections(scene: Scene, fitting: Fitting) -> Scene:
-    """The scene with its training views' poses as the fit has corrected them."""
+    """The scene with its training views' poses as the fit has corrected them, if it was to."""
+    if not fitting.settings.refine_poses:
+        return scene
     views = scene.of_split("train")
     given = torch.from_numpy(np.stack([scene.c2w_world(view) for view in views])).float()
     corrected = fitting.poses.corrected(given, fitting.field.unit).double().numpy()
@@ -221,27 +227,6 @@ def with_corrections(scene: Scene, fitting: Fitting) -> Scene:
     return dataclasses.replace(
         scene, views=tuple(moved.get(view.name, view) for view in scene.views)
     )
-
-
-def check_folder(scene: Scene, run: Path, resume: bool) -> None:
-    """Refuses a folder in which a fit would destroy something, or could not go on."""
-    if run.resolve() == scene.root.resolve():
-        raise UserError(f"{run} is the capture itself; give another folder for the run with -o")
-    has_config = (run / "config.json").is_file()
-    if resume and not has_config:
-        raise UserError(f"{run} holds no run to resume; leave --resume out to begin one")
-    if resume and not (run / OPTIMISER).is_file():
-        raise UserError(
-            f"{run} holds no {OPTIMISER}, without which it can be rendered but not resumed; fit"
-            " anew into another folder"
-        )
-    if not resume and (run / "scene.json").exists() and not has_config:
-        raise UserError(f"{run} holds a scene, which would be overwritten; choose another -o")
-    # Of a checkpoint's files the optimiser's is written last: before it there is nothing to lose.
-    if not resume and ((run / OPTIMISER).exists() or (run / "metrics.json").exists()):
-        raise UserError(
-            f"{run} already holds a run; choose another -o, or continue it with --resume"
-        )
 
 
 def check_config(run: Path) -> dict:
@@ -285,16 +270,28 @@ def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
 def restore(fitting: Fitting, run: Path) -> None:
     """Puts a checkpoint back into a fit of the same scene and settings."""
     field = load_field(run)
+    before = check_config(run).get("settings") or {}
+    if "losses" not in before:
+        raise UserError(
+            f"{run} was fitted by an earlier version; it can be rendered but not resumed, fit anew"
+            " into another folder"
+        )
+    if before.get("refine_poses") and not fitting.settings.refine_poses:
+        raise UserError(
+            f"{run} was fitted with --refine-poses; resume it with that, or its cameras would move"
+            " back"
+        )
     if field.embeddings.shape != fitting.field.embeddings.shape or field.size != fitting.field.size:
         raise UserError(
             f"{run} was fitted to other photos or with another preset; resume it with the same"
             " scene, --holdout and --preset"
         )
     fitting.field.occupancy = field.occupancy
+    learned = fitting.field.learned.clone()
     with torch.no_grad():
         fitting.field.load_state_dict(field.state_dict())
+    fitting.field.learned |= learned
     fitting.field.unit, fitting.field.near = field.unit, field.near
-    fitting.bar_sky()
     arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
     try:
         _restore_state(fitting, arrays)
@@ -321,6 +318,9 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
         own = {k: v for k, v in state.items() if k.startswith(f"{name}.")}
         module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in own.items()})
     fitting.relative.sums = state["relative"]
+    barred = fitting.field.occupancy.barred
+    bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
+    barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
     fitting.generator.set_state(state["generator"])
     fitting.steps, fitting.samples, fitting.rays = state["counters"].tolist()
     fitting.seconds, fitting.step_scale, fitting.error = state["floats"].tolist()

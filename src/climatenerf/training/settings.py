@@ -55,6 +55,8 @@ class FitSettings:
     losses: Losses = field(default_factory=Losses)
     appearance: bool = True
     """A vector for each image takes up its exposure and light."""
+    sky_labels: bool = True
+    """What is labelled sky is known to be; False: it is a class that nobody named."""
     carve: bool = True
     """What photos agree to be sky is kept empty from the beginning."""
     crowded: float = 3.0

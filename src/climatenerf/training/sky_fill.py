@@ -18,7 +18,7 @@ from climatenerf.training.pixels import TrainingPixels
 ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of its sine, azimuth
 LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
 LOOKS = 400_000  # pixels that are looked at
-SPREADS = 400  # rounds of spreading: far more than the map is wide
+SPREADS = 400  # rounds of spreading, over some 20 cells; what lies farther stays near the mean
 
 
 @dataclass(frozen=True)

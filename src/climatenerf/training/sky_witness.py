@@ -19,6 +19,7 @@ VOICES = 64  # views that are asked, at most
 WIDEST = 400  # pixels of the maps that they are asked by
 REACH = 24  # pixels: within larger footprints nothing is claimed
 LEAST_VOICES, LEAST_SHARE = 2, 0.1  # views that must say sky, and of those that have it in view
+APART = 0.1  # of the cameras' spread: neighbouring frames err alike, so they have one voice
 AT_ONCE = 2**17  # places
 
 
@@ -39,6 +40,8 @@ class SkyWitness:
         self.maps = [torch.from_numpy(each) for each, _ in maps]
         self.intrinsics = [pinhole for _, pinhole in maps]
         self.c2w = torch.from_numpy(np.asarray(c2w, np.float32)[asked])
+        eyes = self.c2w[:, :3, 3]
+        self.apart = APART * float((eyes - eyes.mean(0)).norm(dim=-1).mean())
 
     @torch.no_grad()
     def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
@@ -52,6 +55,8 @@ class SkyWitness:
     def _agreed(self, x: Tensor, radius: Tensor) -> Tensor:
         voices = torch.zeros(x.shape[0], dtype=torch.int32)
         watching = torch.zeros_like(voices)
+        first = torch.full((x.shape[0], 3), torch.nan)  # where the first voice comes from
+        spread = torch.zeros(x.shape[0], dtype=torch.bool)
         for sky, (fx, fy, cx, cy), c2w in zip(self.maps, self.intrinsics, self.c2w, strict=True):
             height, width = sky.shape
             local = (x - c2w[:3, 3]) @ c2w[:3, :3]
@@ -63,9 +68,14 @@ class SkyWitness:
             inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
             index = (row * width + column).where(inside, torch.zeros_like(row)).long()
             reach = sky.view(-1)[index] - 1.0  # 1 at the sky's edge
-            voices += inside & (reach >= radius * max(fx, fy) * per_metre)
+            says = inside & (reach >= radius * max(fx, fy) * per_metre)
+            # NaN, before there is a first, is not farther than anything.
+            spread |= says & ((first - c2w[:3, 3]).norm(dim=-1) > self.apart)
+            first = torch.where((says & (voices == 0))[:, None], c2w[:3, 3], first)
+            voices += says
             watching += inside
-        return (voices >= LEAST_VOICES) & (voices >= LEAST_SHARE * watching)
+        enough = (voices >= LEAST_VOICES) & (voices >= LEAST_SHARE * watching)
+        return enough & spread
 
 
 def sky_depth(

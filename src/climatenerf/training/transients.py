@@ -22,7 +22,7 @@ class TransientMasks(nn.Module):
         super().__init__()
         self.levels = nn.ParameterList(
             # The image is a row of its own, so images never leak into each other.
-            [nn.Parameter(1e-2 * torch.randn(images, FEATURES, side, side)) for side in CELLS]
+            [nn.Parameter(1e-2 * torch.randn(images, side, side, FEATURES)) for side in CELLS]
         )
         last = nn.Linear(HIDDEN, 1)
         nn.init.constant_(last.bias, -4.0)  # all is believed to begin with
@@ -43,11 +43,11 @@ class TransientMasks(nn.Module):
         """Bilinear lookups of every level, side by side."""
         found = []
         for level in self.levels:
-            side = level.shape[-1]
+            side = level.shape[1]
             p = (place * side - 0.5).clamp(0, side - 1)
             low = p.long().clamp_max(side - 2)
             (fx, fy), (x, y) = (p - low).unbind(-1), low.unbind(-1)
-            flat = level.permute(0, 2, 3, 1).reshape(-1, FEATURES)
+            flat = level.view(-1, FEATURES)
             at = (image * side + y) * side + x
             top = flat[at] * (1 - fx)[:, None] + flat[at + 1] * fx[:, None]
             bottom = flat[at + side] * (1 - fx)[:, None] + flat[at + side + 1] * fx[:, None]
