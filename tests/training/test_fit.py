@@ -311,6 +311,7 @@ def test_points_put_matter_where_they_are(scene):
     assert off["with"] < 0.6 * off["without"], off
 
 
+@pytest.mark.slow
 def test_someone_in_one_photo_leaves_the_scene(tmp_path):
     """A magenta figure stands before the box in one photo: its mask finds it, and nothing else."""
     scene = make_scene(tmp_path)

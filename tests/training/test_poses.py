@@ -18,6 +18,7 @@ def tiny(monkeypatch):
     monkeypatch.setitem(PRESETS, "tiny", TINY)
 
 
+@pytest.mark.slow
 def test_perturbed_poses_come_back(tmp_path):
     """Cameras turned by some four degrees: a third is found again soon, and only if asked."""
     scene = make_scene(tmp_path)
