@@ -45,7 +45,9 @@ def test_gradients_move_a_wrong_depth_towards_the_right_one():
 def test_what_is_not_known_or_inside_out_says_nothing():
     image, inverse = rays()
     relative = RelativeDepth(3)
-    assert relative.loss(inverse, -inverse, image, inverse > 0) == 0  # far would be near
+    bent = inverse + 0.1 * torch.sin(20 * inverse)
+    assert relative.loss(inverse, -bent, image, inverse > 0) == 0  # far would be near
+    assert RelativeDepth(3).loss(inverse, bent, image, inverse > 0) > 0
     none = torch.zeros(len(image), dtype=torch.bool)
     assert relative.loss(inverse, inverse, image, none) == 0
     few = torch.arange(len(image)) < 10
