@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 
+from climatenerf.ops import reference
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import BUILDING, SKY, UNKNOWN
 from climatenerf.training import sky_witness
@@ -145,3 +146,23 @@ def test_a_distorted_camera_is_asked_at_the_right_pixel():
     x = places()
     agreed = one.agreed(x, torch.full((len(x),), 0.1))
     assert agreed.any() and not (agreed & in_matter(x, 0.1)).any()
+
+
+def test_the_kernel_matches_its_twin():
+    c2w = poses(12)
+    wide = Camera(100, 40, 60.0, 55.0, 52.0, 19.0)  # views need not be of one size
+    cameras = [CAMERA, wide] * 6
+    found = SkyWitness(cameras, c2w, [labels(*each) for each in zip(cameras, c2w, strict=True)])
+    x, radius = places(), 0.3 * torch.rand(4000, generator=torch.Generator().manual_seed(1))
+    ends = found.starts + found.sizes.prod(1)
+    reach = [
+        torch.from_numpy(found.reach[start:end].reshape(size).astype(np.float32))
+        for start, end, size in zip(found.starts, ends, found.sizes, strict=True)
+    ]
+    least = (sky_witness.LEAST_VOICES, sky_witness.LEAST_SHARE, found.apart)
+    views = (torch.from_numpy(found.pinholes), torch.from_numpy(found.c2w))
+    real = reference.sky_voices(x, radius, reach, *views, least)
+    ours = found.agreed(x, radius)
+    # Rounding may put a place that lies on a pixel's border into its neighbour.
+    assert (ours == real).float().mean() > 0.999
+    assert 0.1 < real.float().mean() < 0.9

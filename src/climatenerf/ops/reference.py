@@ -8,7 +8,7 @@ samples; gradients come from autograd. Tests hold the fast kernels against these
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -193,3 +193,42 @@ def merge_order(
         t = torch.cat([t_a[a], t_b[b]])
         order.append(torch.cat([a, b + t_a.shape[0]])[torch.argsort(t, stable=True)])
     return torch.cat(order), offsets_a + offsets_b
+
+
+def sky_voices(
+    x: Float[Tensor, "n 3"],
+    radius: Float[Tensor, "n"],
+    reach: list[Tensor],
+    pinholes: Float[Tensor, "v 4"],
+    c2w: Float[Tensor, "v 4 4"],
+    least: tuple[int, float, float],
+) -> Bool[Tensor, "n"]:
+    """Which places enough views see before nothing but sky.
+
+    Args:
+        x: places, world m.
+        radius: of the ball around each that has to lie in the sky as a whole, m.
+        reach: for each view how many pixels within its sky a pixel lies, 1 at the sky's edge.
+        pinholes: fx, fy, cx, cy of those maps.
+        c2w: of the views.
+        least: voices needed; share of the views that have a place in their picture; distance (m)
+            between the first of them and another.
+    """
+    said, watching = [], []
+    for sky, (fx, fy, cx, cy), pose in zip(reach, pinholes, c2w, strict=True):
+        height, width = sky.shape
+        local = (x - pose[:3, 3]) @ pose[:3, :3]
+        z = local[:, 2]
+        z = torch.where(z > radius, z, torch.nan)  # behind the eye or around it: not asked
+        column = (fx * local[:, 0] / z + cx).floor()
+        row = (fy * local[:, 1] / z + cy).floor()
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        place = torch.stack([row, column]).where(inside, 0.0).long()
+        depth = sky[place[0], place[1]]
+        watching.append(inside)
+        said.append(inside & (depth >= 1) & (depth - 1 >= radius * torch.maximum(fx, fy) / z))
+    says, eyes = torch.stack(said), c2w[:, :3, 3]
+    first = eyes[says.float().argmax(0)]  # of the first voice, or any where there is none
+    spread = (says & ((eyes[:, None] - first).norm(dim=-1) > least[2])).any(0)
+    voices = says.sum(0)
+    return spread & (voices >= least[0]) & (voices >= least[1] * torch.stack(watching).sum(0))

@@ -101,7 +101,9 @@ class Fitting:
             {"params": list(self.masks.parameters()), "shares": (0.0, 1.0)},
             {"params": list(self.poses.parameters()), "shares": (0.0, POSE_SHARE)},
         ]
-        self.net_adam = torch.optim.Adam(groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15)
+        self.net_adam = torch.optim.Adam(
+            groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
+        )
         self.steps = 0
         self.seconds = 0.0
         self.samples = 0

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from climatenerf.ops import cpu
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import SKY, UNKNOWN
 
@@ -20,7 +21,6 @@ WIDEST = 400  # pixels of the maps that they are asked by
 REACH = 24  # pixels: within larger footprints nothing is claimed
 LEAST_VOICES, LEAST_SHARE = 2, 0.1  # views that must say sky, and of those that have it in view
 APART = 0.1  # of the cameras' spread: neighbouring frames err alike, so they have one voice
-AT_ONCE = 2**17  # places
 
 
 class SkyWitness:
@@ -37,45 +37,31 @@ class SkyWitness:
         chosen = np.unique(np.linspace(0, len(labelled) - 1, VOICES).round().astype(int))
         asked = [labelled[i] for i in chosen]
         maps = [sky_depth(cameras[i], labels[i]) for i in asked]
-        self.maps = [torch.from_numpy(each) for each, _ in maps]
-        self.intrinsics = [pinhole for _, pinhole in maps]
-        self.c2w = torch.from_numpy(np.asarray(c2w, np.float32)[asked])
+        self.reach = np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])
+        self.sizes = np.array([each.shape for each, _ in maps])
+        self.starts = np.append(0, self.sizes.prod(1).cumsum()[:-1])
+        self.pinholes = np.array([pinhole for _, pinhole in maps], np.float32)
+        self.c2w = np.ascontiguousarray(np.asarray(c2w, np.float32)[asked])
         eyes = self.c2w[:, :3, 3]
-        self.apart = APART * float((eyes - eyes.mean(0)).norm(dim=-1).mean())
+        self.apart = APART * float(np.linalg.norm(eyes - eyes.mean(0), axis=-1).mean())
 
-    @torch.no_grad()
     def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether enough views see nothing but sky within `radius` (m) of places x (world m)."""
         out = torch.empty(x.shape[0], dtype=torch.bool)
-        for start in range(0, x.shape[0], AT_ONCE):
-            some = slice(start, start + AT_ONCE)
-            out[some] = self._agreed(x[some], radius[some])
+        cpu.sky_voices(
+            x.contiguous().numpy(),
+            radius.numpy(),
+            self.reach,
+            self.starts,
+            self.sizes,
+            self.pinholes,
+            self.c2w,
+            LEAST_VOICES,
+            LEAST_SHARE,
+            self.apart,
+            out.numpy(),
+        )
         return out
-
-    def _agreed(self, x: Tensor, radius: Tensor) -> Tensor:
-        voices = torch.zeros(x.shape[0], dtype=torch.int32)
-        watching = torch.zeros_like(voices)
-        first = torch.full((x.shape[0], 3), torch.nan)  # where the first voice comes from
-        spread = torch.zeros(x.shape[0], dtype=torch.bool)
-        for sky, (fx, fy, cx, cy), c2w in zip(self.maps, self.intrinsics, self.c2w, strict=True):
-            height, width = sky.shape
-            local = (x - c2w[:3, 3]) @ c2w[:3, :3]
-            z = local[:, 2]
-            ahead = z > radius
-            per_metre = 1.0 / z.clamp_min(1e-6)  # behind the eye: not asked
-            column = (fx * local[:, 0] * per_metre + cx).floor()
-            row = (fy * local[:, 1] * per_metre + cy).floor()
-            inside = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            index = (row * width + column).where(inside, torch.zeros_like(row)).long()
-            reach = sky.view(-1)[index] - 1.0  # 1 at the sky's edge
-            says = inside & (reach >= radius * max(fx, fy) * per_metre)
-            # NaN, before there is a first, is not farther than anything.
-            spread |= says & ((first - c2w[:3, 3]).norm(dim=-1) > self.apart)
-            first = torch.where((says & (voices == 0))[:, None], c2w[:3, 3], first)
-            voices += says
-            watching += inside
-        enough = (voices >= LEAST_VOICES) & (voices >= LEAST_SHARE * watching)
-        return enough & spread
 
 
 def sky_depth(
