@@ -10,6 +10,7 @@ frame; the share reached is reported. Preparing (light, waves, snowfall) is time
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import common
 import numpy as np
@@ -38,22 +39,16 @@ def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:
     return float(min(np.quantile(height, wanted), eye - 0.05)) - scene.ground_z
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path)
-    parser.add_argument("--size", default="480x270")
-    parser.add_argument("--path", default="still", help="camera path; its first frame is used")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    field, scene = load_field(options.run), load_scene(options.run)
-    path = camera_path(options.path, scene, 1, parse_size(options.size))
+def frames(run: Path, size: str, view: str, repeats: int, seed: int) -> dict[str, Any]:
+    """Seconds of one view of a run in each weather; the first frame of the camera path `view`."""
+    field, scene = load_field(run), load_scene(run)
+    path = camera_path(view, scene, 1, parse_size(size))
     level = water_level(field, scene, path)
     weathers = {
         "clean": Weather(),
-        "flood": Weather(flood=Flood(level=level), seed=options.seed),
+        "flood": Weather(flood=Flood(level=level), seed=seed),
         "smog": Weather(smog=Smog(visibility=100.0)),
-        "snow": Weather(snow=Snow(depth=0.1), seed=options.seed),
+        "snow": Weather(snow=Snow(depth=0.1), seed=seed),
     }
     rows: dict[str, dict] = {}
     for name, weather in weathers.items():
@@ -65,7 +60,7 @@ def main() -> None:
         _, layers = render_frame(world, path.cameras[0], path.c2w[0])
         seconds = common.measure(
             lambda world=world: render_frame(world, path.cameras[0], path.c2w[0]),
-            options.repeats,
+            repeats,
             warm_up=0,
         )
         rows[name] = {
@@ -76,8 +71,19 @@ def main() -> None:
         }
     for row in rows.values():
         row["times_clean"] = row["seconds"]["median"] / rows["clean"]["seconds"]["median"]
-    about = {"run": options.run.name, "view": path.name, "size": options.size, "level_m": level}
-    common.report("seconds a frame", {**about, "frames": rows}, options.seed)
+    return {"run": run.name, "view": path.name, "size": size, "level_m": level, "frames": rows}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--size", default="480x270")
+    parser.add_argument("--path", default="still", help="camera path; its first frame is used")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    found = frames(options.run, options.size, options.path, options.repeats, options.seed)
+    common.report("seconds a frame", found, options.seed)
 
 
 if __name__ == "__main__":

@@ -255,26 +255,44 @@ def leaf(tensor, dtype):
     return tensor.clone().to(dtype).requires_grad_()
 
 
-def test_network_matches_the_twin_and_autograd(generator):
+@pytest.mark.parametrize("kind", ["one hidden layer", "shared", "shared, mixed up", "two layers"])
+@pytest.mark.parametrize("widths", [(16, 32, 1), (13, 22, 7)])  # whole sweeps of rows, and rests
+def test_network_matches_the_twin_and_autograd(generator, kind, widths):
+    n, rays = 9000, 2000  # more than two chunks
+    inputs, hidden, outputs = widths
+    sizes = [inputs, hidden, *([8] if kind == "two layers" else []), outputs]
     layers = [
-        (torch.randn(6, 16, generator=generator), torch.randn(16, generator=generator)),
-        (torch.randn(16, 8, generator=generator), torch.randn(8, generator=generator)),
-        (torch.randn(8, 3, generator=generator), torch.randn(3, generator=generator)),
+        (torch.randn(a, b, generator=generator), torch.randn(b, generator=generator))
+        for a, b in zip(sizes[:-1], sizes[1:], strict=True)
     ]
-    n = 9000  # more than two chunks
-    x = torch.randn(n, 6, generator=generator)
-    shared = torch.randn(50, 16, generator=generator)
-    row = torch.randint(0, 50, (n,), generator=generator)
-    up = torch.randn(n, 3, generator=generator)
+    x = torch.randn(n, inputs, generator=generator)
+    shared = torch.randn(rays, hidden, generator=generator)
+    row = torch.randint(0, rays, (n,), generator=generator)
+    row[100:3000] = 7  # a ray longer than a chunk
+    if kind != "shared, mixed up":
+        row = row.sort()[0]
+    up = torch.randn(n, outputs, generator=generator)
     grads = []
     for run, dtype in ((dispatch.mlp, torch.float32), (reference.mlp, torch.float64)):
         own = [tuple(leaf(p, dtype) for p in pair) for pair in layers]
-        inputs = [leaf(x, dtype), leaf(shared, dtype)]
-        out = run(inputs[0], own, inputs[1], row)
+        given = [leaf(x, dtype), leaf(shared, dtype)]
+        if kind.startswith("shared"):
+            out = run(given[0], own, given[1], row)
+        else:
+            out, given = run(given[0], own), given[:1]
         (out * up.to(dtype)).sum().backward()
-        grads.append([out, *[t.grad for t in inputs], *[p.grad for pair in own for p in pair]])
+        grads.append([out, *[t.grad for t in given], *[p.grad for pair in own for p in pair]])
     for fast, slow in zip(*grads, strict=True):
-        assert torch.allclose(fast.double(), slow, rtol=1e-3, atol=2e-2)
+        assert (fast.double() - slow).abs().max() < 1e-5 * slow.abs().max()
+
+
+def test_a_network_of_nothing_gives_nothing():
+    layers = [(torch.ones(4, 8), torch.ones(8)), (torch.ones(8, 2), torch.ones(2))]
+    x = torch.ones(0, 4, requires_grad=True)
+    out = dispatch.mlp(x, layers, torch.ones(3, 8), torch.zeros(0, dtype=torch.long))
+    assert out.shape == (0, 2)
+    out.sum().backward()
+    assert x.grad is not None and x.grad.shape == (0, 4)
 
 
 def test_merging_two_lists_matches_the_twin(generator):

@@ -24,7 +24,7 @@ from climatenerf.errors import UserError
 # it may be entered from several threads at once, which its last fallback may not.
 THREADING = {
     "OMP_WAIT_POLICY": "PASSIVE",
-    "GOMP_SPINCOUNT": "0",
+    "GOMP_SPINCOUNT": "10000",
     "KMP_BLOCKTIME": "0",
     "NUMBA_THREADING_LAYER_PRIORITY": "omp tbb workqueue",
 }

@@ -23,19 +23,27 @@ def _contract_scale(m):
 @njit(cache=True, fastmath=True, inline="always")
 def _corner(x, y, z, resolution, dense, mask):
     """Table row of a lattice corner: direct where the level fits its table, else hashed."""
+    # An unsigned index spares the test whether it counts from the end.
     if dense:
         side = np.uint32(resolution + 1)
-        return np.int64(np.uint32(np.uint32(x + np.uint32(side * y)) + np.uint32(side * side * z)))
+        return np.uintp(np.uint32(np.uint32(x + np.uint32(side * y)) + np.uint32(side * side * z)))
     hashed = np.uint32(x ^ np.uint32(y * PRIME_Y)) ^ np.uint32(z * PRIME_Z)
-    return np.int64(np.uint32(hashed) & mask)
+    return np.uintp(np.uint32(hashed) & mask)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _cell(ux, uy, uz, resolution):
+    """Lattice cell of a point and the place in it; in single precision, unlike int64 * float32."""
+    scale = np.float32(resolution)
+    px, py, pz = ux * scale, uy * scale, uz * scale
+    ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
+    return ix, iy, iz, px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
 
 
 @njit(cache=True, fastmath=True, inline="always")
 def _lookup(ux, uy, uz, level, resolution, dense, mask):
     """Trilinear interpolation of one level's two features at a point of the unit cube."""
-    px, py, pz = ux * resolution, uy * resolution, uz * resolution
-    ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-    fx, fy, fz = px - ix, py - iy, pz - iz
+    ix, iy, iz, fx, fy, fz = _cell(ux, uy, uz, resolution)
     one = np.uint32(1)
     jx, jy, jz = np.uint32(ix + one), np.uint32(iy + one), np.uint32(iz + one)
     gx, gy, gz = np.float32(1.0) - fx, np.float32(1.0) - fy, np.float32(1.0) - fz
@@ -105,9 +113,7 @@ def hash_encode_backward(u, grad_out, resolutions, grad_table):
             ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
             if ga == 0.0 and gb == 0.0:
                 continue
-            px, py, pz = u[p, 0] * resolution, u[p, 1] * resolution, u[p, 2] * resolution
-            ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-            fx, fy, fz = px - ix, py - iy, pz - iz
+            ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
             for corner in range(8):
                 dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
                 wx = fx if dx else np.float32(1.0) - fx
@@ -146,9 +152,7 @@ def hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
             rows = table[level]
             for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
                 ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
-                px, py, pz = u[p, 0] * resolution, u[p, 1] * resolution, u[p, 2] * resolution
-                ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-                fx, fy, fz = px - ix, py - iy, pz - iz
+                ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
                 sx, sy, sz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
                 for corner in range(8):
                     dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
@@ -167,9 +171,9 @@ def hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
                     sx += value * wy * wz * (one if dx else -one)
                     sy += value * wx * wz * (one if dy else -one)
                     sz += value * wx * wy * (one if dz else -one)
-                grad_u[p, 0] += resolution * sx
-                grad_u[p, 1] += resolution * sy
-                grad_u[p, 2] += resolution * sz
+                grad_u[p, 0] += np.float32(resolution) * sx
+                grad_u[p, 1] += np.float32(resolution) * sy
+                grad_u[p, 2] += np.float32(resolution) * sz
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -230,7 +234,7 @@ def _cell_exit(o, inv, index, cell, half):
     """Ray length at which the ray leaves the lattice cell of side `cell`, along one axis."""
     if inv > 1e29 or inv < -1e29:  # the ray runs parallel to this pair of faces
         return np.float32(1e30)
-    edge = (index + 1 if inv > 0 else index) * cell - half
+    edge = np.float32(index + 1 if inv > 0 else index) * cell - half
     return (edge - o) * inv
 
 
@@ -255,6 +259,7 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
     far = np.float32(2.0 ** (cascades - 1))
     dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
     log_stop = np.float32(-np.log(stop))
+    cells_across, block_across = np.float32(side), np.float32(1 << shift)
     for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
         hidden = np.empty(w1.shape[1], np.float32)
         k = 0
@@ -288,11 +293,15 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
                 while m > half and cascade < cascades - 1:
                     half *= np.float32(2.0)
                     cascade += 1
-                per_length = side / (np.float32(2.0) * half)
-                ix = min(max(int((qx + half) * per_length), 0), side - 1)
-                iy = min(max(int((qy + half) * per_length), 0), side - 1)
-                iz = min(max(int((qz + half) * per_length), 0), side - 1)
-                if occupied[cascade, ix, iy, iz]:
+                cell = np.float32(2.0) * half / cells_across
+                ix = min(max(np.int64((qx + half) / cell), 0), side - 1)
+                iy = min(max(np.int64((qy + half) / cell), 0), side - 1)
+                iz = min(max(np.int64((qz + half) / cell), 0), side - 1)
+                # Blocks fit into the nearest cache, cells do not: those are asked first.
+                if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
+                    cell *= block_across
+                    ix, iy, iz = ix >> shift, iy >> shift, iz >> shift
+                elif occupied[cascade, ix, iy, iz]:
                     sigma = _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden)
                     if sigma * dt > np.float32(1e-3):
                         rows[0, block, k] = tm
@@ -301,19 +310,15 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
                         tau += sigma * dt
                         k += 1
                     t += dt
-                else:
-                    cell = np.float32(2.0) * half / side
-                    if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
-                        cell *= np.float32(1 << shift)
-                        ix, iy, iz = ix >> shift, iy >> shift, iz >> shift
-                    leave = min(
-                        _cell_exit(ox, ivx, ix, cell, half),
-                        _cell_exit(oy, ivy, iy, cell, half),
-                        _cell_exit(oz, ivz, iz, cell, half),
-                    )
-                    # Whole steps, so that the sampling comb does not depend on the cells crossed.
-                    skip = np.ceil((leave - tm) / dt)
-                    t += dt * max(skip, np.float32(1.0))
+                    continue
+                leave = min(
+                    _cell_exit(ox, ivx, ix, cell, half),
+                    _cell_exit(oy, ivy, iy, cell, half),
+                    _cell_exit(oz, ivz, iz, cell, half),
+                )
+                # Whole steps, so that the sampling comb does not depend on the cells crossed.
+                skip = np.ceil((leave - tm) / dt)
+                t += dt * max(skip, np.float32(1.0))
             counts[r] = k - first
     return counts
 

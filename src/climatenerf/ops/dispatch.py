@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.ops import cpu, reference
+from climatenerf.ops import cpu, cpu_network, reference
 
 
 def _fast(*tensors: Tensor) -> bool:
@@ -142,57 +142,45 @@ def distortion(
     return reference.distortion(weights, s, ds, offsets)
 
 
-CHUNK = 4096  # rows of a matrix product that stay in cache: half the time of whole-batch products
-
-
-class _Mlp(torch.autograd.Function):
-    """Keeps no hidden layer: the backward pass computes it again, chunk by chunk."""
+class _Network(torch.autograd.Function):
+    """One hidden layer. Keeps none of it: the backward pass computes it again, block by block."""
 
     @staticmethod
-    def forward(ctx, x, shared, row, *parameters):
-        weights, biases = parameters[::2], parameters[1::2]
-        out = x.new_empty(x.shape[0], weights[-1].shape[1])
-        for start in range(0, x.shape[0], CHUNK):
-            part = slice(start, start + CHUNK)
-            out[part] = torch.addmm(
-                biases[-1], _Mlp.hidden(x, shared, row, part, weights, biases)[-1], weights[-1]
-            )
-        ctx.save_for_backward(x, shared, row, *parameters)
-        return out
-
-    @staticmethod
-    def hidden(x, shared, row, part, weights, biases):
-        """Inputs of every layer for some rows."""
-        inputs = [x[part]]
-        for i, (weight, bias) in enumerate(zip(weights[:-1], biases[:-1], strict=True)):
-            h = torch.addmm(bias, inputs[-1], weight)
-            if i == 0 and shared is not None:
-                h += shared.index_select(0, row[part])
-            inputs.append(h.relu_())
-        return inputs
+    def forward(ctx, x, shared, row, w1, b1, w2, b2):
+        common = torch.empty(0, w1.shape[1]) if shared is None else shared
+        rows = torch.empty(0, dtype=torch.long) if row is None else row
+        out = torch.empty(w2.shape[1], x.shape[0])
+        cpu_network.network_forward(
+            *(_np(each) for each in (x.T, common, rows, w1.T, b1, w2.T, b2)), out.numpy()
+        )
+        ctx.save_for_backward(x, common, rows, w1, b1, w2)
+        return out.T
 
     @staticmethod
     def backward(ctx, grad):
-        x, shared, row, *parameters = ctx.saved_tensors
-        weights, biases = parameters[::2], parameters[1::2]
-        grads = [torch.zeros_like(p) for p in parameters]
-        grad_shared = None if shared is None else torch.zeros_like(shared)
-        # Feature-major like the encoding's output, so that its backward pass reads rows.
-        grad_x = x.new_empty(x.shape[1], x.shape[0]) if ctx.needs_input_grad[0] else None
-        for start in range(0, x.shape[0], CHUNK):
-            part = slice(start, start + CHUNK)
-            inputs = _Mlp.hidden(x, shared, row, part, weights, biases)
-            g = grad[part]
-            for i in range(len(weights) - 1, -1, -1):
-                grads[2 * i].addmm_(inputs[i].T, g)
-                grads[2 * i + 1].add_(g.sum(0))
-                if i:
-                    g = (g @ weights[i].T).mul_(inputs[i] > 0)
-            if grad_shared is not None:
-                grad_shared.index_add_(0, row[part], g)
-            if grad_x is not None:
-                torch.mm(weights[0], g.T, out=grad_x[:, part])
-        return (None if grad_x is None else grad_x.T), grad_shared, None, *grads
+        x, common, rows, w1, b1, w2 = ctx.saved_tensors
+        inputs, hidden = w1.shape
+        borders = cpu_network.chunk_borders(rows.numpy(), x.shape[0])
+        chunks = borders.shape[0] - 1
+        sums1 = torch.zeros(chunks, hidden, inputs + 1)
+        sums2 = torch.zeros(chunks, w2.shape[1], hidden + 1)
+        grad_x = torch.empty(inputs if ctx.needs_input_grad[0] else 0, x.shape[0])
+        grad_shared = torch.zeros_like(common if ctx.needs_input_grad[1] else common[:0])
+        cpu_network.network_backward(
+            *(_np(each) for each in (x.T, common, rows, w1.T, b1, w1, w2.T, w2, grad.T)),
+            borders,
+            *(each.numpy() for each in (grad_x, grad_shared, sums1, sums2)),
+        )
+        first, second = sums1.sum(0), sums2.sum(0)
+        return (
+            grad_x.T if ctx.needs_input_grad[0] else None,
+            grad_shared if ctx.needs_input_grad[1] else None,
+            None,
+            first[:, :-1].T,
+            first[:, -1],
+            second[:, :-1].T,
+            second[:, -1],
+        )
 
 
 def mlp(
@@ -201,9 +189,9 @@ def mlp(
     shared: Float[Tensor, "m h"] | None = None,
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
-    """See `reference.mlp`."""
-    if _fast(x):
-        return _Mlp.apply(x, shared, row, *[p for layer in layers for p in layer])
+    """See `reference.mlp`, which deeper networks than those of one hidden layer go to."""
+    if _fast(x) and len(layers) == 2:
+        return _Network.apply(x, shared, row, *layers[0], *layers[1])
     return reference.mlp(x, layers, shared, row)
 
 

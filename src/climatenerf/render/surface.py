@@ -6,8 +6,7 @@ from torch import Tensor
 
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
-from climatenerf.render.samples import offsets_of
-from climatenerf.render.view import LEAST_WEIGHT, RAYS_AT_ONCE, RENDER_STEP
+from climatenerf.render.view import RAYS_AT_ONCE, weighed_samples
 from climatenerf.scene.classes import SKY, SOLID
 
 
@@ -27,23 +26,15 @@ def see_surface(
         (`scene.classes`), sky there.
     """
     normals, labels = [], []
-    for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
-        o, d = rays_o[start : start + RAYS_AT_ONCE], rays_d[start : start + RAYS_AT_ONCE]
-        n = o.shape[0]
-        near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
-        samples = field.march(o, d, near, far, RENDER_STEP)
-        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
-        ray = samples.ray_index()[keep]
-        offsets = offsets_of(ray, n)
-        u = field.sample_positions(o, d, samples)[keep]
-        normal, logits = field.surface_at(u)
-        solid = left < 0.5
-        mean = dispatch.accumulate(weights[keep], normal, offsets)
+    for o, d in zip(rays_o.split(RAYS_AT_ONCE), rays_d.split(RAYS_AT_ONCE), strict=True):
+        seen = weighed_samples(field, o, d)
+        normal, logits = field.surface_at(seen.u)
+        solid = seen.left < 0.5
+        mean = dispatch.accumulate(seen.weights, normal, seen.offsets)
         mean = torch.nn.functional.normalize(mean, dim=-1) * solid[:, None]
         away = (mean * d).sum(-1, keepdim=True) > 0
         normals.append(torch.where(away, -mean, mean))
-        best = dispatch.accumulate(weights[keep], logits, offsets).argmax(-1)
+        best = dispatch.accumulate(seen.weights, logits, seen.offsets).argmax(-1)
         kind = torch.from_numpy(SOLID)[best].to(torch.uint8)
         labels.append(torch.where(solid, kind, torch.full_like(kind, SKY)))
     return torch.cat(normals), torch.cat(labels)

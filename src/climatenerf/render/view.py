@@ -1,8 +1,10 @@
 """The clean view: what cameras see of the field, with nothing added. No gradients."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
@@ -28,26 +30,46 @@ def camera_rays(
     return pose[:3, 3].expand(rays_d.shape[0], 3).contiguous(), rays_d.contiguous()
 
 
+@dataclass(frozen=True)
+class Weighed:
+    """The samples of n rays through the dry scene that weigh enough to be seen."""
+
+    weights: Float[Tensor, "k"]
+    u: Float[Tensor, "k 3"]
+    """Where, in the unit cube."""
+    ray: Int[Tensor, "k"]
+    offsets: Int[Tensor, "n+1"]
+    left: Float[Tensor, "n"]
+    """Transmittance of the rays as a whole."""
+
+
+@torch.no_grad()
+def weighed_samples(
+    field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+) -> Weighed:
+    """Marches rays (world m) through the dry scene from the nearest distance on."""
+    n = rays_o.shape[0]
+    near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
+    samples = field.march(rays_o, rays_d, near, far, RENDER_STEP)
+    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+    ray = samples.ray_index()[keep]
+    u = field.sample_positions(rays_o, rays_d, samples)[keep]
+    return Weighed(weights[keep], u, ray, offsets_of(ray, n), left)
+
+
 @torch.no_grad()
 def field_radiance(
     field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     """Linear radiance along rays, in the appearance shown."""
     out = []
-    for start in range(0, rays_o.shape[0], RAYS_AT_ONCE):
-        o, d = rays_o[start : start + RAYS_AT_ONCE], rays_d[start : start + RAYS_AT_ONCE]
-        n = o.shape[0]
-        near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
-        samples = field.march(o, d, near, far, RENDER_STEP)
-        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
-        ray = samples.ray_index()[keep]
-        offsets = offsets_of(ray, n)
-        u = field.sample_positions(o, d, samples)[keep]
-        appearance = field.shown_embedding.expand(n, -1)
-        colour = field.colour_at(u, ray, d, appearance)
-        radiance = dispatch.accumulate(weights[keep], colour, offsets)
-        out.append(radiance + left[:, None] * field.sky_colour(d, appearance))
+    for o, d in zip(rays_o.split(RAYS_AT_ONCE), rays_d.split(RAYS_AT_ONCE), strict=True):
+        seen = weighed_samples(field, o, d)
+        appearance = field.shown_embedding.expand(o.shape[0], -1)
+        colour = field.colour_at(seen.u, seen.ray, d, appearance)
+        radiance = dispatch.accumulate(seen.weights, colour, seen.offsets)
+        out.append(radiance + seen.left[:, None] * field.sky_colour(d, appearance))
     return torch.cat(out)
 
 

@@ -1,0 +1,264 @@
+"""How fast is a step of fitting, a frame, and a fit as a whole?
+
+python benchmarks/engine.py RUN
+python benchmarks/engine.py RUN --capture ../shared/data/fox --minutes 5
+
+`step`: samples a second of one optimiser step on the field of RUN, with rays of its photos: ours;
+the same in eager PyTorch; the same under `torch.compile`. Every sample passes every head in all
+three (density, colour, classes, normals and the normals' target); marching is in none of them.
+`frame`: seconds of a picture, as `frame_time.py`. `time_to_psnr`: seconds of fitting a capture from
+nothing until the held-out photos reach so many dB; measuring them is not counted.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import common
+import numpy as np
+import torch
+from frame_time import frames
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from climatenerf.field.checkpoint import load_field
+from climatenerf.field.extent import find_extent
+from climatenerf.field.field import Field
+from climatenerf.ops import dispatch, reference
+from climatenerf.render.samples import Samples
+from climatenerf.scene import Scene, load_scene, read_scene
+from climatenerf.scene.classes import SOLID
+from climatenerf.training import losses
+from climatenerf.training.fit import Fitting, Report
+from climatenerf.training.optimiser import GridAdam
+from climatenerf.training.pixels import Batch
+from climatenerf.training.points import find_point_rays
+from climatenerf.training.run import evaluate, load_pixels
+from climatenerf.training.settings import FitSettings
+
+GOALS = (20, 22, 24)  # dB
+
+
+# --- the same operations in plain PyTorch, without a loop over rays ------------------------------
+
+
+def ray_of(offsets: Int[Tensor, "rays+1"]) -> Int[Tensor, "s"]:
+    return torch.repeat_interleave(torch.arange(offsets.shape[0] - 1), offsets.diff())
+
+
+def before_each(values: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]) -> Float[Tensor, "s"]:
+    """Sum of what comes before each sample on its ray."""
+    passed = values.double().cumsum(0) - values
+    first = offsets[:-1].clamp_max(values.shape[0] - 1)
+    return (passed - passed[first][ray_of(offsets)]).to(values.dtype)
+
+
+def eager_weights(tau: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]):
+    weights = (-before_each(tau, offsets)).exp() * -torch.expm1(-tau)
+    total = tau.new_zeros(offsets.shape[0] - 1).index_add(0, ray_of(offsets), tau)
+    return weights, (-total).exp()
+
+
+def eager_accumulate(weights: Tensor, values: Tensor, offsets: Tensor) -> Tensor:
+    out = values.new_zeros(offsets.shape[0] - 1, values.shape[1])
+    return out.index_add(0, ray_of(offsets), weights[:, None] * values)
+
+
+def eager_distortion(weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor) -> Tensor:
+    pairs = weights * (s * before_each(weights, offsets) - before_each(weights * s, offsets))
+    each = 2 * pairs + weights * weights * ds / 3
+    return each.new_zeros(offsets.shape[0] - 1).index_add(0, ray_of(offsets), each)
+
+
+def plain_pytorch():
+    """Within it the program computes with PyTorch alone."""
+    return mock.patch.multiple(
+        dispatch,
+        hash_encode=reference.hash_encode,
+        mlp=reference.mlp,
+        render_weights=eager_weights,
+        accumulate=eager_accumulate,
+        distortion=eager_distortion,
+    )
+
+
+# --- one step ------------------------------------------------------------------------------------
+
+
+@dataclass
+class Drawn:
+    """A batch of rays and the samples on them."""
+
+    batch: Batch
+    samples: Samples
+    ray: Int[Tensor, "s"]
+    q: Float[Tensor, "s 3"]
+    """Grid units."""
+
+
+def drawn(fitting: Fitting, samples: int) -> Drawn:
+    """Rays with about so many samples."""
+    field, rays = fitting.field, 512
+    while True:
+        batch = fitting.pixels.draw(rays, fitting.generator)
+        n = batch.rays_o.shape[0]
+        near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
+        jitter = torch.rand(n, generator=fitting.generator)
+        found = field.march(batch.rays_o, batch.rays_d, near, far, 1.0, jitter, stop=1e-4)
+        if 0.9 * samples < found.t.shape[0] < 1.1 * samples or rays > 2**16:
+            break
+        rays = max(16, int(rays * samples / max(found.t.shape[0], 1)))
+    ray = found.ray_index()
+    x = batch.rays_o[ray] + found.t[:, None] * batch.rays_d[ray]
+    return Drawn(batch, found, ray, field.to_grid(x))
+
+
+def loss_of(field: Field, at: Drawn) -> Float[Tensor, ""]:
+    """Colours, distortion, opacity, classes and normals of all samples."""
+    batch, samples = at.batch, at.samples
+    n = batch.rays_o.shape[0]
+    u = reference.contract(at.q)
+    dt, t = samples.dt / field.unit, samples.t / field.unit
+    weights, left = dispatch.render_weights(field.density_with_gradient(u) * dt, samples.offsets)
+    embedding = field.embeddings[batch.image]
+    colour = field.colour_at(u, at.ray, batch.rays_d, embedding)
+    radiance = dispatch.accumulate(weights, colour, samples.offsets)
+    radiance = radiance + left[:, None] * field.sky_colour(batch.rays_d, embedding)
+    loss = losses.colour_error(radiance, batch.rgb).mean()
+    loss = loss + 1e-2 * losses.distortion_loss(weights, t, dt, samples.offsets)
+    loss = loss + 2e-4 * losses.opacity_loss(left)
+    normal, logits = field.surface_at(u)
+    own = weights.detach()
+    composited = dispatch.accumulate(own, logits, samples.offsets)
+    target = torch.arange(n) % len(SOLID)  # their cost does not depend on what they are
+    loss = loss + 4e-2 * losses.class_loss(composited, target, torch.ones(n, dtype=torch.bool))
+    return loss + 4e-2 * losses.normal_loss(own, normal, field.density_normal(at.q), n)
+
+
+def our_step(field: Field, at: Drawn) -> Callable[[], None]:
+    tables = [p for n, p in field.named_parameters() if n.endswith("_grid")]
+    others = [p for n, p in field.named_parameters() if not n.endswith("_grid")]
+    grids, nets = GridAdam(tables), torch.optim.Adam(others, lr=1e-6, fused=True)
+
+    def step() -> None:
+        nets.zero_grad()
+        loss_of(field, at).backward()
+        nets.step()
+        grids.step(1e-6)
+
+    return step
+
+
+def twin_step(field: Field, at: Drawn, compiled: bool) -> Callable[[], None]:
+    for table in field.parameters():
+        if hasattr(table, "grad_buffer"):
+            del table.grad_buffer  # it is our optimiser's
+    adam = torch.optim.Adam(field.parameters(), lr=1e-6, fused=True)
+    loss = torch.compile(loss_of) if compiled else loss_of
+
+    def step() -> None:
+        with plain_pytorch():
+            adam.zero_grad()
+            loss(field, at).backward()
+            adam.step()
+
+    return step
+
+
+def steps(fitting: Fitting, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
+    """Million samples a second, ours and the twins', on the same field and rays."""
+    many, few = drawn(fitting, samples), drawn(fitting, twin_samples)
+    found = {}
+    jobs = {
+        "ours": (our_step, many, repeats),
+        "eager": (lambda f, at: twin_step(f, at, False), few, max(2, repeats // 2)),
+        "compile": (lambda f, at: twin_step(f, at, True), few, max(2, repeats // 2)),
+    }
+    for name, (make, at, count) in jobs.items():
+        try:
+            seconds = common.measure(make(fitting.field, at), count, warm_up=2)
+        except Exception as error:  # torch.compile needs a compiler, and may not know an operation
+            found[name] = {"failed": f"{type(error).__name__}: {error}"[:300]}
+            continue
+        size = at.samples.t.shape[0]
+        found[name] = {"samples_per_s": size / seconds["median"], "samples": size}
+        found[name]["seconds"] = seconds
+    for name in ("eager", "compile"):
+        if "samples_per_s" in found[name]:
+            times = found["ours"]["samples_per_s"] / found[name]["samples_per_s"]
+            found[f"times_{name}"] = times
+    return found
+
+
+# --- a whole fit ---------------------------------------------------------------------------------
+
+
+def begin(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
+    """As `climatenerf fit` begins."""
+    views = scene.of_split("train")
+    poses = np.stack([scene.c2w_world(view) for view in views])
+    extent = find_extent(poses, scene.points_world())
+    pixels = load_pixels(scene, downscale)
+    return Fitting(pixels, len(views), extent, settings, find_point_rays(scene))
+
+
+def time_to_psnr(
+    capture: Path, settings: FitSettings, downscale: int, every: float
+) -> dict[str, object]:
+    """Seconds of fitting until the held-out photos reach `GOALS`; the whole curve beside them."""
+    scene = read_scene(capture)
+    fitting = begin(scene, settings, downscale)
+    curve: list[dict[str, float]] = []
+
+    def look(report: Report) -> None:
+        if report.seconds >= every * (len(curve) + 1) or report.progress >= 1:
+            found = evaluate(fitting.field, scene, downscale, lambda done, total: None)
+            curve.append(
+                {"seconds": report.seconds, "psnr": found["psnr"], "psnr_cc": found["psnr_cc"]}
+            )
+
+    fitting.run(look)
+    reached = {
+        str(goal): next((at["seconds"] for at in curve if at["psnr"] >= goal), None)
+        for goal in GOALS
+    }
+    return {**reached, "curve": curve}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--samples", type=int, default=2**16)
+    parser.add_argument("--twin-samples", type=int, default=2**14)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--size", default="480x270")
+    parser.add_argument("--path", default="still")
+    parser.add_argument(
+        "--capture", type=Path, help="fitted for `time_to_psnr`; default: not asked"
+    )
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--every", type=float, default=5.0, help="seconds between measurements")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    scene = load_scene(options.run)
+    fitting = begin(scene, FitSettings(seed=options.seed), 1)
+    fitting.field = load_field(options.run).requires_grad_()
+    found: dict[str, object] = {"run": options.run.name, "capture": scene.root.name}
+    found["step"] = steps(fitting, options.samples, options.twin_samples, options.repeats)
+    shown = frames(options.run, options.size, options.path, options.repeats, options.seed)
+    found["frame"] = {
+        f"{name}_s": row["seconds"]["median"] for name, row in shown["frames"].items()
+    }
+    found["frames"] = shown
+    if options.capture:
+        settings = FitSettings(minutes=options.minutes, seed=options.seed)
+        ours = time_to_psnr(options.capture, settings, options.downscale, options.every)
+        found["time_to_psnr"] = {"capture": options.capture.name, "ours": ours}
+    common.report("speed of a step, of a frame and of a fit", found, options.seed)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""CPU kernels in Numba: networks with one hidden layer, forward and backward.
+
+Their twin is `reference.mlp`. Features come in rows, [features, n] as the encoding leaves them, so
+that the innermost loops run over samples, which vectorises whatever the layers' widths are. A block
+of samples and its hidden layer stay in the first- and second-level cache, and the backward pass
+computes the hidden layer again rather than keep it.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+BLOCK = 128  # samples at a time: 64 hidden rows of them are 32 kB
+CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients over
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _add_product(weight, rows, first, out, into, size):
+    """out [m, into:into + size] += weight [m, k] @ rows [k, first:first + size].
+
+    Four rows in one sweep over the samples. Slices of single rows are known to be contiguous, those
+    of a table are not, and would not vectorise.
+    """
+    k = rows.shape[0]
+    whole = k // 4 * 4
+    for m in range(out.shape[0]):
+        own = out[m][into : into + size]
+        w = weight[m]
+        for i in range(0, whole, 4):
+            r0 = rows[i][first : first + size]
+            r1 = rows[i + 1][first : first + size]
+            r2 = rows[i + 2][first : first + size]
+            r3 = rows[i + 3][first : first + size]
+            w0, w1, w2, w3 = w[i], w[i + 1], w[i + 2], w[i + 3]
+            for s in range(size):
+                own[s] += (w0 * r0[s] + w1 * r1[s]) + (w2 * r2[s] + w3 * r3[s])
+        for i in range(whole, k):
+            row = rows[i][first : first + size]
+            for s in range(size):
+                own[s] += w[i] * row[s]
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _add_outer(left, from_left, right, from_right, out, size):
+    """out [a, b] += left [a, from:from + size] @ right [b, from:from + size]ᵀ, four at a time."""
+    b = right.shape[0]
+    whole = b // 4 * 4
+    for i in range(left.shape[0]):
+        own = left[i][from_left : from_left + size]
+        for j in range(0, whole, 4):
+            r0 = right[j][from_right : from_right + size]
+            r1 = right[j + 1][from_right : from_right + size]
+            r2 = right[j + 2][from_right : from_right + size]
+            r3 = right[j + 3][from_right : from_right + size]
+            t0 = t1 = t2 = t3 = np.float32(0.0)
+            for s in range(size):
+                t0 += own[s] * r0[s]
+                t1 += own[s] * r1[s]
+                t2 += own[s] * r2[s]
+                t3 += own[s] * r3[s]
+            out[i, j] += t0
+            out[i, j + 1] += t1
+            out[i, j + 2] += t2
+            out[i, j + 3] += t3
+        for j in range(whole, b):
+            row = right[j][from_right : from_right + size]
+            total = np.float32(0.0)
+            for s in range(size):
+                total += own[s] * row[s]
+            out[i, j] += total
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _hidden(x, shared, row, w1, b1, start, stop, hidden):
+    """Fills hidden [h, ≥ stop - start] for some samples: the first layer after its ReLU."""
+    size = stop - start
+    if shared.shape[0]:
+        # Samples of a ray lie side by side: each run of them is filled at once.
+        begin = start
+        while begin < stop:
+            end = begin + 1
+            while end < stop and row[end] == row[begin]:
+                end += 1
+            own = shared[row[begin]]
+            for m in range(hidden.shape[0]):
+                hidden[m, begin - start : end - start] = b1[m] + own[m]
+            begin = end
+    else:
+        for m in range(hidden.shape[0]):
+            hidden[m, :size] = b1[m]
+    _add_product(w1, x, start, hidden, 0, size)
+    for m in range(hidden.shape[0]):
+        for s in range(size):
+            hidden[m, s] = max(hidden[m, s], np.float32(0.0))
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def network_forward(x, shared, row, w1, b1, w2, b2, out):
+    """One hidden layer with ReLU: → out [outputs, n].
+
+    Args: x [inputs, n]; w1 [hidden, inputs], w2 [outputs, hidden]: transposed, so that a unit's
+    weights lie side by side; shared [rays, hidden] is added to the first layer by row [n], or is
+    empty.
+    """
+    n = x.shape[1]
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        hidden = np.empty((w1.shape[0], BLOCK), np.float32)
+        own = np.empty((w2.shape[0], BLOCK), np.float32)
+        for start in range(chunk * CHUNK, min(n, chunk * CHUNK + CHUNK), BLOCK):
+            stop = min(start + BLOCK, n)
+            _hidden(x, shared, row, w1, b1, start, stop, hidden)
+            for o in range(own.shape[0]):
+                own[o, : stop - start] = b2[o]
+            _add_product(w2, hidden, 0, own, 0, stop - start)
+            out[:, start:stop] = own[:, : stop - start]
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def network_backward(x, shared, row, w1, b1, w1_in, w2, w2_in, grad, borders, grad_x, grad_shared,
+                     sums1, sums2):  # fmt: skip
+    """Gradients of `network_forward`.
+
+    Args: w1_in [inputs, hidden] and w2_in [hidden, outputs] are the same weights the other way
+    round; grad [outputs, n]; borders [chunks + 1] of chunks of samples that share no ray with
+    another. → grad_x [inputs, n] or of no rows; grad_shared [rays, hidden], which is added to;
+    sums1 [chunks, hidden, inputs + 1], sums2 [chunks, outputs, hidden + 1]: of the weights, and of
+    the bias in the last column.
+    """
+    for chunk in prange(borders.shape[0] - 1):
+        hidden = np.empty((w1.shape[0], BLOCK), np.float32)
+        back = np.empty((w1.shape[0], BLOCK), np.float32)
+        for start in range(borders[chunk], borders[chunk + 1], BLOCK):
+            stop = min(start + BLOCK, borders[chunk + 1])
+            size = stop - start
+            _hidden(x, shared, row, w1, b1, start, stop, hidden)
+            _add_outer(grad, start, hidden, 0, sums2[chunk], size)
+            back[:, :size] = 0.0
+            _add_product(w2_in, grad, start, back, 0, size)
+            for m in range(back.shape[0]):
+                for s in range(size):
+                    back[m, s] = back[m, s] if hidden[m, s] > 0 else np.float32(0.0)
+            _add_outer(back, 0, x, start, sums1[chunk], size)
+            for m in range(back.shape[0]):
+                total = np.float32(0.0)
+                for s in range(size):
+                    total += back[m, s]
+                sums1[chunk, m, -1] += total
+            for o in range(grad.shape[0]):
+                total = np.float32(0.0)
+                for s in range(start, stop):
+                    total += grad[o, s]
+                sums2[chunk, o, -1] += total
+            if grad_x.shape[0]:
+                grad_x[:, start:stop] = 0.0
+                _add_product(w1_in, back, 0, grad_x, start, size)
+            if grad_shared.shape[0]:
+                begin = start
+                while begin < stop:
+                    end = begin + 1
+                    while end < stop and row[end] == row[begin]:
+                        end += 1
+                    for m in range(back.shape[0]):
+                        total = np.float32(0.0)
+                        for s in range(begin - start, end - start):
+                            total += back[m, s]
+                        grad_shared[row[begin], m] += total
+                    begin = end
+
+
+def chunk_borders(row: np.ndarray, n: int) -> np.ndarray:
+    """Where chunks of about `CHUNK` samples begin and end, none within a ray.
+
+    Rays that come again (row does not ascend) may be in any chunk, so then there is but one.
+    """
+    if (np.diff(row) < 0).any():
+        return np.array([0, n])
+    borders = np.append(np.arange(0, n, CHUNK), n)
+    if row.shape[0]:
+        borders[1:-1] = np.searchsorted(row, row[borders[1:-1]], side="right")
+    return borders
