@@ -139,6 +139,15 @@ def test_relative_depth_is_found_by_either_name(tmp_path):
     assert (load_relative_depth(other, scene) == 3).all()
 
 
+def test_relative_depth_of_the_unturned_photo_is_refused(tmp_path):
+    view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
+    path = tmp_path / "depth_relative" / "a.npz"
+    path.parent.mkdir()
+    np.savez(path, x=np.ones((64, 48)))
+    with pytest.raises(UserError, match="48x64 pixels but its camera 32x24"):
+        load_relative_depth(view, scene)
+
+
 def test_relative_depth_that_cannot_be_used_is_one_sentence(tmp_path):
     view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
     path = tmp_path / "depth_relative" / "a.npz"

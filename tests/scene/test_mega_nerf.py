@@ -46,8 +46,9 @@ def save(path, **changes):
     torch.save({k: v for k, v in changes.items() if v is not None}, path)
 
 
-def make(root, suffix=".jpg", coordinates=True):
-    for i, pose in enumerate(poses()):
+def make(root, suffix=".jpg", coordinates=True, turn=None):
+    for i, upright in enumerate(poses()):
+        pose = upright if turn is None else turn @ upright
         folder = root / ("val" if i in (0, 5) else "train")
         write_images(folder / "rgbs", [f"{i:06}{suffix}"])
         save(
@@ -92,6 +93,17 @@ def test_the_scene_is_in_metres_with_z_up(tmp_path):
     eyes = np.array([scene.c2w_world(v)[:3, 3] for v in scene.views])
     assert eyes[:, 2].min() > 147 and eyes[:, 2].max() < 153
     assert np.ptp(eyes[:, 0]) == pytest.approx(60, abs=0.1)
+
+
+def test_a_frame_in_which_no_camera_stands_level_is_not_believed_to_be_metric(tmp_path):
+    """The project's converter from COLMAP writes `coordinates.pt` for such a frame, too."""
+    turn = np.eye(4)
+    turn[:3, :3] = np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    make(tmp_path, turn=turn)
+    scene = read_scene(tmp_path)
+    assert scene.scale_source == "camera-height-assumed"
+    up = scene.world_from_input[:3, :3] @ turn[:3, 2]
+    assert up[2] / np.linalg.norm(up) > np.cos(np.radians(10))
 
 
 def test_without_coordinates_the_scale_is_not_known(tmp_path):

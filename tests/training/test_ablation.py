@@ -42,7 +42,8 @@ def test_each_row_leaves_out_just_what_it_says():
     assert {name: differences(full, row) for name, row in rows.items() if name != "plain NGP"} == {
         "no appearance": {"appearance"},
         "no distortion": {"distortion"},
-        "no normals": {"normals", "flat"},
+        "no normals": {"normals"},
+        "no flatness": {"flat"},
         "no sky": {"sky_labels"},
         "no depth": {"points", "monocular"},
         "full": set(),
@@ -131,3 +132,23 @@ def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "ablation.json").read_text())["rows"].keys() == rows.keys()
     assert (tmp_path / "ablation.jpg").stat().st_size > 10_000
     assert "smog-mid" in (tmp_path / "ablation.md").read_text()
+
+
+def test_what_cannot_be_measured_is_refused_before_the_first_fit(tmp_path, monkeypatch):
+    monkeypatch.setattr(ablation, "fit_scene", lambda *_: pytest.fail("a fit began"))
+    scene = read_scene(REFERENCE)
+
+    def refused(match, out, of=scene):
+        with pytest.raises(UserError, match=match):
+            ablation.ablate(of, out, 1.0, 2, 1, lambda *_: None, lambda _: None)
+
+    refused("lies in the reference set", REFERENCE / "mine")
+    trained = [dataclasses.replace(view, split="train") for view in scene.views]
+    refused("was fitted to the test view", tmp_path, dataclasses.replace(scene, views=trained))
+    fewer = [view for view in scene.views if view.name != "t03.jpg"]
+    refused("does not know the test view", tmp_path, dataclasses.replace(scene, views=fewer))
+    (tmp_path / ablation.TEXT_NAME).write_text("mine")
+    refused("would be overwritten", tmp_path)
+    assert (tmp_path / ablation.TEXT_NAME).read_text() == "mine" and len(
+        list(tmp_path.iterdir())
+    ) == 1

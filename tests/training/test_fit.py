@@ -12,9 +12,10 @@ from climatenerf.evaluation.metrics import psnr
 from climatenerf.field.extent import find_extent
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
+from climatenerf.render.samples import Samples
 from climatenerf.render.view import camera_rays, render_view
 from climatenerf.scene import load_image
-from climatenerf.scene.classes import ROAD, SKY
+from climatenerf.scene.classes import ROAD, SKY, UNKNOWN, VEHICLE
 from climatenerf.training import fit, losses
 from climatenerf.training.fit import Fitting, scale_gradient
 from climatenerf.training.points import find_point_rays
@@ -182,6 +183,67 @@ def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
     batch.label[:] = SKY
     fitting.step(batch)
     assert any((p.grad != 0).any() for p in fitting.field.sky_net)
+
+
+def test_what_nobody_has_labelled_may_be_sky_too(scene):
+    fitting = begin(scene, steps=1, losses=Losses(sky_fill=0.0))
+    fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
+    fitting.pixels.label[0] = SKY
+    fitting = Fitting(fitting.pixels, 20, fitting.extent, fitting.settings)
+    batch = fitting.pixels.draw(200, fitting.generator)
+    batch.label[:] = UNKNOWN
+    fitting.step(batch)
+    assert any((p.grad != 0).any() for p in fitting.field.sky_net)
+
+
+def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
+    """Of a half-opaque pole before the open sky only what others see the sky at is sky."""
+    fitting = begin(scene, steps=1)
+    batch = fitting.pixels.draw(2, fitting.generator)
+    batch.label[:] = torch.tensor([SKY, ROAD], dtype=torch.uint8)
+    t = torch.tensor([1.0, 2.0, 3.0, 4.0, 1.0])
+    samples = Samples(torch.tensor([0, 4, 5]), t, torch.full((5,), 0.1), torch.ones(5))
+    weights = torch.tensor([0.3, 0.2, 0.2, 0.0, 0.9])
+    assert fitting.sky_samples(batch, samples, weights).tolist() == [0, 1, 2]
+
+    class Witness:
+        def agreed(self, x, radius):
+            far = (x - batch.rays_o[0]).norm(dim=-1)
+            return far > 1.5  # the nearest is seen as matter elsewhere
+
+    fitting.pixels.witness = Witness()
+    assert fitting.sky_samples(batch, samples, weights).tolist() == [1, 2]
+    x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
+    cell, _ = fitting.field._cells(fitting.field.to_grid(x[None]))
+    fitting.held.view(-1)[cell] = True  # a sparse point lies by the last
+    assert fitting.sky_samples(batch, samples, weights).tolist() == [1]
+
+
+def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypatch):
+    fitting = begin(scene, steps=10)
+    fitting.steps = 9  # masks are in use
+    batch = fitting.pixels.draw(4, fitting.generator)
+    batch.label[:], batch.relative = VEHICLE, torch.ones(4)
+    mask = torch.tensor([0.9, 0.1, 0.4, 0.6])
+    monkeypatch.setattr(fitting, "masks", lambda image, place: mask)
+    _, stays = fitting.colour_loss(torch.ones(4), batch)
+    assert stays.label.tolist() == [UNKNOWN, VEHICLE, VEHICLE, UNKNOWN]
+    assert torch.isnan(stays.relative).tolist() == [True, False, False, True]
+    assert (batch.label == VEHICLE).all()
+
+
+def test_a_fit_that_stops_early_does_not_claim_normals(scene):
+    fitting = begin(scene, steps=100)
+
+    def report(state):
+        if state.step == 20:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fitting.run(report)
+    assert not fitting.field.knows_normals
+    fitting.run(lambda _: None)
+    assert fitting.field.knows_normals
 
 
 def test_colours_are_alike_from_all_sides_until_surfaces_are_found(scene):
@@ -385,9 +447,8 @@ def test_opacity_is_pushed_to_none_or_all():
     assert half == pytest.approx(0.5 * math.log(2))
 
 
-def test_sky_loss_is_the_opacity_of_sky_rays_alone():
-    left, sky = torch.tensor([0.25, 0.5, 1.0]), torch.tensor([1.0, 0.0, 1.0])
-    assert losses.sky_loss(left, sky) == pytest.approx(0.25)
+def test_sky_loss_is_the_weight_in_the_sky_over_all_rays():
+    assert losses.sky_loss(torch.tensor([0.5, 0.25]), 3) == pytest.approx(0.25)
 
 
 def test_scaling_a_gradient_leaves_the_value():

@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 import torch
 
 from climatenerf.training.monocular import RelativeDepth
+from climatenerf.training.pixels import in_units
 
 
 def rays(n=4000, images=3, seed=0):
@@ -63,3 +65,12 @@ def test_sums_from_earlier_steps_help_when_a_step_has_few_rays():
         image, inverse = rays(60, seed=seed)
         relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)
     assert (relative.affine()[2] > 0).all()
+
+
+def test_relative_depth_of_any_unit_fits_into_half_floats():
+    disparity = np.array([[1.0, 2.0], [60_000.0, np.nan]]) * 100
+    kept = in_units(disparity).astype(np.float16)
+    assert kept[1, 0] == 1 and kept[0, 1] == pytest.approx(2 * kept[0, 0], rel=1e-2)
+    assert np.isnan(kept[1, 1])
+    assert (in_units(np.zeros((2, 2))) == 0).all()
+    assert in_units(np.array([[np.inf, 0.5]])).tolist() == [[np.inf, 1.0]]

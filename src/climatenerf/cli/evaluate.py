@@ -61,8 +61,7 @@ def run(options: Evaluate) -> int:
     reference = read_reference(scene.root, options.views, options.weathers)
     if options.out.resolve().is_relative_to(reference.folder.resolve()):
         raise UserError(f"{options.out} lies in the reference set; choose another folder with -o")
-    place = Place(field, scene, reference)
-    check_views(place)
+    check_views(scene, reference)
     measured = options.run / "metrics.json"  # absent where a fit was stopped before its end
     metrics = read_json(measured, "the run's measurements") if measured.exists() else {}
     names = ["clean", *(kind.name for kind in reference.weathers)]

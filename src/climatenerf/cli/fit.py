@@ -39,7 +39,8 @@ class Fit:
     """Continue the run in the folder; --minutes then counts from its beginning."""
     preset: Literal["cpu", "gpu", "paper"] = "cpu"
     """Size of the field. gpu: larger tables (no GPU kernels yet). paper: the paper's sizes and
-    losses; its sky is opaque, by each photo's own labels, and shelters from snow."""
+    weights of losses (docs/physics.md tells what in them is ours); its sky is opaque, by each
+    photo's own labels, and shelters from snow."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Weight of a loss, such as sky=0, which switches it off; may be given again for others."""
     refine_poses: bool = False

@@ -68,6 +68,7 @@ def wet_pixels(dry: Dry, level: float) -> tuple[Bool[np.ndarray, "h w"], np.ndar
     """Where the water's plane lies before what is seen, and its ray length, m."""
     fall = -dry.rays_d[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
+        # 1e-6: rays that do not sink, 0/0.
         t = np.where(fall > 1e-6, (dry.c2w[2, 3] - level) / fall, np.inf)
     return (t > 0) & (t < dry.depth), t
 
@@ -183,6 +184,7 @@ def frame_noise(picture: Float[np.ndarray, "h w 3"], seed: int) -> Float[np.ndar
 def display(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Display values in [0, 1] of linear light (IEC 61966-2-1)."""
     x = np.clip(linear, 0.0, 1.0)
+    # 1e-6: the root's branch is not taken there, but is computed.
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-6) ** (1 / 2.4) - 0.055)
 
 

@@ -62,15 +62,19 @@ class Place:
     reference: Reference
 
     def view(self, truth: Truth) -> View | None:
-        """The run's view of that name; poses from elsewhere may call it `images/NAME`."""
-        names = {Path(view.name).name: view for view in self.scene.views}
-        return names.get(truth.name)
+        """The run's view of that name."""
+        return find_view(self.scene, truth)
 
     def pose(self, truth: Truth) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
         """Camera and pose, in the run's own world, of a view that is measured."""
         view = self.view(truth)
         assert view is not None
         return self.scene.cameras[view.camera], self.scene.c2w_world(view)
+
+
+def find_view(scene: Scene, truth: Truth) -> View | None:
+    """A scene's view of a truth's name; poses from elsewhere may call it `images/NAME`."""
+    return {Path(view.name).name: view for view in scene.views}.get(truth.name)
 
 
 def evaluate(place: Place, tell: Tell) -> Scores:
@@ -83,7 +87,7 @@ def evaluate(place: Place, tell: Tell) -> Scores:
     Raises:
         UserError: the run lacks a test view, was fitted to it, or has it in another size.
     """
-    check_views(place)
+    check_views(place.scene, place.reference)
     truths = place.reference.truths
     tell("clean views")
     dry = [dry_view(place, truth) for truth in truths]
@@ -108,10 +112,10 @@ def evaluate(place: Place, tell: Tell) -> Scores:
     return scores
 
 
-def check_views(place: Place) -> None:
+def check_views(scene: Scene, reference: Reference) -> None:
     """Refuses a run that cannot be measured honestly."""
-    for truth in place.reference.truths:
-        view = place.view(truth)
+    for truth in reference.truths:
+        view = find_view(scene, truth)
         if view is None:
             raise UserError(
                 f"the run does not know the test view {truth.name}; fit the whole reference set"
@@ -121,7 +125,7 @@ def check_views(place: Place) -> None:
                 f"the run was fitted to the test view {truth.name}, so it cannot be measured by it;"
                 " fit without --holdout"
             )
-        camera = place.scene.cameras[view.camera]
+        camera = scene.cameras[view.camera]
         if (camera.height, camera.width) != truth.depth.shape:
             raise UserError(
                 f"the run has {truth.name} at {camera.width}x{camera.height} pixels, the reference"
@@ -242,7 +246,7 @@ def mirror_scores(place: Place) -> dict[str, float]:
         ours = display_8bit(linear.double().numpy())[there] / 255.0
         errors.append(((ours - reference.mirrored(truth.name)[there] / 255.0) ** 2).ravel())
     mse = float(np.concatenate(errors).mean()) if sum(map(len, errors)) else float("nan")
-    return {"mirror_psnr": float(-10 * np.log10(max(mse, 1e-12)))}
+    return {"mirror_psnr": float(-10 * np.log10(max(mse, 1e-12)))}  # equal ones: log 0
 
 
 def frame_scores(place: Place) -> dict[str, float]:

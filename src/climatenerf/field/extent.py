@@ -44,6 +44,7 @@ def find_extent(c2w: Float[np.ndarray, "v 4 4"], points: Float[np.ndarray, "n 3"
 def focus_point(c2w: Float[np.ndarray, "v 4 4"]) -> Float[np.ndarray, "3"]:
     """Point nearest to all optical axes; for parallel axes, a point ahead of the cameras."""
     eyes, forward = c2w[:, :3, 3], c2w[:, :3, 2]
+    # 1e-6: cameras in one place, of which none is ahead of another.
     spread = max(float(np.linalg.norm(eyes - eyes.mean(0), axis=1).mean()), 1e-6)
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     # The small pull to a point ahead makes parallel axes solvable.

@@ -279,6 +279,7 @@ class Field(nn.Module):
         """Density (1/grid unit) at unit-cube coordinates, with gradients to the parameters."""
         raw = self.raw_density(u)
         # 1/|q|^2 outside the core (see `reference.density`), from the contracted radius 2 - 1/|q|.
+        # 1e-4: the outermost shell, where rounding could make it negative.
         shell = (2.0 - (4.0 * u - 2.0).norm(dim=-1)).clamp(1e-4, 1.0)
         return raw.clamp_max(15.0).exp() * shell.square()
 

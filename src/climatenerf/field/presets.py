@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class FieldSize:
-    """Sizes of the two hash grids and of their networks."""
+    """Sizes of the hash grids and of their networks."""
 
     geometry_levels: int = 8
     geometry_log2_rows: int = 17

@@ -448,10 +448,12 @@ def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correc
 
 
 @njit(cache=True, parallel=True)
-def sky_voices(
-    x, radius, reach, starts, sizes, pinholes, c2w, least_voices, least_share, apart, agreed
-):
-    """Which places enough views see before nothing but sky: see `reference.sky_voices`."""
+def sky_voices(x, radius, reach, starts, sizes, pinholes, c2w, least, agreed):
+    """Which places enough views see before nothing but sky: see `reference.sky_voices`.
+
+    Args: the maps of all views in one row, reach, each from starts [v] on and of sizes [v, 2].
+    """
+    least_voices, least_share, apart = least
     views = c2w.shape[0]
     for i in prange(x.shape[0]):
         voices, watching, first, spread = 0, 0, 0, False

@@ -115,16 +115,20 @@ def network_forward(x, shared, row, w1, b1, w2, b2, out):
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def network_backward(x, shared, row, w1, b1, w1_in, w2, w2_in, grad, borders, grad_x, grad_shared,
-                     sums1, sums2):  # fmt: skip
+def network_backward(given, weights, turned, grad, borders, gradients):
     """Gradients of `network_forward`.
 
-    Args: w1_in [inputs, hidden] and w2_in [hidden, outputs] are the same weights the other way
-    round; grad [outputs, n]; borders [chunks + 1] of chunks of samples that share no ray with
-    another. → grad_x [inputs, n] or of no rows; grad_shared [rays, hidden], which is added to;
-    sums1 [chunks, hidden, inputs + 1], sums2 [chunks, outputs, hidden + 1]: of the weights, and of
-    the bias in the last column.
+    Args: given = (x, shared, row) and weights = (w1, b1, w2) as there; turned = the same weights
+    the other way round, (w1 [inputs, hidden], w2 [hidden, outputs]); grad [outputs, n];
+    borders [chunks + 1] of chunks of samples that share no ray with another.
+    → gradients = (grad_x [inputs, n] or of no rows, grad_shared [rays, hidden] or of no rows, which
+    is added to, sums1 [chunks, hidden, inputs + 1], sums2 [chunks, outputs, hidden + 1]): sums of
+    the weights', with the bias in the last column.
     """
+    x, shared, row = given
+    w1, b1, w2 = weights
+    w1_in, w2_in = turned
+    grad_x, grad_shared, sums1, sums2 = gradients
     for chunk in prange(borders.shape[0] - 1):
         hidden = np.empty((w1.shape[0], BLOCK), np.float32)
         back = np.empty((w1.shape[0], BLOCK), np.float32)

@@ -151,7 +151,14 @@ class _Network(torch.autograd.Function):
         rows = torch.empty(0, dtype=torch.long) if row is None else row
         out = torch.empty(w2.shape[1], x.shape[0])
         cpu_network.network_forward(
-            *(_np(each) for each in (x.T, common, rows, w1.T, b1, w2.T, b2)), out.numpy()
+            _np(x.T),
+            _np(common),
+            _np(rows),
+            _np(w1.T),
+            _np(b1),
+            _np(w2.T),
+            _np(b2),
+            out.numpy(),
         )
         ctx.save_for_backward(x, common, rows, w1, b1, w2)
         return out.T
@@ -167,9 +174,12 @@ class _Network(torch.autograd.Function):
         grad_x = torch.empty(inputs if ctx.needs_input_grad[0] else 0, x.shape[0])
         grad_shared = torch.zeros_like(common if ctx.needs_input_grad[1] else common[:0])
         cpu_network.network_backward(
-            *(_np(each) for each in (x.T, common, rows, w1.T, b1, w1, w2.T, w2, grad.T)),
+            (_np(x.T), _np(common), _np(rows)),
+            (_np(w1.T), _np(b1), _np(w2.T)),
+            (_np(w1), _np(w2)),
+            _np(grad.T),
             borders,
-            *(each.numpy() for each in (grad_x, grad_shared, sums1, sums2)),
+            (grad_x.numpy(), grad_shared.numpy(), sums1.numpy(), sums2.numpy()),
         )
         first, second = sums1.sum(0), sums2.sum(0)
         return (

@@ -21,6 +21,8 @@ _LICENCES = (
     ("segformer", "NVIDIA's own licence: non-commercial, for research or evaluation only"),
     ("oneformer", "MIT"),
     ("depth-anything-v2-small", "Apache-2.0"),
+    ("depth-anything-v2-metric-indoor-small", "Apache-2.0"),
+    ("depth-anything-v2-metric-outdoor-small", "Apache-2.0"),
     ("depth-anything-v2", "CC-BY-NC-4.0: non-commercial"),
 )
 

@@ -34,7 +34,7 @@ def load_depth(name: str) -> Network:
             inputs = processor(images=Image.fromarray(picture), return_tensors="pt")
             seen = model(**inputs.to(model.device)).predicted_depth[0].float().cpu().numpy()
         if config.depth_estimation_type == "metric":
-            seen = 1 / np.maximum(seen, 1e-3)
+            seen = 1 / np.maximum(seen, 1e-3)  # a millimetre: 1/0
         height, width = picture.shape[:2]
         scale = min(1.0, LONGEST / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))

@@ -98,7 +98,7 @@ class Seen:
     depth: Float[Tensor, "n"]
     """Ray length to the surface seen (water counts), m; +inf for sky."""
     normal: Float[Tensor, "n 3"]
-    """Of water and snow; 0 elsewhere: solid surfaces' come from the depth (`normals.py`)."""
+    """Of water and snow; 0 elsewhere: solid surfaces' come from the field (`frame.py`)."""
     transmittance: Float[Tensor, "n"]
     """Of the air to that surface."""
     water_depth: Float[Tensor, "n"]

@@ -185,7 +185,9 @@ def load_relative_depth(
         raise UserError(
             f"The relative depth {path} cannot be read ({reason}); replace it."
         ) from None
-    camera = downscaled_camera(scene.cameras[view.camera], downscale)
+    full = scene.cameras[view.camera]
+    _check_shape(values, full, path)
+    camera = downscaled_camera(full, downscale)
     size = (camera.width, camera.height)
     return np.asarray(relative.resize(size, Image.Resampling.BILINEAR))
 
@@ -311,14 +313,19 @@ def _fitting(values: np.ndarray, camera: Camera, path: Path) -> np.ndarray:
     Labels, masks and depths may have been made from larger or smaller pictures.
     """
     height, width = values.shape
+    _check_shape(values, camera, path)
+    rows = (np.arange(camera.height) + 0.5) * height / camera.height
+    columns = (np.arange(camera.width) + 0.5) * width / camera.width
+    return values[rows.astype(np.int64)[:, None], columns.astype(np.int64)]
+
+
+def _check_shape(values: np.ndarray, camera: Camera, path: Path) -> None:
+    height, width = values.shape
     if abs(width * camera.height / (height * camera.width) - 1) >= 0.02:
         raise UserError(
             f"The picture {path} has {width}x{height} pixels but its camera "
             f"{camera.width}x{camera.height}; make them agree."
         )
-    rows = (np.arange(camera.height) + 0.5) * height / camera.height
-    columns = (np.arange(camera.width) + 0.5) * width / camera.width
-    return values[rows.astype(np.int64)[:, None], columns.astype(np.int64)]
 
 
 def to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:

@@ -7,7 +7,9 @@ backward). Positions are (real - origin_drb) / pose_scale_factor with the two in
 real ones being in metres.
 
 The input frame here is (right, forward, up) of that world: z up, in metres where `coordinates.pt`
-tells how long the units are. Pictures are without lens distortion.
+tells how long the units are, and the cameras stand level in it. (Those of a capture that came from
+COLMAP do not: it has an arbitrary frame and scale, which the file does not say.) Pictures are
+without lens distortion.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from climatenerf.scene.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.scene import View
 
 SPLITS: dict[str, Literal["train", "heldout"]] = {"train": "train", "val": "heldout"}
+LEVEL = 0.1  # sine of 6 degrees
 _SUFFIXES = (".jpg", ".JPG", ".png", ".PNG")
 _UPRIGHT_FROM_DRB = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]])
 
@@ -65,8 +68,13 @@ def read_mega_nerf(root: Path) -> Capture:
         cameras=tuple(cameras),
         views=tuple(views),
         own_split=any(v.split == "heldout" for v in views),
-        metric=metric,
+        metric=metric and _stand_level(np.stack([view.c2w for view in views])),
     )
+
+
+def _stand_level(c2w: np.ndarray) -> bool:
+    """Whether the right-hand axes of most cameras [n, 4, 4] are level, as a drone's gimbal is."""
+    return bool(np.median(np.abs(c2w[:, 2, 0])) < LEVEL)
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import (
     Place,
     Tell,
+    check_views,
     display_8bit,
     dry_view,
     frame_scores,
@@ -75,7 +76,8 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         "plain NGP": plain,
         "no appearance": dataclasses.replace(full, appearance=False),
         "no distortion": without(distortion=0.0),
-        "no normals": without(normals=0.0, flat=0.0),
+        "no normals": without(normals=0.0),
+        "no flatness": without(flat=0.0),
         "no sky": dataclasses.replace(full, sky_labels=False),
         "no depth": without(points=0.0, monocular=0.0),
         "full": full,
@@ -107,7 +109,10 @@ def ablate(
     Raises:
         UserError: the capture has no reference set, or the folder holds fits of other settings.
     """
-    read_reference(scene.root)  # to be known before hours of fitting
+    # All that can be wrong is to be known before hours of fitting.
+    reference = read_reference(scene.root)
+    check_views(scene, reference)
+    check_folder(out, reference.folder)
     make_folder(out / "runs")
     table: dict[str, list[dict[str, float]]] = {}
     sheet = []
@@ -133,6 +138,16 @@ def ablate(
     write_bytes(out / TEXT_NAME, markdown(data).encode())
     write_jpeg(out / SHEET, contact_sheet(sheet, cell_width=CELL), 400_000)
     return data
+
+
+def check_folder(out: Path, reference: Path) -> None:
+    """Refuses a folder within the reference set, or with files that no ablation wrote."""
+    if out.resolve().is_relative_to(reference.resolve()):
+        raise UserError(f"{out} lies in the reference set; choose another folder with -o")
+    ours = (out / FILE_NAME).is_file() and "rows" in read_json(out / FILE_NAME, "an ablation")
+    for name in (FILE_NAME, TEXT_NAME, SHEET):
+        if (out / name).exists() and not ours:
+            raise UserError(f"{out / name} would be overwritten; choose another folder with -o")
 
 
 def fit_row(

@@ -85,7 +85,8 @@ class Fitting:
         kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
         classed = bool((SOLID_CLASSES[kinds.long()] != UNKNOWN).any())
         weigh = settings.losses
-        self.field.learned[:] = torch.tensor([weigh.normals > 0, weigh.classes > 0 and classed])
+        # Normals are learned later.
+        self.field.learned[:] = torch.tensor([False, weigh.classes > 0 and classed])
         self.field.sky_grid.requires_grad_(self.knows_sky)
         grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
         grids += [self.field.surface_grid] if size.surface_levels else []
@@ -145,7 +146,7 @@ class Fitting:
                     step=self.steps,
                     seconds=self.seconds,
                     progress=self.progress,
-                    psnr=-10 * np.log10(max(self.error, 1e-10)),
+                    psnr=-10 * np.log10(max(self.error, 1e-10)),  # a perfect fit: log 0
                     rays_per_second=rays / seconds,
                     samples_per_ray=samples / rays,
                     samples=self.samples,
@@ -201,7 +202,7 @@ class Fitting:
         ray = samples.ray_index()[kept][seen]
         radiance = self.radiance(batch, u[seen], ray, share[seen], left, spread[seen])
         error = losses.colour_error(radiance, batch.rgb)
-        loss = self.colour_loss(error, batch)
+        loss, batch = self.colour_loss(error, batch)
         loss = loss + self.geometry_loss(batch, samples, weights, left, t, dt)
         loss = loss + self.surface_loss(
             batch, u[seen], ray, share[seen].detach(), samples, kept[seen]
@@ -239,17 +240,27 @@ class Fitting:
         x = batch.rays_o[ray] + samples.t[kept, None] * batch.rays_d[ray]
         return reference.contract(self.field.to_grid(x))
 
-    def colour_loss(self, error: Float[Tensor, "n"], batch: Batch) -> Float[Tensor, ""]:
-        """Mean squared error of the colours, without what is taken for transient."""
+    def colour_loss(
+        self, error: Float[Tensor, "n"], batch: Batch
+    ) -> tuple[Float[Tensor, ""], Batch]:
+        """Mean squared error of the colours, without what is taken for transient.
+
+        Also the batch without labels and relative depth there: they are of the passer-by.
+        """
         price = self.settings.losses.transient
         if not price or self.progress <= REFINE_AT:
-            return error.mean()
+            return error.mean(), batch
         # As long as all is wrong, nothing stands out.
         price = max(price, OUTSTANDING * self.error)
         # What can move is suspected sooner; but a word alone removes nothing.
         movable = (batch.label == PERSON) | (batch.label == VEHICLE)
         prices = torch.where(movable, price * SUSPECT, price)
-        return losses.masked_colour_loss(error, self.masks(batch.image, batch.place), prices)
+        mask = self.masks(batch.image, batch.place)
+        gone = mask.detach() > 0.5
+        label = batch.label.masked_fill(gone, UNKNOWN)
+        relative = None if batch.relative is None else batch.relative.masked_fill(gone, torch.nan)
+        stays = replace(batch, label=label, relative=relative)
+        return losses.masked_colour_loss(error, mask, prices), stays
 
     def geometry_loss(
         self,
@@ -277,10 +288,10 @@ class Fitting:
             if self.settings.opaque_sky:
                 loss = loss + weigh.sky * losses.far_sky_loss(distance, batch.is_sky)
             else:
-                agreed = self.agreed_sky(batch, mean_distance.detach(), left.detach())
+                which = self.sky_samples(batch, samples, weights.detach())
                 # Leaves against the sky come first, clean edges last: too early, crowns are lost.
                 grown = min(1.0, max(SKY_AT_FIRST, 2 * self.progress - 0.5))
-                loss = loss + grown * weigh.sky * losses.sky_loss(left, agreed)
+                loss = loss + grown * weigh.sky * losses.sky_loss(weights[which], n)
         solid = left.detach() < 0.5
         z = (mean_distance * batch.cosine).clamp_min(1e-3)  # of rays without matter: not counted
         m = batch.in_line.shape[0]
@@ -299,20 +310,20 @@ class Fitting:
             )
         return loss
 
-    def agreed_sky(
-        self, batch: Batch, distance: Float[Tensor, "n"], left: Float[Tensor, "n"]
-    ) -> Float[Tensor, "n"]:
-        """1 for rays labelled sky whose matter other photos see as sky too."""
+    def sky_samples(
+        self, batch: Batch, samples: Samples, weights: Float[Tensor, "s"]
+    ) -> Int[Tensor, "k"]:
+        """Matter on rays labelled sky, where other photos see sky too and no point is known."""
+        ray = samples.ray_index()
+        asked = ((batch.label == SKY)[ray] & (weights > LEAST_WEIGHT)).nonzero()[:, 0]
         witness = self.pixels.witness
         if witness is None or not self.settings.carve:
-            return batch.is_sky
-        asked = ((batch.label == SKY) & (left < ASKED_LEFT)).nonzero()[:, 0]
-        x = batch.rays_o.detach()[asked] + (
-            distance[asked, None] * self.field.unit * batch.rays_d.detach()[asked]
-        )
-        agreed = torch.zeros_like(left)
-        agreed[asked] = witness.agreed(x, torch.zeros(asked.shape[0])).float()
-        return agreed
+            return asked
+        own = ray[asked]
+        x = batch.rays_o.detach()[own] + samples.t[asked, None] * batch.rays_d.detach()[own]
+        agreed = witness.agreed(x, torch.zeros(asked.shape[0]))
+        cells, _ = self.field._cells(self.field.to_grid(x))
+        return asked[agreed & ~self.held.view(-1)[cells]]
 
     def surface_loss(
         self,
@@ -340,6 +351,7 @@ class Fitting:
             at = samples.t[index[some], None]
             q = self.field.to_grid(batch.rays_o.detach()[of] + at * batch.rays_d.detach()[of])
             if weigh.normals:
+                self.field.learned[0] = self.progress > NORMALS_AT
                 target = self.field.density_normal(q)
                 loss = loss + weigh.normals * losses.normal_loss(own, normal, target, n)
             if weigh.bend:
@@ -409,11 +421,14 @@ class Fitting:
         # The drawn shares sum to the ray's opacity on average only; made to sum to it, they are far
         # less noisy.
         drawn = torch.zeros(n).index_add(0, ray, share.detach())
+        # 1e-3: rays of which nothing was drawn, 0/0.
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
         sky = self.field.sky_colour(batch.rays_d, appearance)
         if self.knows_sky:
-            # It learns from its own pixels alone; then it may learn fast, and in detail.
-            sky = scale_gradient(sky, batch.is_sky[:, None])
+            # It learns from its own pixels; then it may learn fast, and in detail. What nobody has
+            # labelled may be sky, and would have to be painted with matter else.
+            unknown = SKY_SHARES[self.progress > REFINE_AT] * (batch.label == UNKNOWN)
+            sky = scale_gradient(sky, (batch.is_sky + unknown)[:, None])
         return own + left[:, None] * sky
 
     def bar_sky(self, everywhere: bool = True) -> None:
@@ -423,6 +438,8 @@ class Fitting:
             everywhere: ask of all cells; else of those that are occupied, which is quicker.
         """
         witness, occupancy = self.pixels.witness, self.field.occupancy
+        # Cells in which sparse points lie.
+        self.held = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
         if witness is None or not self.settings.carve:
             return
         cells = torch.arange(occupancy.occupied.numel())
@@ -436,10 +453,9 @@ class Fitting:
         barred[cells] = True
         if self.points is not None:
             ends = self.points.rays_o + self.points.depth[:, None] * self.points.rays_d
-            held = torch.zeros_like(occupancy.occupied, dtype=torch.float32)
             cells, inside = self.field._cells(self.field.to_grid(ends))
-            held.view(-1)[cells[inside]] = 1.0
-            near = torch.nn.functional.max_pool3d(held[:, None], 3, stride=1, padding=1)
+            self.held.view(-1)[cells[inside]] = True
+            near = torch.nn.functional.max_pool3d(self.held[:, None].float(), 3, 1, padding=1)
             barred[near.view(-1) > 0] = False
         occupancy.occupied.view(-1)[barred] = 0
 
@@ -500,7 +516,6 @@ TRIPLE_SHARE = 1 / 6  # of the rays that are the middle of three in a line
 SKY_AT_FIRST = 0.2  # of the sky loss's weight, whole from three quarters of the fit
 EDGE_SHARE = 0.1  # of the other rays that are drawn from the sky's edges, late in the fit
 SKY_LOOKS = 64  # directions in which the sky is filled, a step
-ASKED_LEFT = 0.999  # rays with more light left have no matter to speak of
 OUTSTANDING = 6.0  # times the mean error: the least price of a mask
 SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
@@ -511,3 +526,4 @@ MAX_STEP_SCALE = 8.0
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
 FINE_AT = 0.8  # progress from which steps are as fine as when rendering
 REFINE_AT = 0.25  # progress at which occupancy cells are halved
+NORMALS_AT = 0.35  # progress from which predicted normals, learned since then, are shown

@@ -72,9 +72,9 @@ def solid_loss(transmittance: Float[Tensor, "n"], below: Bool[Tensor, "n"]) -> F
     return (transmittance.square() * below).mean()
 
 
-def sky_loss(transmittance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Mean opacity of rays labelled sky: the sky has no density."""
-    return ((1.0 - transmittance) * is_sky).mean()
+def sky_loss(weights: Float[Tensor, "k"], rays: int) -> Float[Tensor, ""]:
+    """Mean over rays of the weights of matter that stands in the sky: the sky has no density."""
+    return weights.sum() / rays
 
 
 def far_sky_loss(distance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Float[Tensor, ""]:

@@ -54,6 +54,7 @@ class RelativeDepth:
         n, x, d, xx, xd, dd = self.sums.unbind(-1)
         safe = n.clamp_min(1e-9)  # no rays yet: 0/0
         variance_x, variance_d = xx / safe - (x / safe) ** 2, dd / safe - (d / safe) ** 2
+        # 1e-12: of an image without rays yet, or of which all are equally far, 0/0.
         scale = (xd / safe - x * d / safe**2) / variance_x.clamp_min(1e-12)
         shift = d / safe - scale * x / safe
         # Nearer must be larger: a scene that stands inside out says nothing yet.

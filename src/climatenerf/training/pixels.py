@@ -104,7 +104,7 @@ class TrainingPixels:
         self.relative = None
         if relative is not None and any(each is not None for each in relative):
             flat = [
-                np.full(int(n), np.nan, np.float16) if each is None else each.reshape(-1)
+                np.full(int(n), np.nan, np.float16) if each is None else in_units(each).reshape(-1)
                 for each, n in zip(relative, counts, strict=True)
             ]
             self.relative = torch.from_numpy(np.concatenate(flat).astype(np.float16))
@@ -204,6 +204,12 @@ class TrainingPixels:
             inside = inside & self.usable[start - shift] & self.usable[start + shift]
             shift = shift * inside
         return within - shift, within + shift, inside
+
+
+def in_units(relative: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Relative depth with 1 as its largest value: its scale is free, and half floats are not."""
+    largest = np.max(np.abs(relative), where=np.isfinite(relative), initial=0.0)
+    return relative / largest if largest > 0 else relative
 
 
 def sky_edge(label: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -25,7 +25,7 @@ from climatenerf.scene.images import (
     load_mask,
     load_relative_depth,
 )
-from climatenerf.scene.scene import Scene, View, load_scene, save_scene
+from climatenerf.scene.scene import Scene, load_scene, save_scene
 from climatenerf.storage import (
     atomic_path,
     check_schema,
@@ -120,14 +120,13 @@ def fit_scene(
     write_json(run / "config.json", _config(settings, downscale, fitting.field))
     save_scene(with_corrections(scene, fitting), run)
 
-    watch = views[len(views) // 2]
     last = {"checkpoint": time.monotonic(), "preview": time.monotonic()}
 
     def after_step(state: Report) -> None:
         report(state)
         now = time.monotonic()
         if now - last["preview"] > PREVIEW_EVERY:
-            save_preview(fitting.field, scene, watch, run / "previews", state.step)
+            save_preview(fitting.field, with_corrections(scene, fitting), run, state.step)
             last["preview"] = time.monotonic()
         if now - last["checkpoint"] > CHECKPOINT_EVERY:
             checkpoint(fitting, run)
@@ -143,7 +142,7 @@ def fit_scene(
     checkpoint(fitting, run)
     scene = with_corrections(scene, fitting)
     save_scene(scene, run)
-    save_preview(fitting.field, scene, watch, run / "previews", fitting.steps)
+    save_preview(fitting.field, scene, run, fitting.steps)
     metrics = {
         "seconds": round(fitting.seconds, 1),
         "steps": fitting.steps,
@@ -326,15 +325,17 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
     fitting.seconds, fitting.step_scale, fitting.error = state["floats"].tolist()
 
 
-def save_preview(field: Field, scene: Scene, view: View, folder: Path, step: int) -> None:
-    """A small picture: the field's rendering beside the photo it is fitted to."""
+def save_preview(field: Field, scene: Scene, run: Path, step: int) -> None:
+    """A small picture of a run: the field's rendering beside a photo that it is fitted to."""
+    views = scene.of_split("train")
+    view = views[len(views) // 2]
     camera = scene.cameras[view.camera]
     small = camera.resized(PREVIEW_WIDTH, round(PREVIEW_WIDTH * camera.height / camera.width))
     with torch.no_grad():
         picture = render_view(field, small, scene.c2w_world(view))
     photo = _resized(load_image(view, scene), small)
     pair = np.concatenate([(picture * 255 + 0.5).astype(np.uint8), photo], axis=1)
-    with atomic_path(folder / f"step_{step:06d}.jpg") as path:
+    with atomic_path(run / "previews" / f"step_{step:06d}.jpg") as path:
         Image.fromarray(pair).save(path, quality=90)
 
 

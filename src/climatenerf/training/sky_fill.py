@@ -18,6 +18,7 @@ from climatenerf.training.pixels import TrainingPixels
 ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of its sine, azimuth
 LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
 LOOKS = 400_000  # pixels that are looked at
+LEAST_LOOKS = 3  # of them for a cell to be seen: a single one may be labelled wrongly
 SPREADS = 400  # rounds of spreading, over some 20 cells; what lies farther stays near the mean
 
 
@@ -50,7 +51,7 @@ def direction(row: Float[Tensor, "n"], column: Float[Tensor, "n"]) -> Float[Tens
 
 
 def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | None:
-    """The sky of all photos on a map, and its gaps filled; None if no photo shows sky."""
+    """The sky of all photos on a map, and its gaps filled; None if hardly a photo shows sky."""
     batch = pixels.draw(LOOKS, generator)
     sky = (batch.label == SKY) & (batch.rays_d[:, 2] > LOWEST)
     if not bool(sky.any()):
@@ -62,7 +63,9 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | No
     cell = row * COLUMNS + column
     total = torch.zeros(ROWS * COLUMNS, 3).index_add(0, cell, colour)
     count = torch.bincount(cell, minlength=ROWS * COLUMNS).float()
-    seen = (count > 0).view(ROWS, COLUMNS)
+    seen = (count >= LEAST_LOOKS).view(ROWS, COLUMNS)
+    if not bool(seen.any()):
+        return None
     known = (total / count.clamp_min(1)[:, None]).view(ROWS, COLUMNS, 3)
     return SkyFill(spread(known, seen), ~seen)
 
@@ -70,7 +73,7 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | No
 def spread(
     known: Float[Tensor, "rows columns 3"], seen: Bool[Tensor, "rows columns"]
 ) -> Float[Tensor, "rows columns 3"]:
-    """Unseen cells as the mean of their neighbours (Laplace's equation), seen ones as they are."""
+    """Unseen cells as the mean of their neighbours on the map, seen ones as they are."""
     held = seen[..., None]
     colour = torch.where(held, known, known[seen].mean(0))
     for _ in range(SPREADS):

@@ -56,9 +56,7 @@ class SkyWitness:
             self.sizes,
             self.pinholes,
             self.c2w,
-            LEAST_VOICES,
-            LEAST_SHARE,
-            self.apart,
+            (LEAST_VOICES, LEAST_SHARE, self.apart),
             out.numpy(),
         )
         return out
