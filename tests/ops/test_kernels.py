@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops import cpu, dispatch, reference
+from climatenerf.ops import dispatch, reference
 
 
 @pytest.fixture
@@ -92,8 +92,7 @@ def network(generator, inputs, width):
         (torch.randn(inputs, width, generator=generator) * 0.3, torch.randn(width) * 0.1),
         (torch.randn(width, 1, generator=generator) * 0.3, torch.zeros(1)),
     ]
-    (w1, b1), (w2, b2) = layers
-    return layers, (w1.numpy(), b1.numpy(), w2[:, 0].numpy().copy(), np.float32(b2[0]))
+    return layers, [p for pair in layers for p in pair]
 
 
 def test_density_matches_the_twin_inside_and_outside_the_core(generator):
@@ -101,8 +100,7 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
     layers, plain = network(generator, 8, 16)
     q = torch.randn(500, 3, generator=generator) * 2
     q[0] = 0.0
-    out = torch.empty(500)
-    cpu.density_at(q.numpy(), table.numpy(), resolutions.numpy(), *plain, out.numpy())
+    out = dispatch.density(q, (table, resolutions, *plain))
     twin = reference.density(
         q.double(), table.double(), resolutions, [(w.double(), b.double()) for w, b in layers]
     )
@@ -110,29 +108,15 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
     assert torch.isfinite(out).all()
 
 
-def marched(*arguments):
-    """What `cpu.march` finds: samples per ray, and t, dt, sigma packed [3, samples]."""
-    n = arguments[0].shape[0]
-    rows = np.empty((3, -(-n // cpu.RAY_BLOCK), cpu.RAY_BLOCK * 1024), np.float32)
-    counts = cpu.march(*arguments, rows)
-    packed = np.zeros((3, counts.sum()), np.float32)
-    cpu.pack(rows, np.concatenate([[0], counts.cumsum()]), packed)
-    return counts, packed
-
-
 @pytest.mark.parametrize(("side", "skip", "share"), [(8, 1, 0.3), (32, 8, 0.002), (32, 8, 0.0)])
-def test_marching_matches_the_twin(generator, side, skip, share):
+def test_marching_matches_the_twin(generator, monkeypatch, side, skip, share):
     table, resolutions = grid(generator)
     layers, plain = network(generator, 8, 16)
-    net = (table.numpy(), resolutions.numpy(), *plain)
     occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
     occupied[0, -skip:] = 1  # the finest cells at one side, whatever the share
     blocks = occupied.unfold(1, skip, skip).unfold(2, skip, skip).unfold(3, skip, skip)
-    blocks = blocks.amax((-3, -2, -1)).numpy()
-    if skip == 8:
-        words, own = occupied.numpy().view(np.uint64), np.full_like(blocks, 7)
-        cpu.occupied_blocks(words, own)
-        assert (own == blocks).all()
+    blocks = blocks.amax((-3, -2, -1))
+    assert torch.equal(dispatch.occupied_blocks(occupied), blocks)
     n = 60
     o = torch.randn(n, 3, generator=generator)
     d = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
@@ -142,17 +126,16 @@ def test_marching_matches_the_twin(generator, side, skip, share):
     near, far = torch.full((n,), 0.05), torch.full((n,), 1e9)
     far[2] = 0.5
     steps = (0.05, 0.02)
-    counts, packed_samples = marched(
-        o.numpy(),
-        d.numpy(),
-        near.numpy(),
-        far.numpy(),
-        jitter.numpy(),
-        (occupied.numpy(), blocks),
+    monkeypatch.setattr(dispatch, "CPU_RAYS", 32)  # in two parts
+    offsets, found = dispatch.march(
+        (o, d),
+        torch.stack([near, far, jitter], dim=-1),
+        (occupied, blocks),
         steps,
         1e-3,
-        net,
+        (table, resolutions, *plain),
     )
+    counts, packed_samples = offsets.diff().numpy(), found.numpy()
     agree = 0
     for r in range(n):
         twin = reference.march(
@@ -177,20 +160,20 @@ def test_marching_matches_the_twin(generator, side, skip, share):
 
 def test_a_ray_ends_where_it_is_opaque_and_cells_that_are_empty_give_no_samples(generator):
     table, resolutions = grid(generator)
-    _, plain = network(generator, 8, 16)
-    net = (table.numpy(), resolutions.numpy(), *plain[:3], np.float32(6.0))  # dense everywhere
-    o, d = np.zeros((1, 3), np.float32), np.array([[1.0, 0, 0]], np.float32)
-    bounds = np.zeros(1, np.float32), np.full(1, 1e9, np.float32), np.zeros(1, np.float32)
-    for fill, expected in ((0, 0), (1, None)):
-        occupied = np.full((2, 8, 8, 8), fill, np.uint8)
-        counts, (_, dt, sigma) = marched(
-            o, d, *bounds, (occupied, occupied), (0.01, 0.0), 1e-3, net
+    _, (w1, b1, w2, _) = network(generator, 8, 16)
+    net = (table, resolutions, w1, b1, w2, torch.full((1,), 6.0))  # dense everywhere
+    rays = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0]])
+    for fill in (0, 1):
+        occupied = torch.full((2, 8, 8, 8), fill, dtype=torch.uint8)
+        span = torch.tensor([[0.0, 1e9, 0.0]])
+        offsets, (_, dt, sigma) = dispatch.march(
+            rays, span, (occupied, occupied), (0.01, 0.0), 1e-3, net
         )
-        if expected is not None:
-            assert counts[0] == expected
-        else:
+        if fill:
             tau = dt * sigma
             assert tau.sum() >= -np.log(1e-3) > tau[:-1].sum()
+        else:
+            assert offsets.tolist() == [0, 0]
 
 
 def test_weights_and_their_gradient_match_the_twin(generator):

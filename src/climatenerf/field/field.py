@@ -19,14 +19,12 @@ from climatenerf.field.colour_space import decode_srgb
 from climatenerf.field.directions import spherical_harmonics
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
-from climatenerf.ops import cpu, dispatch, reference
+from climatenerf.ops import dispatch, reference
 from climatenerf.render.samples import Samples
 from climatenerf.scene.classes import SOLID
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
 STEP_CONE = 1.0 / 160  # marching step per length travelled
-CAPACITY = 1024  # samples a ray may have; a ray across all cascades takes 850 whole steps
-MARCHED_AT_ONCE = 2048  # rays; a multiple of cpu.RAY_BLOCK
 
 
 def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
@@ -160,24 +158,14 @@ class Field(nn.Module):
 
     # --- geometry ----------------------------------------------------------------------------
 
-    def _net(self) -> tuple:
-        """The geometry network as the kernels take it."""
-        w1, b1, w2, b2 = (p.detach().numpy() for p in self.geometry_net)
-        return (
-            self.geometry_grid.detach().numpy(),
-            self.geometry_resolutions.numpy(),
-            w1,
-            b1,
-            np.ascontiguousarray(w2[:, 0]),
-            np.float32(b2[0]),
-        )
+    def _net(self) -> dispatch.Net:
+        """The density's encoding and network."""
+        w1, b1, w2, b2 = self.geometry_net
+        return self.geometry_grid, self.geometry_resolutions, w1, b1, w2, b2
 
     def grid_density(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Density (1/grid unit) at positions in grid units, without gradient."""
-        out = torch.empty(q.shape[0])
-        table, resolutions, w1, b1, w2, b2 = self._net()
-        cpu.density_at(q.contiguous().numpy(), table, resolutions, w1, b1, w2, b2, out.numpy())
-        return out
+        return dispatch.density(q, self._net())
 
     @torch.no_grad()
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -223,52 +211,24 @@ class Field(nn.Module):
             jitter: share of the first step by which each ray's comb is shifted; default 0.
             stop: transmittance at which a ray ends.
         """
-        n = rays_o.shape[0]
         if jitter is None:
-            jitter = torch.zeros(n)
-        q, d = self.to_grid(rays_o).contiguous().numpy(), rays_d.contiguous().numpy()
-        start, end = ((x / self.unit).contiguous().numpy() for x in (t_min, t_max))
-        comb, cells, net = jitter.numpy(), self.occupancy.cells(), self._net()
-        offsets = np.zeros(n + 1, np.int64)
-        # Few rays at a time into the same room: fresh memory for all would cost more than marching.
-        rows = np.empty((3, MARCHED_AT_ONCE // cpu.RAY_BLOCK, cpu.RAY_BLOCK * CAPACITY), np.float32)
-        parts = []
-        for first in range(0, n, MARCHED_AT_ONCE):
-            some = slice(first, first + MARCHED_AT_ONCE)
-            counts = cpu.march(
-                q[some],
-                d[some],
-                start[some],
-                end[some],
-                comb[some],
-                cells,
-                (STEP_MIN * step_scale, STEP_CONE * step_scale),
-                stop,
-                net,
-                rows,
-            )
-            own = np.zeros(counts.shape[0] + 1, np.int64)
-            np.cumsum(counts, out=own[1:])
-            offsets[first : first + own.shape[0]] = offsets[first] + own
-            packed = np.empty((3, own[-1]), np.float32)
-            cpu.pack(rows, own, packed)
-            parts.append(packed)
-        t, dt, sigma = torch.from_numpy(np.concatenate(parts, axis=1))
-        return Samples(torch.from_numpy(offsets), t * self.unit, dt * self.unit, sigma / self.unit)
+            jitter = torch.zeros_like(t_min)
+        offsets, (t, dt, sigma) = dispatch.march(
+            (self.to_grid(rays_o), rays_d),
+            torch.stack([t_min / self.unit, t_max / self.unit, jitter], dim=-1),
+            self.occupancy.cells(),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale),
+            stop,
+            self._net(),
+        )
+        return Samples(offsets, t * self.unit, dt * self.unit, sigma / self.unit)
 
     def sample_positions(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], samples: Samples
     ) -> Float[Tensor, "s 3"]:
         """Unit-cube coordinates of samples."""
-        u = torch.empty(samples.t.shape[0], 3)
-        cpu.grid_positions(
-            self.to_grid(rays_o).contiguous().numpy(),
-            rays_d.contiguous().numpy(),
-            samples.offsets.numpy(),
-            (samples.t / self.unit).contiguous().numpy(),
-            u.numpy(),
-        )
-        return u
+        rays = (self.to_grid(rays_o), rays_d)
+        return dispatch.positions(rays, samples.offsets, samples.t / self.unit)
 
     def raw_density(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Logarithm of the density per contracted length at unit-cube coordinates."""
@@ -421,11 +381,7 @@ class Field(nn.Module):
             d: unit directions from the eye, one a position or (with `ray`) one a ray.
             ray: the row of d for each position.
         """
-        u = torch.empty(x.shape[0], 3)
-        one_each = np.arange(x.shape[0] + 1)
-        zero = np.zeros(x.shape[0], np.float32)
-        q = self.to_grid(x).contiguous().numpy()
-        cpu.grid_positions(q, q, one_each, zero, u.numpy())
+        u = reference.contract(self.to_grid(x))
         rows = torch.arange(x.shape[0]) if ray is None else ray
         return self.colour_at(u, rows, d, self.shown_embedding.expand(d.shape[0], -1))
 

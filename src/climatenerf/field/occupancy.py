@@ -6,12 +6,11 @@ as steps do. Marching looks only where a cell is occupied.
 
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.ops import cpu
+from climatenerf.ops import dispatch
 
 OPACITY = 0.3  # of a crossed cell
 
@@ -43,14 +42,9 @@ class Occupancy(torch.nn.Module):
         """Cells along an edge."""
         return self.density.shape[1]
 
-    def cells(self) -> tuple[np.ndarray, np.ndarray]:
+    def cells(self) -> dispatch.Cells:
         """What marching reads: which cells are occupied, and which blocks of cells hold one."""
-        occupied = self.occupied.numpy()
-        if self.side % 32:  # a block would reach into the cube of the next finer cascade
-            return occupied, occupied
-        blocks = np.empty((occupied.shape[0], *3 * (self.side // 8,)), np.uint8)
-        cpu.occupied_blocks(occupied.view(np.uint64), blocks)
-        return occupied, blocks
+        return self.occupied, dispatch.occupied_blocks(self.occupied)
 
     def cell_centres(self, cells: Int[Tensor, "n"]) -> tuple[Tensor, Tensor]:
         """Centre (grid units) and side of cells given by flat index."""

@@ -203,8 +203,9 @@ def _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden):
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def density_at(q, table, resolutions, w1, b1, w2, b2, out):
+def density_at(q, net, out):
     """Density (1/grid unit) at q [n,3] in grid units → out [n]."""
+    table, resolutions, w1, b1, w2, b2 = net
     n = q.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         hidden = np.empty(w1.shape[1], np.float32)
@@ -239,15 +240,15 @@ def _cell_exit(o, inv, index, cell, half):
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
+def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     """Marches rays front to back through occupied space, evaluating density on the way.
 
-    Args: rays [n,3] in grid units, t_min, t_max, jitter [n]; cells = (occupied [K,G,G,G] uint8,
-    the same for blocks of 2^n cells a side), cascade k covers the cube of half side 2^k;
-    steps = (smallest step, step per length);
+    Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
+    cells = (occupied [K,G,G,G] uint8, the same for blocks of 2^n cells a side), cascade k covers
+    the cube of half side 2^k; steps = (smallest step, step per length);
     stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
     rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
-    samples one after the other, to be packed. Returns counts [n], the samples written per ray.
+    samples one after the other, to be packed. counts [n] receive the samples written per ray.
     """
     table, resolutions, w1, b1, w2, b2 = net
     occupied, blocks = cells
@@ -255,7 +256,6 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
     cascades, side = occupied.shape[0], occupied.shape[1]
     shift = int(np.log2(side // blocks.shape[1]))  # >> is quicker than //
     capacity = rows.shape[2] // RAY_BLOCK
-    counts = np.zeros(n, np.int64)
     far = np.float32(2.0 ** (cascades - 1))
     dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
     log_stop = np.float32(-np.log(stop))
@@ -271,7 +271,7 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
             ivy = np.float32(1.0) / dy if dy != 0 else big
             ivz = np.float32(1.0) / dz if dz != 0 else big
             # Clip to the outermost cube.
-            t, end = t_min[r], t_max[r]
+            t, end = spans[r, 0], spans[r, 1]
             for o, d, iv in ((ox, dx, ivx), (oy, dy, ivy), (oz, dz, ivz)):
                 if d == 0:
                     if o < -far or o > far:
@@ -282,7 +282,7 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
                     end = min(end, max(ta, tb))
             tau = np.float32(0.0)
             first = k
-            t += jitter[r] * max(dt_min, cone * t)
+            t += spans[r, 2] * max(dt_min, cone * t)
             while t < end and k - first < capacity and tau < log_stop:
                 dt = min(max(dt_min, cone * t), end - t)
                 tm = t + np.float32(0.5) * dt
@@ -320,7 +320,6 @@ def march(rays_o, rays_d, t_min, t_max, jitter, cells, steps, stop, net, rows):
                 skip = np.ceil((leave - tm) / dt)
                 t += dt * max(skip, np.float32(1.0))
             counts[r] = k - first
-    return counts
 
 
 @njit(cache=True, parallel=True)

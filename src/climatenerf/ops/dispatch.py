@@ -1,30 +1,56 @@
 """The operations as the rest of the program calls them: one function each, with gradients.
 
-The device of the tensors decides the kernel. CPU tensors of 32 bits go to Numba (`cpu.py`);
-everything else goes to the reference, which is slow and always right.
+The device of the tensors decides the kernel. Those of 32 bits go to Numba on a CPU (`cpu.py`), to
+Numba-CUDA on an NVIDIA GPU (`gpu.py`, the same functions); all others go to the reference, which is
+slow and always right.
 """
+
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.ops import cpu, cpu_network, reference
 
 
-def _fast(*tensors: Tensor) -> bool:
-    return all(t.device.type == "cpu" and t.dtype in (torch.float32, torch.int64) for t in tensors)
+def _kernels(*tensors: Tensor) -> ModuleType | None:
+    """The module with the kernels for these tensors; None: the reference takes them."""
+    if not all(t.dtype in (torch.float32, torch.int64) for t in tensors):
+        return None
+    devices = {t.device.type for t in tensors}
+    if devices == {"cpu"}:
+        return cpu
+    if devices == {"cuda"}:
+        from climatenerf.ops import gpu  # where there is no GPU, its libraries need not load
+
+        return gpu
+    return None
 
 
-def _np(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
+def _array(tensor: Tensor) -> Any:
+    """A tensor's numbers as kernels take them; a copy if they do not lie in order."""
+    tensor = tensor.detach().contiguous()
+    if tensor.is_cuda:
+        from numba import cuda
+
+        return cuda.as_cuda_array(tensor)
+    return tensor.numpy()
+
+
+CAPACITY = 1024  # samples a ray may have; a ray across all cascades takes 850 whole steps
+CPU_RAYS = 2048  # marched at once; a multiple of cpu.RAY_BLOCK
+GPU_RAYS = 2**15  # the same; the room for their samples takes 12 kB a ray
 
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, u, table, resolutions):
-        out = torch.empty(2 * table.shape[0], u.shape[0])
-        cpu.hash_encode(_np(u), _np(table), _np(resolutions), out.numpy())
+    def forward(ctx, u, table, resolutions, kernels):
+        out = u.new_empty(2 * table.shape[0], u.shape[0])
+        kernels.hash_encode(_array(u), _array(table), _array(resolutions), _array(out))
+        ctx.kernels = kernels
         ctx.save_for_backward(u, resolutions)
         ctx.table = table
         return out.T
@@ -35,18 +61,20 @@ class _HashEncode(torch.autograd.Function):
         table = ctx.table
         grad_u = None
         if ctx.needs_input_grad[0]:
-            grad_u = torch.empty_like(u)
-            cpu.hash_encode_slopes(
-                _np(u), _np(grad.T), _np(table), _np(resolutions), grad_u.numpy()
+            grad_u = torch.empty_like(u, memory_format=torch.contiguous_format)
+            ctx.kernels.hash_encode_slopes(
+                _array(u), _array(grad.T), _array(table), _array(resolutions), _array(grad_u)
             )
         if not ctx.needs_input_grad[1]:
-            return grad_u, None, None
+            return grad_u, None, None, None
         # A buffer kept on the table saves zeroing and copying megabytes each step: the optimiser
         # clears what it has used (training/optimiser.py).
         buffer = getattr(table, "grad_buffer", None)
         target = torch.zeros_like(table) if buffer is None else buffer
-        cpu.hash_encode_backward(_np(u), _np(grad.T), _np(resolutions), target.numpy())
-        return grad_u, (target if buffer is None else None), None
+        ctx.kernels.hash_encode_backward(
+            _array(u), _array(grad.T), _array(resolutions), _array(target)
+        )
+        return grad_u, (target if buffer is None else None), None, None
 
 
 def hash_encode(
@@ -55,16 +83,17 @@ def hash_encode(
     resolutions: Int[Tensor, "levels"],
 ) -> Float[Tensor, "n features"]:
     """See `reference.hash_encode`; gradients to the table and to the positions (once)."""
-    if _fast(u, table):
-        return _HashEncode.apply(u, table, resolutions)
+    if kernels := _kernels(u, table):
+        return _HashEncode.apply(u, table, resolutions, kernels)
     return reference.hash_encode(u, table, resolutions)
 
 
 class _RenderWeights(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, tau, offsets):
-        weights, left = torch.empty_like(tau), torch.empty(offsets.shape[0] - 1)
-        cpu.weights_forward(_np(tau), _np(offsets), weights.numpy(), left.numpy())
+    def forward(ctx, tau, offsets, kernels):
+        weights, left = torch.empty_like(tau), tau.new_empty(offsets.shape[0] - 1)
+        kernels.weights_forward(_array(tau), _array(offsets), _array(weights), _array(left))
+        ctx.kernels = kernels
         ctx.save_for_backward(tau, offsets)
         return weights, left
 
@@ -72,51 +101,55 @@ class _RenderWeights(torch.autograd.Function):
     def backward(ctx, grad_w, grad_t):
         tau, offsets = ctx.saved_tensors
         grad = torch.empty_like(tau)
-        cpu.weights_backward(_np(tau), _np(offsets), _np(grad_w), _np(grad_t), grad.numpy())
-        return grad, None
+        ctx.kernels.weights_backward(
+            _array(tau), _array(offsets), _array(grad_w), _array(grad_t), _array(grad)
+        )
+        return grad, None, None
 
 
 def render_weights(
     tau: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]
 ) -> tuple[Float[Tensor, "s"], Float[Tensor, "rays"]]:
     """See `reference.render_weights`."""
-    if _fast(tau, offsets):
-        return _RenderWeights.apply(tau, offsets)
+    if kernels := _kernels(tau, offsets):
+        return _RenderWeights.apply(tau.contiguous(), offsets, kernels)
     return reference.render_weights(tau, offsets)
 
 
 class _Accumulate(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weights, values, offsets):
-        out = torch.empty(offsets.shape[0] - 1, values.shape[1])
-        cpu.accumulate_forward(_np(weights), _np(values), _np(offsets), out.numpy())
+    def forward(ctx, weights, values, offsets, kernels):
+        out = values.new_empty(offsets.shape[0] - 1, values.shape[1])
+        kernels.accumulate_forward(_array(weights), _array(values), _array(offsets), _array(out))
+        ctx.kernels = kernels
         ctx.save_for_backward(weights, values, offsets)
         return out
 
     @staticmethod
     def backward(ctx, grad):
         weights, values, offsets = ctx.saved_tensors
-        grad_w, grad_v = torch.empty_like(weights), torch.empty(values.shape)
-        cpu.accumulate_backward(
-            _np(weights), _np(values), _np(offsets), _np(grad), grad_w.numpy(), grad_v.numpy()
+        grad_w, grad_v = torch.empty_like(weights), values.new_empty(values.shape)
+        ctx.kernels.accumulate_backward(
+            *map(_array, (weights, values, offsets, grad, grad_w, grad_v))
         )
-        return grad_w, grad_v, None
+        return grad_w, grad_v, None, None
 
 
 def accumulate(
     weights: Float[Tensor, "s"], values: Float[Tensor, "s c"], offsets: Int[Tensor, "rays+1"]
 ) -> Float[Tensor, "rays c"]:
     """See `reference.accumulate`."""
-    if _fast(weights, values, offsets):
-        return _Accumulate.apply(weights, values, offsets)
+    if kernels := _kernels(weights, values, offsets):
+        return _Accumulate.apply(weights.contiguous(), values, offsets, kernels)
     return reference.accumulate(weights, values, offsets)
 
 
 class _Distortion(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, weights, s, ds, offsets):
-        out = torch.empty(offsets.shape[0] - 1)
-        cpu.distortion_forward(_np(weights), _np(s), _np(ds), _np(offsets), out.numpy())
+    def forward(ctx, weights, s, ds, offsets, kernels):
+        out = weights.new_empty(offsets.shape[0] - 1)
+        kernels.distortion_forward(*map(_array, (weights, s, ds, offsets, out)))
+        ctx.kernels = kernels
         ctx.save_for_backward(weights, s, ds, offsets)
         return out
 
@@ -124,10 +157,8 @@ class _Distortion(torch.autograd.Function):
     def backward(ctx, grad):
         weights, s, ds, offsets = ctx.saved_tensors
         grad_w = torch.empty_like(weights)
-        cpu.distortion_backward(
-            _np(weights), _np(s), _np(ds), _np(offsets), _np(grad), grad_w.numpy()
-        )
-        return grad_w, None, None, None
+        ctx.kernels.distortion_backward(*map(_array, (weights, s, ds, offsets, grad, grad_w)))
+        return grad_w, None, None, None, None
 
 
 def distortion(
@@ -137,8 +168,8 @@ def distortion(
     offsets: Int[Tensor, "rays+1"],
 ) -> Float[Tensor, "rays"]:
     """See `reference.distortion`; gradients to the weights only."""
-    if _fast(weights, s, ds, offsets):
-        return _Distortion.apply(weights, s, ds, offsets)
+    if kernels := _kernels(weights, s, ds, offsets):
+        return _Distortion.apply(weights.contiguous(), s, ds, offsets, kernels)
     return reference.distortion(weights, s, ds, offsets)
 
 
@@ -151,13 +182,13 @@ class _Network(torch.autograd.Function):
         rows = torch.empty(0, dtype=torch.long) if row is None else row
         out = torch.empty(w2.shape[1], x.shape[0])
         cpu_network.network_forward(
-            _np(x.T),
-            _np(common),
-            _np(rows),
-            _np(w1.T),
-            _np(b1),
-            _np(w2.T),
-            _np(b2),
+            _array(x.T),
+            _array(common),
+            _array(rows),
+            _array(w1.T),
+            _array(b1),
+            _array(w2.T),
+            _array(b2),
             out.numpy(),
         )
         ctx.save_for_backward(x, common, rows, w1, b1, w2)
@@ -174,10 +205,10 @@ class _Network(torch.autograd.Function):
         grad_x = torch.empty(inputs if ctx.needs_input_grad[0] else 0, x.shape[0])
         grad_shared = torch.zeros_like(common if ctx.needs_input_grad[1] else common[:0])
         cpu_network.network_backward(
-            (_np(x.T), _np(common), _np(rows)),
-            (_np(w1.T), _np(b1), _np(w2.T)),
-            (_np(w1), _np(w2)),
-            _np(grad.T),
+            (_array(x.T), _array(common), _array(rows)),
+            (_array(w1.T), _array(b1), _array(w2.T)),
+            (_array(w1), _array(w2)),
+            _array(grad.T),
             borders,
             (grad_x.numpy(), grad_shared.numpy(), sums1.numpy(), sums2.numpy()),
         )
@@ -200,7 +231,7 @@ def mlp(
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
     """See `reference.mlp`, which deeper networks than those of one hidden layer go to."""
-    if _fast(x) and len(layers) == 2:
+    if _kernels(x) is cpu and len(layers) == 2:  # a GPU's own matrix products are fast
         return _Network.apply(x, shared, row, *layers[0], *layers[1])
     return reference.mlp(x, layers, shared, row)
 
@@ -212,9 +243,141 @@ def merge_order(
     offsets_b: Int[Tensor, "rays+1"],
 ) -> tuple[Int[Tensor, "a+b"], Int[Tensor, "rays+1"]]:
     """See `reference.merge_order`."""
-    if not _fast(t_a, t_b, offsets_a, offsets_b):
+    kernels = _kernels(t_a, t_b, offsets_a, offsets_b)
+    if kernels is None:
         return reference.merge_order(t_a, offsets_a, t_b, offsets_b)
     offsets = offsets_a + offsets_b
-    order = torch.empty(t_a.shape[0] + t_b.shape[0], dtype=torch.long)
-    cpu.merge_order(_np(t_a), _np(offsets_a), _np(t_b), _np(offsets_b), _np(offsets), order.numpy())
+    order = offsets.new_empty(t_a.shape[0] + t_b.shape[0])
+    kernels.merge_order(*map(_array, (t_a, offsets_a, t_b, offsets_b, offsets, order)))
     return order, offsets
+
+
+# --- without gradients ---------------------------------------------------------------------------
+
+Net = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Table and resolutions of an encoding; w1, b1, w2, b2 of the network of one hidden layer on it."""
+Cells = tuple[UInt8[Tensor, "k g g g"], UInt8[Tensor, "k b b b"]]
+
+
+def _cpu_net(net: Net) -> tuple:
+    *rest, w2, b2 = net
+    return *map(_array, rest), _array(w2[:, 0]), np.float32(b2[0].item())
+
+
+@torch.no_grad()
+def density(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n"]:
+    """See `reference.density`, which it is for one hidden layer."""
+    kernels = _kernels(q, *net)
+    if kernels is None:
+        table, resolutions, w1, b1, w2, b2 = net
+        return reference.density(q, table, resolutions, [(w1, b1), (w2, b2)])
+    out = q.new_empty(q.shape[0])
+    if kernels is cpu:
+        kernels.density_at(_array(q), _cpu_net(net), _array(out))
+    else:
+        kernels.density_at(_array(q), tuple(map(_array, net)), _array(out))
+    return out
+
+
+@torch.no_grad()
+def positions(
+    rays: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
+    offsets: Int[Tensor, "n+1"],
+    t: Float[Tensor, "s"],
+) -> Float[Tensor, "s 3"]:
+    """Where packed samples lie in the unit cube (`reference.contract`); lengths in grid units."""
+    kernels = _kernels(*rays, offsets, t)
+    if kernels is None:
+        o, d = (torch.repeat_interleave(each, offsets.diff(), dim=0) for each in rays)
+        return reference.contract(o + t[:, None] * d)
+    u = t.new_empty(t.shape[0], 3)
+    kernels.grid_positions(*map(_array, (*rays, offsets, t, u)))
+    return u
+
+
+def occupied_blocks(occupied: UInt8[Tensor, "k g g g"]) -> UInt8[Tensor, "k b b b"]:
+    """Whether each block of 8 cells a side holds an occupied one."""
+    cascades, side = occupied.shape[:2]
+    if side % 32:  # a block would reach into the cube of the next finer cascade
+        return occupied
+    blocks = occupied.new_empty(cascades, *3 * (side // 8,))
+    if occupied.is_cuda:
+        split = occupied.view(cascades, side // 8, 8, side // 8, 8, side // 8, 8)
+        return torch.amax(split, dim=(2, 4, 6), out=blocks)
+    cpu.occupied_blocks(occupied.numpy().view(np.uint64), blocks.numpy())
+    return blocks
+
+
+@torch.no_grad()
+def adam(
+    parameter: Tensor,
+    gradient: Tensor,
+    moments: tuple[Tensor, Tensor],
+    rate: float,
+    betas: tuple[float, float],
+    epsilon: float,
+    step: int,
+) -> None:
+    """One step of Adam (Kingma & Ba 2015) in place, for tables whose gradients are mostly zero.
+
+    Entries without gradient are left alone with their moments; the gradient is cleared.
+    """
+    kernels = _kernels(parameter, gradient, *moments)
+    if kernels is None:
+        raise TypeError("a table and its moments must be of 32 bits and on one device")
+    corrections = (1.0 - beta**step for beta in betas)
+    scalars = map(np.float32, (rate, *betas, epsilon, *corrections))
+    kernels.adam(*(_array(each.view(-1)) for each in (parameter, gradient, *moments)), *scalars)
+
+
+@torch.no_grad()
+def march(
+    rays: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
+    spans: Float[Tensor, "n 3"],
+    cells: Cells,
+    steps: tuple[float, float],
+    stop: float,
+    net: Net,
+) -> tuple[Int[Tensor, "n+1"], Float[Tensor, "3 s"]]:
+    """See `reference.march`: all rays' samples, packed, and their offsets.
+
+    Args:
+        rays: origins and unit directions, grid units.
+        spans: first and last length of each ray, share of the first step that it begins after.
+        cells: which cells are occupied, and which blocks of cells hold one.
+        steps: the smallest step and the step per length.
+        stop: transmittance at which a ray ends.
+        net: of the density.
+
+    Returns:
+        Offsets; t, dt (grid units) and sigma (1/grid unit) of the samples.
+    """
+    kernels = _kernels(*rays, *net)
+    if kernels is None:
+        raise TypeError("rays and field must be of 32 bits and on one device, CPU or NVIDIA GPU")
+    at_once = CPU_RAYS if kernels is cpu else GPU_RAYS
+    occupied = tuple(map(_array, cells))
+    weights = _cpu_net(net) if kernels is cpu else tuple(map(_array, net))
+    # The room for samples is used again and again: fresh memory would cost more than marching.
+    room = _array(_room(rays[0], at_once, kernels is cpu))
+    counts, parts = [], []
+    for o, d, span in zip(*(x.split(at_once) for x in (*rays, spans)), strict=True):
+        count = o.new_zeros(o.shape[0], dtype=torch.long)
+        kernels.march(
+            _array(o), _array(d), _array(span), occupied, steps, stop, weights, room, _array(count)
+        )
+        offsets = torch.cat([count.new_zeros(1), count.cumsum(0)])
+        part = o.new_empty(3, int(offsets[-1]))
+        kernels.pack(room, _array(offsets), _array(part))
+        counts.append(count)
+        parts.append(part)
+    offsets = torch.cat([counts[0].new_zeros(1), torch.cat(counts).cumsum(0)])
+    return offsets, torch.cat(parts, dim=1)
+
+
+def _room(rays_o: Tensor, at_once: int, by_block: bool) -> Tensor:
+    """Room for the samples of some rays: in blocks of rays, or a column for each."""
+    n = min(at_once, max(rays_o.shape[0], 1))
+    if by_block:
+        return rays_o.new_empty(3, -(-n // cpu.RAY_BLOCK), cpu.RAY_BLOCK * CAPACITY)
+    return rays_o.new_empty(3, CAPACITY, n)

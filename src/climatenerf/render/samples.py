@@ -23,11 +23,11 @@ class Samples:
     def ray_index(self) -> Int[Tensor, "s"]:
         """The ray each sample belongs to."""
         counts = self.offsets[1:] - self.offsets[:-1]
-        return torch.repeat_interleave(torch.arange(counts.shape[0]), counts)
+        return torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
 
 
 def offsets_of(ray: Int[Tensor, "s"], rays: int) -> Int[Tensor, "rays+1"]:
     """Where each ray's samples begin in a packed list whose samples' rays are `ray`, ascending."""
-    offsets = torch.zeros(rays + 1, dtype=torch.long)
+    offsets = torch.zeros(rays + 1, dtype=torch.long, device=ray.device)
     offsets[1:] = torch.bincount(ray, minlength=rays).cumsum(0)
     return offsets

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterable
 
-import numpy as np
 import torch
 
-from climatenerf.ops import cpu
+from climatenerf.ops import dispatch
 
 
 class GridAdam:
@@ -19,26 +18,23 @@ class GridAdam:
         self.tables = list(tables)
         self.epsilon = epsilon
         self.steps = 0
-        self.first = [torch.zeros(t.numel()) for t in self.tables]
-        self.second = [torch.zeros(t.numel()) for t in self.tables]
+        self.first = [torch.zeros(t.numel(), device=t.device) for t in self.tables]
+        self.second = [torch.zeros(t.numel(), device=t.device) for t in self.tables]
         for table in self.tables:
             table.grad_buffer = torch.zeros_like(table.data)  # type: ignore[attr-defined]
 
     def step(self, rate: float, beta1: float = 0.9, beta2: float = 0.99) -> None:
         """One update with learning rate `rate`."""
         self.steps += 1
-        correction1 = 1.0 - beta1**self.steps
-        correction2 = 1.0 - beta2**self.steps
-        scalars = [
-            np.float32(v) for v in (rate, beta1, beta2, self.epsilon, correction1, correction2)
-        ]
-        for table, first, second in zip(self.tables, self.first, self.second, strict=True):
-            cpu.adam(
-                table.data.view(-1).numpy(),
-                table.grad_buffer.view(-1).numpy(),  # type: ignore[attr-defined]
-                first.numpy(),
-                second.numpy(),
-                *scalars,
+        for table, *moments in zip(self.tables, self.first, self.second, strict=True):
+            dispatch.adam(
+                table.data,
+                table.grad_buffer,  # type: ignore[attr-defined]
+                (moments[0], moments[1]),
+                rate,
+                (beta1, beta2),
+                self.epsilon,
+                self.steps,
             )
 
     def state(self) -> dict[str, torch.Tensor]:

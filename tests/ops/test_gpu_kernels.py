@@ -1,0 +1,199 @@
+"""GPU kernels against the twins, in Numba's simulator or, where there is one, on an NVIDIA GPU.
+
+The simulator takes a millisecond a thread or more, hence the small sizes.
+"""
+
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.ops import dispatch, gpu, reference
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+# The simulator's numbers are NumPy's, which warns where a hash's products wrap around.
+pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
+
+
+@pytest.fixture(autouse=True)
+def gpu_kernels(monkeypatch):
+    """All operations by the GPU's kernels."""
+    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: gpu)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(5)
+
+
+def random(generator, *shape):
+    return torch.randn(*shape, generator=generator)
+
+
+def both(operation, twin, *inputs):
+    """Outputs and gradients of an operation on the device and of its twin in double precision."""
+    results = []
+    for run, device, dtype in ((operation, DEVICE, torch.float32), (twin, "cpu", torch.float64)):
+        given = [x.detach().clone().to(device, dtype).requires_grad_() for x in inputs]
+        out = run(*given)
+        out = out if isinstance(out, tuple) else (out,)
+        sum((o * torch.arange(1, o.numel() + 1).view(o.shape).to(o)).sum() for o in out).backward()
+        grads = [x.grad for x in given]
+        results.append([each.detach().cpu().double() for each in (*out, *grads)])
+    return zip(*results, strict=True)
+
+
+def assert_close(pairs, tolerance=1e-5):
+    count = 0
+    for ours, real in pairs:
+        assert ours.shape == real.shape and torch.isfinite(ours).all()
+        assert (ours - real).abs().max() <= tolerance * real.abs().max()
+        count += 1
+    return count
+
+
+def grid(generator):
+    """A level that fits its table and two that are hashed."""
+    return random(generator, 3, 2**8, 2), torch.tensor([4, 11, 37])
+
+
+def test_hash_encoding_with_gradients_to_table_and_positions(generator):
+    table, resolutions = grid(generator)
+    u = torch.rand(12, 3, generator=generator)
+    u[0], u[1] = 0.0, 0.999999
+    pairs = both(
+        lambda u, table: dispatch.hash_encode(u, table, resolutions.to(DEVICE)),
+        lambda u, table: reference.hash_encode(u, table, resolutions),
+        u,
+        table,
+    )
+    assert assert_close(pairs, 1e-4) == 3
+
+
+@pytest.fixture
+def rays(generator):
+    counts = torch.randint(0, 7, (9,), generator=generator)
+    counts[3] = 0
+    return torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
+
+
+def test_compositing(generator, rays):
+    n = int(rays[-1])
+    tau = torch.rand(n, generator=generator) * 3
+    tau[0], tau[1] = 0.0, 40.0
+    weights, values = torch.rand(n, generator=generator), random(generator, n, 3)
+    s, ds = torch.rand(n, generator=generator).sort()[0], torch.full((n,), 0.02)
+    offsets = rays.to(DEVICE)
+    assert assert_close(both(
+        lambda tau: dispatch.render_weights(tau, offsets),
+        lambda tau: reference.render_weights(tau, rays), tau,
+    )) == 3  # fmt: skip
+    assert assert_close(both(
+        lambda w, v: dispatch.accumulate(w, v, offsets),
+        lambda w, v: reference.accumulate(w, v, rays), weights, values,
+    )) == 3  # fmt: skip
+    assert assert_close(both(
+        lambda w: dispatch.distortion(w, s.to(DEVICE), ds.to(DEVICE), offsets),
+        lambda w: reference.distortion(w, s.double(), ds.double(), rays), weights,
+    )) == 2  # fmt: skip
+
+
+def test_networks_go_to_matrix_products(generator):
+    layers = [
+        (random(generator, 6, 8), random(generator, 8)),
+        (random(generator, 8, 2), random(generator, 2)),
+    ]
+    on_device = [(w.to(DEVICE), b.to(DEVICE)) for w, b in layers]
+    double = [(w.double(), b.double()) for w, b in layers]
+    pairs = both(
+        lambda x: dispatch.mlp(x, on_device), lambda x: reference.mlp(x, double),
+        random(generator, 30, 6),
+    )  # fmt: skip
+    assert assert_close(pairs, 1e-3) == 2
+
+
+def net(generator):
+    table, resolutions = grid(generator)
+    weights = 0.3 * random(generator, 6, 8), random(generator, 8), random(generator, 8, 1)
+    return tuple(x.to(DEVICE) for x in (table, resolutions, *weights, torch.ones(1)))
+
+
+def density_of(net):
+    table, resolutions, w1, b1, w2, b2 = (x.cpu() for x in net)
+    return lambda q: reference.density(q, table, resolutions, [(w1, b1), (w2, b2)])
+
+
+def test_density_inside_and_outside_the_core(generator):
+    weights = net(generator)
+    q = 2 * random(generator, 15, 3)
+    q[0] = 0.0
+    ours = dispatch.density(q.to(DEVICE), weights).cpu()
+    assert torch.allclose(ours, density_of(weights)(q), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("skip", "share"), [(1, 0.3), (8, 0.02)])
+def test_marching(generator, monkeypatch, skip, share):
+    weights = net(generator)
+    side = 32 if skip == 8 else 8
+    occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
+    occupied[0, -skip:] = 1
+    split = occupied.view(3, side // skip, skip, side // skip, skip, side // skip, skip)
+    cells = occupied.to(DEVICE), split.amax((2, 4, 6)).to(DEVICE)
+    n = 10
+    o = 0.5 * random(generator, n, 3)
+    d = torch.nn.functional.normalize(random(generator, n, 3), dim=-1)
+    d[0] = torch.tensor([0.0, 0.0, 1.0])
+    o[1] = 9.0  # outside all cascades
+    spans = torch.stack(
+        [torch.full((n,), 0.05), torch.full((n,), 1e9), torch.rand(n, generator=generator)], dim=-1
+    )
+    spans[2, 1] = 0.5
+    steps = (0.1, 0.02)
+    monkeypatch.setattr(dispatch, "GPU_RAYS", 6)  # in two parts
+    monkeypatch.setattr(dispatch, "CAPACITY", 64)
+    offsets, samples = dispatch.march(
+        (o.to(DEVICE), d.to(DEVICE)), spans.to(DEVICE), cells, steps, 1e-3, weights
+    )
+    offsets, samples = offsets.cpu(), samples.cpu().numpy()
+    u = dispatch.positions((o.to(DEVICE), d.to(DEVICE)), offsets.to(DEVICE),
+                           torch.from_numpy(samples[0]).to(DEVICE)).cpu()  # fmt: skip
+    agree = 0
+    for r in range(n):
+        span = tuple(spans[r].tolist())
+        twin = reference.march(o[r], d[r], span, occupied, steps, 1e-3, density_of(weights), skip)
+        own = samples[:, offsets[r] : offsets[r + 1]]
+        agree += own.shape[1] == len(twin) and np.allclose(
+            own, np.array(twin).reshape(-1, 3).T, rtol=1e-3
+        )
+        q = o[r] + torch.from_numpy(own[0])[:, None] * d[r]
+        assert torch.allclose(u[offsets[r] : offsets[r + 1]], reference.contract(q), atol=1e-6)
+    # Where a step ends on a cell's face, rounding may put it on either side.
+    assert agree >= n - 1 and offsets[-1] > 20
+
+
+def test_merging_two_lists(generator, rays):
+    other = rays.flip(0)[0] - rays.flip(0)
+    lists = [
+        torch.cat([torch.rand(int(n), generator=generator).sort()[0] for n in each.diff()])
+        for each in (rays, other)
+    ]
+    given = [lists[0], rays, lists[1], other]
+    order, offsets = dispatch.merge_order(*(x.to(DEVICE) for x in given))
+    real, real_offsets = reference.merge_order(*given)
+    assert torch.equal(order.cpu(), real) and torch.equal(offsets.cpu(), real_offsets)
+
+
+def test_adam_leaves_entries_without_gradient_alone(generator):
+    start = random(generator, 40)
+    ours, moments = start.clone().to(DEVICE), [torch.zeros(40, device=DEVICE) for _ in range(2)]
+    theirs = start.clone().requires_grad_()
+    adam = torch.optim.Adam([theirs], lr=0.01, betas=(0.9, 0.99), eps=1e-15)
+    some = torch.arange(40) < 25
+    for step in (1, 2, 3):
+        gradient = random(generator, 40)
+        theirs.grad = gradient.clone()
+        adam.step()
+        given = (gradient * some).to(DEVICE)
+        dispatch.adam(ours, given, (moments[0], moments[1]), 0.01, (0.9, 0.99), 1e-15, step)
+        assert (given == 0).all()
+    assert torch.allclose(ours.cpu()[some], theirs.detach()[some], rtol=1e-4)
+    assert torch.equal(ours.cpu()[~some], start[~some])
