@@ -19,9 +19,10 @@ import climatenerf
 from climatenerf.errors import UserError
 
 # Before torch and Numba are imported, unless the user has chosen otherwise. Both bring an OpenMP
-# run time of their own, and by default the idle threads of the one spin for a while after each
-# parallel region and so take the cores from the other. Numba's OpenMP layer is asked for because
-# it may be entered from several threads at once, which its last fallback may not.
+# run time of their own. Idle threads of the one that spin for long after each parallel region take
+# the cores from the other, and those that sleep at once wake late: some tens of microseconds are
+# best (docs/decisions.md). Numba's OpenMP layer is asked for because it may be entered from several
+# threads at once, which its last fallback may not.
 THREADING = {
     "OMP_WAIT_POLICY": "PASSIVE",
     "GOMP_SPINCOUNT": "10000",
