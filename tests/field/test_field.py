@@ -2,6 +2,7 @@ import numpy as np
 import torch
 from random_field import directions, points, random_field
 
+from climatenerf.field.field import _Brightness
 from climatenerf.ops import dispatch, reference
 
 
@@ -220,3 +221,17 @@ def test_accumulated_colour_of_an_opaque_field_is_a_mean_of_its_colours():
     )
     high = torch.zeros(100, 3).scatter_reduce(0, ray[:, None].expand(-1, 3), colour, "amax")
     assert (seen >= low * (1 - 1e-2)).all() and (seen <= high * (1 + 1e-5)).all()
+
+
+def test_a_display_value_is_a_softplus_and_black_is_no_trap():
+    x = torch.linspace(-6, 3, 200, requires_grad=True)
+    y = _Brightness.apply(x)
+    plain = x.detach().clone().requires_grad_()
+    softplus = torch.nn.functional.softplus(plain, beta=8.0)
+    assert torch.equal(y, softplus)
+    (down,) = torch.autograd.grad(y.sum(), x, retain_graph=True)
+    (up,) = torch.autograd.grad(-y.sum(), x)
+    (slope,) = torch.autograd.grad(softplus.sum(), plain)
+    assert torch.allclose(down[x > -0.4], slope[x > -0.4]) and (down[x < -0.6] == 0).all()
+    assert (up <= -0.9 * slope).all() and (up < 0).all()
+    assert up.max() < -1e-3  # brighter is always in reach

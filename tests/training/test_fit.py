@@ -183,6 +183,8 @@ def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
     batch.label[:] = SKY
     fitting.step(batch)
     assert any((p.grad != 0).any() for p in fitting.field.sky_net)
+    # Nor does haze before it take its colour.
+    assert all((p.grad == 0).all() for p in fitting.field.colour_net)
 
 
 def test_what_nobody_has_labelled_may_be_sky_too(scene):
@@ -265,6 +267,15 @@ def test_colours_are_alike_from_all_sides_until_surfaces_are_found(scene):
     fitting.run(look)
     assert all(change == 0 for progress, change in seen if progress <= fit.REFINE_AT)
     assert seen[-1][1] > 0
+
+
+def test_colours_come_back_from_black(scene):
+    """In haze before a bright sky they darken for a while, and without slope they stayed so."""
+    fitting = begin(scene, steps=150)
+    with torch.no_grad():
+        fitting.field.colour_net[-1].fill_(-4.0)
+    fitting.run(lambda _: None)
+    assert heldout_psnr(scene, lambda c2w: render_view(fitting.field, CAMERA, c2w)) > 14
 
 
 def test_near_matter_is_believed_later(scene):

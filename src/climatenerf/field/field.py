@@ -391,9 +391,35 @@ class Field(nn.Module):
         return self.sky_colour(d, self.shown_embedding.expand(d.shape[0], -1))
 
 
+class _Brightness(torch.autograd.Function):
+    """Softplus out of whose flat part there is a way back.
+
+    Where it is black its slope vanishes. Adam makes steps of full length of vanishing gradients, so
+    colours that darken for a while would sink ever deeper and never return: a fit in which the sky
+    shone through the haze stayed black for good.
+    """
+
+    @staticmethod
+    def forward(ctx, x):
+        ctx.save_for_backward(x)
+        return nn.functional.softplus(x, beta=SHARPNESS)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (x,) = ctx.saved_tensors
+        slope = torch.sigmoid(SHARPNESS * x)
+        # Steps go against the gradient: negative ones brighten.
+        return grad * torch.where(grad < 0, slope.clamp_min(LEAST_SLOPE), slope * (x > BLACK))
+
+
 def _to_radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Network output to linear radiance: a display value ≥ 0 and unbounded, decoded.
 
-    Softplus with sharpness 8 is nearly the identity from 0.3 up and keeps a gradient at black.
+    Softplus with sharpness 8 is nearly the identity from 0.3 up.
     """
-    return decode_srgb(nn.functional.softplus(raw + 0.5, beta=8.0))
+    return decode_srgb(_Brightness.apply(raw + 0.5))
+
+
+SHARPNESS = 8.0  # of the softplus
+LEAST_SLOPE = 0.1  # upwards
+BLACK = -0.5  # below it the display value is under .003, and nothing darkens further

@@ -416,6 +416,9 @@ class Fitting:
         if not self.settings.appearance:
             appearance = appearance.detach()
         colour = self.field.colour_at(u, ray, batch.rays_d, appearance)
+        if self.knows_sky:
+            # Haze before the sky would take its colour and stay.
+            spread = spread * (batch.label != SKY)[ray]
         colour = scale_gradient(colour, spread[:, None])
         own = dispatch.accumulate(share, colour, offsets_of(ray, n))
         # The drawn shares sum to the ray's opacity on average only; made to sum to it, they are far
