@@ -13,7 +13,7 @@ BLOCK = 128  # samples at a time: 64 hidden rows of them are 32 kB
 CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients over
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=True)
 def _add_product(weight, rows, first, out, into, size):
     """out [m, into:into + size] += weight [m, k] @ rows [k, first:first + size].
 
@@ -39,7 +39,7 @@ def _add_product(weight, rows, first, out, into, size):
                 own[s] += w[i] * row[s]
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=True)
 def _add_outer(left, from_left, right, from_right, out, size):
     """out [a, b] += left [a, from:from + size] @ right [b, from:from + size]ᵀ, four at a time."""
     b = right.shape[0]
@@ -69,7 +69,7 @@ def _add_outer(left, from_left, right, from_right, out, size):
             out[i, j] += total
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=True)
 def _hidden(x, shared, row, w1, b1, start, stop, hidden):
     """Fills hidden [h, ≥ stop - start] for some samples: the first layer after its ReLU."""
     size = stop - start
