@@ -38,7 +38,7 @@ class Fit:
     resume: bool = False
     """Continue the run in the folder; --minutes then counts from its beginning."""
     preset: Literal["cpu", "gpu", "paper"] = "cpu"
-    """Size of the field. gpu: larger tables (no GPU kernels yet). paper: the paper's sizes and
+    """Size of the field. gpu: larger tables (still on the CPU). paper: the paper's sizes and
     weights of losses (docs/physics.md tells what in them is ours); its sky is opaque, by each
     photo's own labels, and shelters from snow."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()

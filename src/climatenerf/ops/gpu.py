@@ -41,24 +41,38 @@ def _corner(x, y, z, resolution, size):
 
 
 @cuda.jit(device=True)
-def _encode(ux, uy, uz, table, level, resolution, features):
-    """Trilinear interpolation of one level's two features, into features[2 level : 2 level + 2]."""
+def _row(ix, iy, iz, corner, resolution, size):
+    """Table row of one of a cell's eight corners; bits 0 to 2 say which side on x, y and z."""
+    x = np.uint32(ix + np.uint32(corner & 1))
+    y = np.uint32(iy + np.uint32((corner >> 1) & 1))
+    z = np.uint32(iz + np.uint32(corner >> 2))
+    return _corner(x, y, z, resolution, size)
+
+
+@cuda.jit(device=True)
+def _cell(ux, uy, uz, resolution):
+    """Lattice cell of a point and the place in it."""
     scale = np.float32(resolution)
     px, py, pz = ux * scale, uy * scale, uz * scale
     ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-    fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
-    one = np.float32(1.0)
+    return ix, iy, iz, px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
+
+
+@cuda.jit(device=True)
+def _side(f, upper):
+    """Weight of a cell's lower or upper side for a point a share f across it."""
+    return f if upper else np.float32(1.0) - f
+
+
+@cuda.jit(device=True)
+def _encode(ux, uy, uz, table, level, resolution, features):
+    """Trilinear interpolation of one level's two features, into features[2 level : 2 level + 2]."""
+    ix, iy, iz, fx, fy, fz = _cell(ux, uy, uz, resolution)
     first, second = np.float32(0.0), np.float32(0.0)
     for corner in range(8):
         dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = (fx if dx else one - fx) * (fy if dy else one - fy) * (fz if dz else one - fz)
-        row = _corner(
-            np.uint32(ix + np.uint32(dx)),
-            np.uint32(iy + np.uint32(dy)),
-            np.uint32(iz + np.uint32(dz)),
-            resolution,
-            table.shape[1],
-        )
+        weight = _side(fx, dx) * _side(fy, dy) * _side(fz, dz)
+        row = _row(ix, iy, iz, corner, resolution, table.shape[1])
         first += weight * table[level, row, 0]
         second += weight * table[level, row, 1]
     features[2 * level] = first
@@ -91,22 +105,11 @@ def _hash_encode_backward(u, grad_out, resolutions, grad_table):
         ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
         if ga != 0.0 or gb != 0.0:
             resolution = resolutions[level]
-            scale, one = np.float32(resolution), np.float32(1.0)
-            px, py, pz = u[p, 0] * scale, u[p, 1] * scale, u[p, 2] * scale
-            ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-            fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
+            ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
             for corner in range(8):
                 dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                weight = (
-                    (fx if dx else one - fx) * (fy if dy else one - fy) * (fz if dz else one - fz)
-                )
-                row = _corner(
-                    np.uint32(ix + np.uint32(dx)),
-                    np.uint32(iy + np.uint32(dy)),
-                    np.uint32(iz + np.uint32(dz)),
-                    resolution,
-                    grad_table.shape[1],
-                )
+                weight = _side(fx, dx) * _side(fy, dy) * _side(fz, dz)
+                row = _row(ix, iy, iz, corner, resolution, grad_table.shape[1])
                 cuda.atomic.add(grad_table, (level, row, 0), weight * ga)
                 cuda.atomic.add(grad_table, (level, row, 1), weight * gb)
 
@@ -125,24 +128,15 @@ def _hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
         tx, ty, tz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         for level in range(table.shape[0]):
             resolution = resolutions[level]
-            scale = np.float32(resolution)
             ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
-            px, py, pz = u[p, 0] * scale, u[p, 1] * scale, u[p, 2] * scale
-            ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-            fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
+            ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
             for corner in range(8):
                 dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                row = _corner(
-                    np.uint32(ix + np.uint32(dx)),
-                    np.uint32(iy + np.uint32(dy)),
-                    np.uint32(iz + np.uint32(dz)),
-                    resolution,
-                    table.shape[1],
+                row = _row(ix, iy, iz, corner, resolution, table.shape[1])
+                value = np.float32(resolution) * (
+                    ga * table[level, row, 0] + gb * table[level, row, 1]
                 )
-                value = scale * (ga * table[level, row, 0] + gb * table[level, row, 1])
-                wx = fx if dx else one - fx
-                wy = fy if dy else one - fy
-                wz = fz if dz else one - fz
+                wx, wy, wz = _side(fx, dx), _side(fy, dy), _side(fz, dz)
                 tx += value * wy * wz * (one if dx else -one)
                 ty += value * wx * wz * (one if dy else -one)
                 tz += value * wx * wy * (one if dz else -one)
