@@ -221,6 +221,20 @@ def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
     assert fitting.sky_samples(batch, samples, weights).tolist() == [1]
 
 
+def test_space_outside_every_picture_stays_empty(scene):
+    fitting = begin(scene, steps=40)
+    occupancy = fitting.field.occupancy
+    ring = torch.tensor([[0.0, 0.0, 8.0], [0.0, 0.0, 0.5]])  # above all cameras; on the box
+    for again in range(2):
+        cells, inside = fitting.field._cells(fitting.field.to_grid(ring))
+        assert inside.all() and occupancy.barred.view(-1)[cells].tolist() == [True, False]
+        occupancy.update(fitting.field.grid_density, 1.0, 0.9, fitting.generator)
+        assert occupancy.occupied.view(-1)[cells][0] == 0
+        if not again:
+            occupancy.refine()
+            fitting.bar_cells(everywhere=False)
+
+
 def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypatch):
     fitting = begin(scene, steps=10)
     fitting.steps = 9  # masks are in use

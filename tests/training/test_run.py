@@ -133,7 +133,9 @@ def begin(scene, **settings):
     poses = np.stack([scene.c2w_world(v) for v in views])
     chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
     extent = run_module.find_extent(poses, None)
-    return run_module.Fitting(load_pixels(scene, 1), len(views), extent, FitSettings(**chosen))
+    points = run_module.find_point_rays(scene)
+    settings = FitSettings(**chosen)
+    return run_module.Fitting(load_pixels(scene, 1), len(views), extent, settings, points)
 
 
 def assert_same(a, b):
@@ -228,6 +230,22 @@ def test_resuming_counts_on(scene, tmp_path):
     assert second["samples"] > first["samples"] and second["seconds"] > first["seconds"]
     third = fitted(scene, tmp_path / "run", steps=16, resume=True)
     assert third["steps"] == 16 and third["samples"] == second["samples"], "it was finished"
+
+
+def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
+    points = np.array([[0.0, -0.6, 0.6], [0.6, 0.0, 0.8]])
+    views = [dataclasses.replace(view, seen=np.arange(2)) for view in scene.views]
+    scene = dataclasses.replace(scene, views=tuple(views), points=points)
+    fitting = begin(scene, steps=4)
+    fitting.field.occupancy.refine()
+    fitting.bar_cells(everywhere=False)
+    assert fitting.held.shape == fitting.field.occupancy.occupied.shape and fitting.held.any()
+    fitted(scene, tmp_path / "run", steps=2)  # its other files
+    checkpoint(fitting, tmp_path / "run")
+    again = begin(scene, steps=4)
+    restore(again, tmp_path / "run")
+    assert torch.equal(again.held, fitting.held)
+    assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
 
 
 def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):

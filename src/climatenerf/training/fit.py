@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
@@ -23,6 +23,7 @@ from climatenerf.render.samples import Samples, offsets_of
 from climatenerf.render.view import LEAST_WEIGHT
 from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.training import losses
+from climatenerf.training.in_view import in_view
 from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.pixels import HORIZON, Batch, TrainingPixels
@@ -81,7 +82,7 @@ class Fitting:
         self.knows_sky = pixels.knows_sky
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
         self.fill = fill_sky(pixels, self.generator) if self.knows_sky else None
-        self.bar_sky()
+        self.bar_cells()
         kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
         classed = bool((SOLID_CLASSES[kinds.long()] != UNKNOWN).any())
         weigh = settings.losses
@@ -434,33 +435,38 @@ class Fitting:
             sky = scale_gradient(sky, (batch.is_sky + unknown)[:, None])
         return own + left[:, None] * sky
 
-    def bar_sky(self, everywhere: bool = True) -> None:
-        """Bars the occupancy's cells that photos agree to be sky, unless a point lies by them.
+    def bar_cells(self, everywhere: bool = True) -> None:
+        """Bars the occupancy's cells that no photo has in view, and those that photos agree to be
+        sky, unless a point lies by them.
 
         Args:
             everywhere: ask of all cells; else of those that are occupied, which is quicker.
         """
         witness, occupancy = self.pixels.witness, self.field.occupancy
-        # Cells in which sparse points lie.
-        self.held = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
-        if witness is None or not self.settings.carve:
-            return
+        self.held = self.cells_of_points()
         cells = torch.arange(occupancy.occupied.numel())
         if not everywhere:
             cells = cells[occupancy.occupied.view(-1) > 0]
         centre, size = occupancy.cell_centres(cells)
         x = centre * self.field.unit + self.field.centre
         radius = size * (self.field.unit * 3**0.5 / 2)
-        cells = cells[witness.agreed(x, radius)]
+        empty = ~in_view(x, radius, self.pixels.pyramids)
+        if witness is not None and self.settings.carve:
+            empty |= witness.agreed(x, radius)
         barred = occupancy.barred.view(-1)
-        barred[cells] = True
+        barred[cells[empty]] = True
+        near = torch.nn.functional.max_pool3d(self.held[:, None].float(), 3, 1, padding=1)
+        barred[near.view(-1) > 0] = False
+        occupancy.occupied.view(-1)[barred] = 0
+
+    def cells_of_points(self) -> Bool[Tensor, "cascades side side side"]:
+        """The occupancy's cells in which sparse points lie."""
+        held = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
         if self.points is not None:
             ends = self.points.rays_o + self.points.depth[:, None] * self.points.rays_d
             cells, inside = self.field._cells(self.field.to_grid(ends))
-            self.held.view(-1)[cells[inside]] = True
-            near = torch.nn.functional.max_pool3d(self.held[:, None].float(), 3, 1, padding=1)
-            barred[near.view(-1) > 0] = False
-        occupancy.occupied.view(-1)[barred] = 0
+            held.view(-1)[cells[inside]] = True
+        return held
 
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
@@ -472,7 +478,7 @@ class Fitting:
         late = self.progress > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
-            self.bar_sky(everywhere=False)
+            self.bar_cells(everywhere=False)
 
     def adapt(self, rays: int, samples: int) -> None:
         """Keeps the samples per step at their budget, and makes marching finer with time.

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import MERGED, SKY, UNKNOWN
+from climatenerf.training.in_view import pyramids
 from climatenerf.training.sky_witness import SkyWitness
 
 SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
@@ -69,6 +70,7 @@ class TrainingPixels:
         Masks: pixels where a mask is 0 are never drawn.
         """
         self.c2w = torch.from_numpy(np.asarray(c2w, np.float32))
+        self.pyramids = pyramids([cameras[i] for i in camera_of], c2w)
         directions = [torch.from_numpy(camera.directions().reshape(-1, 3)) for camera in cameras]
         sizes = torch.tensor([d.shape[0] for d in directions])
         self.directions = torch.cat(directions)
