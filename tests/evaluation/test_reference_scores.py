@@ -12,6 +12,7 @@ from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
 from climatenerf.scene import Camera
+from climatenerf.scene.srgb import to_display
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 ROAD, TERRAIN, LEAVES, SKY = 0, 9, 8, 10  # Cityscapes train ids
@@ -169,12 +170,12 @@ def dry_view(rise=0.0):
 
 def test_tuning_finds_the_constants_that_made_the_truth():
     dry, colour = dry_view(), np.array([0.8, 0.7, 0.6])
-    foggy = baselines.display(baselines.depth_fog(dry, 0.1, colour))
+    foggy = to_display(baselines.depth_fog(dry, 0.1, colour))
     found = baselines.tuned_sigma([dry], [np.round(255 * foggy).astype(np.uint8)], 0.05, colour)
     assert found == pytest.approx(0.1, rel=0.1)
     share = baselines.white_paint(dry)
     assert share[~np.isinf(dry.depth)].min() > 0.99 and share[np.isinf(dry.depth)].max() < 1e-6
-    painted = baselines.display(baselines.painted(dry.linear, share, colour))
+    painted = to_display(baselines.painted(dry.linear, share, colour))
     true = [np.round(255 * painted).astype(np.uint8)]
     white = baselines.tuned_colour([dry.linear * (1 - share[..., None])], [share], true)
     np.testing.assert_allclose(white, colour, atol=0.01)
@@ -217,7 +218,7 @@ def test_a_colour_is_tuned_for_what_is_displayed():
     found = baselines.tuned_colour(base, share, true)
 
     def error(colour):
-        return ((baselines.display(colour) - true[0] / 255.0) ** 2).mean()
+        return ((to_display(colour) - true[0] / 255.0) ** 2).mean()
 
     mean = baselines.linear_of(true[0]).mean((0, 1))
     assert error(found) < 0.97 * error(mean)

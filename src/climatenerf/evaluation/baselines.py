@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from climatenerf.evaluation.geometry import nearest_pixels
 from climatenerf.scene import Camera
+from climatenerf.scene.srgb import to_display, to_linear
 
 SNOW_EDGE, SNOW_SLOPE = 50.0, np.cos(np.deg2rad(37.0))  # as the paper's snow
 REACHES = np.geomspace(0.05, 60.0, 64)  # m along a reflected ray
@@ -56,7 +57,7 @@ def tuned_sigma(
     """The extinction near the nominal one whose fog is nearest to the true pictures."""
 
     def error(factor: float) -> float:
-        pictures = [display(depth_fog(dry, factor * sigma, colour)) for dry in views]
+        pictures = [to_display(depth_fog(dry, factor * sigma, colour)) for dry in views]
         return float(
             np.mean([((p - t / 255.0) ** 2).mean() for p, t in zip(pictures, true, strict=True)])
         )
@@ -160,7 +161,7 @@ def tuned_colour(
 
     def error(gain: float, c: int) -> float:
         return sum(
-            float(((display(b[..., c] + s * gain * colour[c]) - t[..., c] / 255.0) ** 2).sum())
+            float(((to_display(b[..., c] + s * gain * colour[c]) - t[..., c] / 255.0) ** 2).sum())
             for b, s, t in zip(bases, shares, true, strict=True)
         )
 
@@ -181,17 +182,9 @@ def frame_noise(picture: Float[np.ndarray, "h w 3"], seed: int) -> Float[np.ndar
     return np.clip(picture + (1 - v) * upper + v * lower, 0.0, 1.0)
 
 
-def display(linear: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """Display values in [0, 1] of linear light (IEC 61966-2-1)."""
-    x = np.clip(linear, 0.0, 1.0)
-    # 1e-6: the root's branch is not taken there, but is computed.
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-6) ** (1 / 2.4) - 0.055)
-
-
 def linear_of(picture: UInt8[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Linear light of 8-bit display values."""
-    x = picture / 255.0
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    return to_linear(picture / 255.0)
 
 
 def _on_screen(dry: Dry, points: Float[np.ndarray, "h w 3"]):

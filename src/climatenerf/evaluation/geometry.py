@@ -11,6 +11,7 @@ from climatenerf.scene.classes import (
     MERGED,
     ROAD,
     TERRAIN,
+    UNKNOWN,
     VEGETATION,
 )
 
@@ -146,7 +147,7 @@ def label_scores(
     """Intersection over union of each class that occurs, and their mean; unknown is wrong."""
     ours = np.concatenate([each.ravel() for each in labels])
     real = np.concatenate([MERGED[truth.label].ravel() for truth in truths])
-    known = real != 255
+    known = real != UNKNOWN
     ours, real = ours[known], real[known]
     each = {}
     for kind, name in enumerate(CLASS_NAMES):

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from climatenerf.evaluation import baselines
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.reference import WeatherTruth
+from climatenerf.scene.srgb import to_display
 from climatenerf.weather import flood as water_physics
 from climatenerf.weather import smog, waves
 from climatenerf.weather.parameters import linear_colour
@@ -66,20 +67,20 @@ def painted(
         return None
     if name == "depth-fog" and "sigma" in tuned:
         colour = np.array(linear_colour(weather.smog.colour))
-        return baselines.display(baselines.depth_fog(dry, tuned["sigma"], colour))
+        return to_display(baselines.depth_fog(dry, tuned["sigma"], colour))
     if name == "white-paint" and "white" in tuned:
         share = baselines.white_paint(dry)
-        return baselines.display(baselines.painted(dry.linear, share, tuned["white"]))
+        return to_display(baselines.painted(dry.linear, share, tuned["white"]))
     if weather.flood.level is None or "flat" not in tuned:
         return None
     level = ground_z + weather.flood.level
     if name == "flat-plane":
-        return baselines.display(baselines.flat_plane(dry, level, tuned["flat"]))
+        return to_display(baselines.flat_plane(dry, level, tuned["flat"]))
     if name == "screen-reflection":
         wet = baselines.wet_pixels(dry, level)[0]
         reflected, part = _mirrored(kind, ground_z, dry)
         water = part[..., None] * reflected + (1 - part[..., None]) * tuned["body"]
-        return baselines.display(np.where(wet[..., None], water, dry.linear))
+        return to_display(np.where(wet[..., None], water, dry.linear))
     return None
 
 

@@ -29,6 +29,7 @@ from climatenerf.render.surface import see_surface
 from climatenerf.render.view import RENDER_STEP, camera_rays
 from climatenerf.render.world import World
 from climatenerf.scene import Camera, Scene, View
+from climatenerf.scene.srgb import to_display
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
 
@@ -144,7 +145,7 @@ def picture_scores(ours: list[Picture], real: list[Picture]) -> dict[str, float]
 
 def display_8bit(linear: Float[np.ndarray, "h w 3"]) -> Picture:
     """8-bit display values."""
-    return (baselines.display(linear) * 255 + 0.5).astype(np.uint8)
+    return (to_display(linear) * 255 + 0.5).astype(np.uint8)
 
 
 def dry_view(place: Place, truth: Truth) -> Dry:
@@ -343,9 +344,7 @@ def consistency(place: Place, tuned: dict[str, dict], tell: Tell) -> dict[str, A
     def frame(index: int, picture: np.ndarray, depth: np.ndarray, excluded: np.ndarray) -> Frame:
         return Frame(picture, depth, excluded, path.c2w[index], path.cameras[index])
 
-    clean = {
-        i: frame(i, baselines.display(each.linear), each.depth, plain) for i, each in dry.items()
-    }
+    clean = {i: frame(i, to_display(each.linear), each.depth, plain) for i, each in dry.items()}
     out: dict[str, Any] = {"clean": _pairs(clean, starts), "baselines": {}}
     kinds = {kind.name: kind for kind in place.reference.weathers}
     for short, name in FOLLOWED.items():
@@ -357,7 +356,7 @@ def consistency(place: Place, tuned: dict[str, dict], tell: Tell) -> dict[str, A
         world, frames = stage.at(kind.time), {}
         for i in wanted:
             linear, layers = see_frame(world, path.cameras[i], path.c2w[i])
-            picture = baselines.display(linear.double().numpy())
+            picture = to_display(linear.double().numpy())
             frames[i] = frame(i, picture, layers["depth"], grown(layers["mask_water"] > 0.5))
         out[short] = _pairs(frames, starts)
         for baseline in baselines.NAMES:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.perception.models import Network, load_parts
-from climatenerf.scene.images import UNKNOWN_LABEL
+from climatenerf.scene.label_spaces import UNKNOWN
 
 CITYSCAPES = (
     "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign",
@@ -61,13 +61,13 @@ def train_ids(names: Mapping[int, str], model: str) -> UInt8[np.ndarray, " n"]:
     Raises:
         UserError: Hardly any name is known.
     """
-    table = np.full(max(names, default=-1) + 1, UNKNOWN_LABEL, np.uint8)
+    table = np.full(max(names, default=-1) + 1, UNKNOWN, np.uint8)
     for number, words in names.items():
         name = words.replace(";", ",").split(",")[0].strip().lower().replace("_", " ")
         name = NEAREST.get(name, name)
         if name in CITYSCAPES:
             table[number] = CITYSCAPES.index(name)
-    if len(set(table[table != UNKNOWN_LABEL].tolist())) < LEAST_CLASSES:
+    if len(set(table[table != UNKNOWN].tolist())) < LEAST_CLASSES:
         some = ", ".join(list(names.values())[:3])
         raise UserError(
             f"the model {model} does not name its classes as Cityscapes or ADE20K do (it has:"

@@ -15,7 +15,8 @@ from PIL import Image
 
 from climatenerf.perception.simple_ground import GroundPoints, find_ground_in
 from climatenerf.scene.cameras import Camera
-from climatenerf.scene.images import UNKNOWN_LABEL, load_image
+from climatenerf.scene.images import load_image
+from climatenerf.scene.label_spaces import UNKNOWN
 from climatenerf.scene.scene import Scene, View
 
 SKY, GROUND = 10, 9
@@ -61,7 +62,7 @@ def simple_labels(
     picture = np.asarray(picture)
     rays = _rays(small, scene.c2w_world(view)[:3, :3])
     sky = find_sky(picture, rays[..., 2], _solid(scene, view, small))
-    labels = np.where(sky, np.uint8(SKY), np.uint8(UNKNOWN_LABEL))
+    labels = np.where(sky, np.uint8(SKY), np.uint8(UNKNOWN))
     if ground is not None:
         values = picture.astype(np.float32) / 255
         labels[find_ground_in(view, scene, small, ground, rays, values) & ~sky] = GROUND
@@ -226,6 +227,7 @@ def _fits(
     known, colours = terms.reshape(-1, 6)[some], values.reshape(-1, 3)[some]
     # A light pull to a constant colour: a small patch does not tell how the sky goes on.
     pull = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]) * 1e-3 * len(some)
+    # 1e-6: of fewer pixels than terms the equations are singular.
     weights = np.linalg.solve(known.T @ known + pull + 1e-6 * np.eye(6), known.T @ colours)
     expected = terms @ weights.astype(np.float32)
     return np.abs(values - expected).max(axis=-1) < _FIT

@@ -218,6 +218,7 @@ def _planes(near, gap, height, weight, count):
     right = np.stack([total(a * height) for a in terms], axis=-1)
     support = left[:, 0, 0]
     # A light pull to level: a few cells in a line do not tell how the ground leans.
+    # 1e-9: a cell that nothing bears has no equation at all.
     left = left + np.diag([1e-9, 0.1, 0.1])
     return np.linalg.solve(left, right[..., None])[..., 0], support
 

@@ -15,8 +15,8 @@ from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.label_spaces import to_train_ids
 from climatenerf.scene.scene import Scene, View
+from climatenerf.scene.srgb import to_linear
 
-UNKNOWN_LABEL = 255
 RELATIVE_DEPTH = "depth_relative"
 _ORIENTATION_TAG = 0x0112
 EXIF_TURNS = {
@@ -35,13 +35,8 @@ _ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
 _BAD_IMAGE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
-def _srgb_to_linear(display: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """IEC 61966-2-1, display values 0 to 1."""
-    return np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
-
-
-_LINEAR = _srgb_to_linear(np.arange(256) / 255).astype(np.float32)
-_LINEAR_EDGES = _srgb_to_linear((np.arange(255) + 0.5) / 255).astype(np.float32)
+_LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
+_LINEAR_EDGES = to_linear((np.arange(255) + 0.5) / 255).astype(np.float32)
 
 
 @dataclass(frozen=True)
