@@ -9,6 +9,7 @@ import torch
 from analytic_fields import AnalyticField, Box, HalfSpace
 from random_field import directions, random_field
 
+from climatenerf.render import trace as trace_module
 from climatenerf.render.frame import render_frame
 from climatenerf.render.trace import trace
 from climatenerf.render.world import Water, World
@@ -309,6 +310,27 @@ def test_snow_shows_its_depth_in_the_picture(tilt):
         angle
     )
     assert (height - 0.15).abs().max() < 0.15 * 0.15
+
+
+def test_snow_is_not_looked_for_behind_what_is_opaque(monkeypatch):
+    """Fewer samples, the same picture but for rounding; and what is before a wall all shows."""
+    world = World(street(), matter=snowed(0.2))
+    few = linear(world)
+    wanted = []
+    march = type(world.matter).march
+
+    def noted(self, rays_o, rays_d, t_min, t_max):
+        wanted.append(t_max)
+        return march(self, rays_o, rays_d, t_min, t_max)
+
+    monkeypatch.setattr(type(world.matter), "march", noted)
+    linear(world)
+    assert 0.1 < torch.isfinite(torch.cat(wanted)).float().mean() < 0.9
+    monkeypatch.setattr(trace_module, "HIDDEN", 0.0)
+    every = linear(world)
+    for name in ("rgb", "mask_snow", "snow_thickness"):
+        assert (getattr(few, name) - getattr(every, name)).abs().max() < 2e-3, name
+    assert few.mask_snow.max() > 0.99
 
 
 def test_no_snow_shows_under_a_roof_or_on_a_steep_slope():

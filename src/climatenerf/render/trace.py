@@ -21,6 +21,7 @@ from climatenerf.weather import flood as water_physics
 from climatenerf.weather import smog, waves
 
 LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
+HIDDEN = 1e-3  # what this share of the light or less comes from is not looked for
 LEAST_SHARE = 1.0 / 2048  # of a pixel that water must have to be traced: below an 8-bit step
 RAYS_AT_ONCE = 16384  # bounds memory
 BOUNCES = 2  # meetings with the water, then the plain field
@@ -92,8 +93,8 @@ def _trace(
         below = rays_o[:, 2] < water.level
         beyond = _beyond(world, samples, ray, weights, rays_o, rays_d, t_plane, pixel_angle)
     front = weights * (1 - beyond)
-    water_share = _sum(weights * beyond, samples.offsets) + left * torch.isfinite(t_plane)
-    sky_share = left * torch.isinf(t_plane)
+    water_share = _sum(weights * beyond, samples.offsets) + left * (t_plane < torch.inf)
+    sky_share = left * (t_plane == torch.inf)
 
     # --- Light of the matter this side of the water, through the air -----------------------------
     keep = (front > LEAST_WEIGHT).nonzero()[:, 0]
@@ -180,13 +181,24 @@ def _all_samples(
     field = world.field.march(rays_o, rays_d, t_min, endless, step_scale)
     if world.matter is None:
         return field, torch.zeros(field.t.shape[0], dtype=torch.bool)
-    own = world.matter.march(rays_o, rays_d, t_min, endless)
+    own = world.matter.march(rays_o, rays_d, t_min, _opaque_from(field))
     order, offsets = dispatch.merge_order(field.t, field.offsets, own.t, own.offsets)
     both = {
         key: torch.cat([getattr(field, key), getattr(own, key)])[order]
         for key in ("t", "dt", "sigma")
     }
     return Samples(offsets, **both), order >= field.t.shape[0]
+
+
+def _opaque_from(samples: Samples) -> Float[Tensor, "n"]:
+    """Ray length behind which nothing shows any more; +inf where light is left."""
+    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    ends = torch.full_like(left, torch.inf)
+    rays = (left < HIDDEN).nonzero()[:, 0]
+    last = samples.offsets[rays + 1] - 1
+    # Some way further, since cutting a clump of snow would move its middle.
+    ends[rays] = samples.t[last] + 2 * samples.dt[last]
+    return ends
 
 
 def _beyond(
@@ -207,18 +219,21 @@ def _beyond(
     The waterline's softness depends on how the ground slopes, so the ground's normal is found for
     the rays that have matter within a pixel of the plane.
     """
-    arguments = (t_plane[ray], samples.t, rays_d[ray], pixel_angle[ray])
+    beyond = (samples.t > t_plane[ray]).float()
+    some = ((weights > LEAST_WEIGHT) & (t_plane[ray] < torch.inf)).nonzero()[:, 0]
+    own = ray[some]
+    arguments = (t_plane[own], samples.t[some], rays_d[own], pixel_angle[own])
     soft = water_physics.shore_coverage(*arguments)
-    unsure = (soft > 0) & (soft < 1) & (weights > LEAST_WEIGHT)
-    rays = torch.unique(ray[unsure])
+    rays = torch.unique(own[(soft > 0) & (soft < 1)])
     if not rays.numel():
-        return (samples.t > t_plane[ray]).float()
+        return beyond
     x = rays_o[rays] + t_plane[rays, None] * rays_d[rays]
     step = (2 * pixel_angle[rays] * t_plane[rays]).clamp_min(0.02)
     normal = torch.zeros_like(rays_d)
     normal[:, 2] = 1.0
     normal[rays] = _field_normal(world, x, step, rays_d[rays])
-    return (2 * water_physics.shore_coverage(*arguments, normal[ray]) - 1).clamp_min(0.0)
+    covered = 2 * water_physics.shore_coverage(*arguments, normal[own]) - 1
+    return beyond.index_copy(0, some, covered.clamp_min(0.0))
 
 
 def _sample_colour(
