@@ -2,9 +2,11 @@
 
 python benchmarks/frame_time.py RUN
 python benchmarks/frame_time.py RUN --size 480x270 --path still --repeats 5
+python benchmarks/frame_time.py RUN --sizes 240x135 480x270 960x540 1920x1080
 
 The flood's level is searched for (on a small picture) so that water shows on 35 to 45 % of the
 frame; the share reached is reported. Preparing (light, waves, snowfall) is timed once, apart.
+With --sizes a clean frame of each, and the exponent of its seconds over its pixels (1: linear).
 """
 
 import argparse
@@ -20,6 +22,7 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.render.camera_path import CameraPath, camera_path
 from climatenerf.render.frame import render_frame
 from climatenerf.render.stage import prepare
+from climatenerf.render.world import World
 from climatenerf.scene import load_scene
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
@@ -74,6 +77,23 @@ def frames(run: Path, size: str, view: str, repeats: int, seed: int) -> dict[str
     return {"run": run.name, "view": path.name, "size": size, "level_m": level, "frames": rows}
 
 
+def growth(run: Path, sizes: list[str], view: str, repeats: int) -> dict[str, Any]:
+    """Seconds of a clean frame in several sizes, and the exponent of pixels that fits them best."""
+    field, scene = load_field(run), load_scene(run)
+    world = World(field, field.near)
+    rows = []
+    for size in sizes:
+        path = camera_path(view, scene, 1, parse_size(size))
+        camera, c2w = path.cameras[0], path.c2w[0]
+        seconds = common.measure(
+            lambda camera=camera, c2w=c2w: render_frame(world, camera, c2w), repeats
+        )
+        rows.append({"size": size, "pixels": camera.width * camera.height, "seconds": seconds})
+    logs = np.log([[row["pixels"], row["seconds"]["median"]] for row in rows])
+    exponent = float(np.polyfit(logs[:, 0], logs[:, 1], 1)[0])
+    return {"run": run.name, "view": view, "frames": rows, "exponent": exponent}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
@@ -81,7 +101,12 @@ def main() -> None:
     parser.add_argument("--path", default="still", help="camera path; its first frame is used")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sizes", nargs="+")
     options = parser.parse_args()
+    if options.sizes:
+        found = growth(options.run, options.sizes, options.path, options.repeats)
+        common.report("seconds a frame over its pixels", found)
+        return
     found = frames(options.run, options.size, options.path, options.repeats, options.seed)
     common.report("seconds a frame", found, options.seed)
 

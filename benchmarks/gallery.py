@@ -3,8 +3,11 @@
 python benchmarks/gallery.py street RUN
 python benchmarks/gallery.py ditch RUN --level "-1.5 m" --visibility "60 m" --snow "15 cm"
 
+python benchmarks/gallery.py ditch RUN --surfaces
+
 A sheet NAME.jpg of at most 150 KB, marked as simulated: rows clean, flood, smog, snow and all at
-once, columns along the camera path.
+once, columns along the camera path. With --surfaces NAME-surfaces.jpg: colours, depth, normals and
+classes of held-out views.
 """
 
 import argparse
@@ -15,9 +18,61 @@ import common
 import numpy as np
 from PIL import Image
 
+from climatenerf.field.checkpoint import load_field
 from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
+from climatenerf.render.frame import render_frame
+from climatenerf.render.world import World
+from climatenerf.scene import load_scene
+from climatenerf.scene.images import load_image
+from climatenerf.training.ablation import depth_picture, normal_picture
 
+# Road, building, vegetation, terrain, sky, person, vehicle, as Cityscapes paints them.
+PAINT = np.zeros((256, 3), np.uint8)
+PAINT[:7] = [[128, 64, 128], [70, 70, 70], [107, 142, 35], [152, 251, 152], [70, 130, 180],
+             [220, 20, 60], [0, 0, 142]]  # fmt: skip
 GALLERY = Path(__file__).resolve().parents[1] / "docs" / "gallery"
+
+
+Rows = list[tuple[str, list[np.ndarray]]]
+
+
+def weathers(run: Path, options: argparse.Namespace) -> Rows:
+    """Frames along the path in each weather, by the command line."""
+    flood = ["--flood.level", options.level]
+    smog = ["--smog.visibility", options.visibility]
+    snow = ["--snow.depth", options.snow]
+    flags = {"clean": [], "flood": flood, "smog": smog, "snow": snow}
+    flags["all"] = [*flood, *smog, *snow]
+    rows = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for label, words in flags.items():
+            out = Path(temporary) / label
+            base = ["render", str(run), "-o", str(out), "--path", options.path]
+            base += ["--frames", str(options.columns), "--size", options.size]
+            common.command(*base, "--supersample", str(options.supersample), *words)
+            frames = sorted((out / "frames").glob("*.png"))
+            rows.append((label, [np.asarray(Image.open(path)) for path in frames]))
+    return rows
+
+
+def surfaces(run: Path, columns: int) -> Rows:
+    """Held-out views as the field has them: colours, inverse depth, normals and classes."""
+    field, scene = load_field(run), load_scene(run)
+    views = scene.of_split("heldout")
+    chosen = np.unique(np.linspace(0, len(views) - 1, columns).round().astype(int))
+    rows: Rows = [("photo", []), ("field", []), ("depth", []), ("normals", []), ("classes", [])]
+    for view in (views[i] for i in chosen):
+        camera = scene.cameras[view.camera]
+        small = camera.resized(320, round(camera.height * 320 / camera.width))
+        world = World(field, field.near)
+        picture, layers = render_frame(world, small, scene.c2w_world(view), 2, True, True)
+        photo = Image.fromarray(load_image(view, scene)).resize((small.width, small.height))
+        shown = [np.asarray(photo), picture, depth_picture(layers["depth"])]
+        shown += [normal_picture(layers["normal"])]
+        shown += [PAINT[layers["label"].astype(np.uint8)]] if "label" in layers else []
+        for row, each in zip(rows, shown, strict=False):
+            row[1].append(each)
+    return [row for row in rows if row[1]]
 
 
 def main() -> None:
@@ -32,23 +87,15 @@ def main() -> None:
     parser.add_argument("--columns", type=int, default=4)
     parser.add_argument("--supersample", type=int, default=2)
     parser.add_argument("--out", type=Path, default=GALLERY)
+    parser.add_argument("--surfaces", action="store_true")
     options = parser.parse_args()
-    flood = ["--flood.level", options.level]
-    smog = ["--smog.visibility", options.visibility]
-    snow = ["--snow.depth", options.snow]
-    weathers = {"clean": [], "flood": flood, "smog": smog, "snow": snow}
-    weathers["all"] = [*flood, *smog, *snow]
-    rows = []
-    with tempfile.TemporaryDirectory() as temporary:
-        for label, flags in weathers.items():
-            out = Path(temporary) / label
-            words = ["render", str(options.run), "-o", str(out), "--path", options.path]
-            words += ["--frames", str(options.columns), "--size", options.size]
-            common.command(*words, "--supersample", str(options.supersample), *flags)
-            frames = sorted((out / "frames").glob("*.png"))
-            rows.append((label, [np.asarray(Image.open(path)) for path in frames]))
+    name = f"{options.name}-surfaces" if options.surfaces else options.name
+    if options.surfaces:
+        rows = surfaces(options.run, options.columns)
+    else:
+        rows = weathers(options.run, options)
     sheet = contact_sheet(rows, options.columns, cell_width=320)
-    path = options.out / f"{options.name}.jpg"
+    path = options.out / f"{name}.jpg"
     size = write_jpeg(path, sheet, max_bytes=150_000)
     common.report("contact sheet", {"file": path.name, "bytes": size})
 

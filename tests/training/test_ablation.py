@@ -45,7 +45,7 @@ def test_each_row_leaves_out_just_what_it_says():
         "no normals": {"normals"},
         "no flatness": {"flat"},
         "no sky": {"sky_labels"},
-        "no depth": {"points", "monocular"},
+        "no depth": {"points", "ground", "monocular"},
         "full": set(),
     }
     plain = rows["plain NGP"]

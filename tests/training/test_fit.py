@@ -217,7 +217,7 @@ def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
     assert fitting.sky_samples(batch, samples, weights).tolist() == [1, 2]
     x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
     cell, _ = fitting.field._cells(fitting.field.to_grid(x[None]))
-    fitting.held.view(-1)[cell] = True  # a sparse point lies by the last
+    fitting.carving.held.view(-1)[cell] = True  # a sparse point lies by the last
     assert fitting.sky_samples(batch, samples, weights).tolist() == [1]
 
 
@@ -232,7 +232,7 @@ def test_space_outside_every_picture_stays_empty(scene):
         assert occupancy.occupied.view(-1)[cells][0] == 0
         if not again:
             occupancy.refine()
-            fitting.bar_cells(everywhere=False)
+            fitting.carving.bar(everywhere=False)
 
 
 def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypatch):

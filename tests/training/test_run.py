@@ -21,7 +21,7 @@ from climatenerf.storage import read_json, read_safetensors, write_json, write_s
 from climatenerf.training import run as run_module
 from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.sky_witness import SkyWitness
+from climatenerf.training.witness import Witness
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +179,7 @@ def labelled(fitting):
     pixels.label = torch.where(bright, SKY, BUILDING).to(torch.uint8)
     sizes = (pixels.pixel_start[1:] - pixels.pixel_start[:-1]).tolist()
     maps = [part.view(36, 48).numpy() for part in pixels.label.split(sizes)]
-    pixels.witness = SkyWitness([CAMERA] * len(maps), pixels.c2w.numpy(), maps)
+    pixels.witness = Witness([CAMERA] * len(maps), pixels.c2w.numpy(), maps, [SKY], 0.1)
     return run_module.Fitting(pixels, len(maps), fitting.extent, fitting.settings)
 
 
@@ -238,13 +238,16 @@ def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
     fitting = begin(scene, steps=4)
     fitting.field.occupancy.refine()
-    fitting.bar_cells(everywhere=False)
-    assert fitting.held.shape == fitting.field.occupancy.occupied.shape and fitting.held.any()
+    fitting.carving.bar(everywhere=False)
+    assert (
+        fitting.carving.held.shape == fitting.field.occupancy.occupied.shape
+        and fitting.carving.held.any()
+    )
     fitted(scene, tmp_path / "run", steps=2)  # its other files
     checkpoint(fitting, tmp_path / "run")
     again = begin(scene, steps=4)
     restore(again, tmp_path / "run")
-    assert torch.equal(again.held, fitting.held)
+    assert torch.equal(again.carving.held, fitting.carving.held)
     assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
 
 

@@ -447,8 +447,8 @@ def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correc
 
 
 @njit(cache=True, parallel=True)
-def sky_voices(x, radius, reach, starts, sizes, pinholes, c2w, least, agreed):
-    """Which places enough views see before nothing but sky: see `reference.sky_voices`.
+def voices_of(x, radius, reach, starts, sizes, pinholes, c2w, least, agreed):
+    """Which places enough views see before nothing but sky: see `reference.voices_of`.
 
     Args: the maps of all views in one row, reach, each from starts [v] on and of sizes [v, 2].
     """

@@ -195,7 +195,7 @@ def merge_order(
     return torch.cat(order), offsets_a + offsets_b
 
 
-def sky_voices(
+def voices_of(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
     reach: list[Tensor],

@@ -5,6 +5,8 @@ import numpy as np
 ROAD, BUILDING, VEGETATION, TERRAIN, SKY, PERSON, VEHICLE = range(7)
 CLASS_NAMES = ("road", "building", "vegetation", "terrain", "sky", "person", "vehicle")
 UNKNOWN = 255
+GROUND = (ROAD, TERRAIN)
+"""Classes that lie on the ground."""
 
 MERGED = np.full(256, UNKNOWN, np.uint8)
 """Class of each Cityscapes train id: road and pavement, what is built, ..., what moves."""

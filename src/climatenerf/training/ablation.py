@@ -79,7 +79,7 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         "no normals": without(normals=0.0),
         "no flatness": without(flat=0.0),
         "no sky": dataclasses.replace(full, sky_labels=False),
-        "no depth": without(points=0.0, monocular=0.0),
+        "no depth": without(points=0.0, ground=0.0, monocular=0.0),
         "full": full,
     }
 
@@ -136,7 +136,7 @@ def ablate(
     }
     write_json(out / FILE_NAME, data)
     write_bytes(out / TEXT_NAME, markdown(data).encode())
-    write_jpeg(out / SHEET, contact_sheet(sheet, cell_width=CELL), 400_000)
+    write_jpeg(out / SHEET, contact_sheet(sheet, cell_width=CELL), 150_000)
     return data
 
 

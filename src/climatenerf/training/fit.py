@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
@@ -23,7 +23,7 @@ from climatenerf.render.samples import Samples, offsets_of
 from climatenerf.render.view import LEAST_WEIGHT
 from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.training import losses
-from climatenerf.training.in_view import in_view
+from climatenerf.training.carving import Carving, on_the_ground
 from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.pixels import HORIZON, Batch, TrainingPixels
@@ -82,7 +82,7 @@ class Fitting:
         self.knows_sky = pixels.knows_sky
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
         self.fill = fill_sky(pixels, self.generator) if self.knows_sky else None
-        self.bar_cells()
+        self.carving = Carving(self.field, pixels, points, settings)
         kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
         classed = bool((SOLID_CLASSES[kinds.long()] != UNKNOWN).any())
         weigh = settings.losses
@@ -293,6 +293,8 @@ class Fitting:
                 # Leaves against the sky come first, clean edges last: too early, crowns are lost.
                 grown = min(1.0, max(SKY_AT_FIRST, 2 * self.progress - 0.5))
                 loss = loss + grown * weigh.sky * losses.sky_loss(weights[which], n)
+        if weigh.ground and self.carving.ground is not None:
+            loss = loss + weigh.ground * self.ground_loss(batch, samples, weights, t)
         solid = left.detach() < 0.5
         z = (mean_distance * batch.cosine).clamp_min(1e-3)  # of rays without matter: not counted
         m = batch.in_line.shape[0]
@@ -311,20 +313,33 @@ class Fitting:
             )
         return loss
 
+    def ground_loss(
+        self,
+        batch: Batch,
+        samples: Samples,
+        weights: Float[Tensor, "s"],
+        t: Float[Tensor, "s"],
+    ) -> Float[Tensor, ""]:
+        """How far matter on rays labelled ground is from the ground that points show."""
+        ray = samples.ray_index()
+        heavy = weights.detach() > GROUND_WEIGHT
+        some = (on_the_ground(batch.label)[ray] & heavy).nonzero()[:, 0]
+        own = ray[some]
+        d = batch.rays_d.detach()[own]
+        q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
+        far, goal = self.carving.far_from_ground(q, d, t[some])
+        some = some[far]
+        return losses.ground_loss(weights[some], t[some], goal, batch.rays_o.shape[0])
+
     def sky_samples(
         self, batch: Batch, samples: Samples, weights: Float[Tensor, "s"]
     ) -> Int[Tensor, "k"]:
         """Matter on rays labelled sky, where other photos see sky too and no point is known."""
         ray = samples.ray_index()
         asked = ((batch.label == SKY)[ray] & (weights > LEAST_WEIGHT)).nonzero()[:, 0]
-        witness = self.pixels.witness
-        if witness is None or not self.settings.carve:
-            return asked
         own = ray[asked]
         x = batch.rays_o.detach()[own] + samples.t[asked, None] * batch.rays_d.detach()[own]
-        agreed = witness.agreed(x, torch.zeros(asked.shape[0]))
-        cells, _ = self.field._cells(self.field.to_grid(x))
-        return asked[agreed & ~self.held.view(-1)[cells]]
+        return asked[self.carving.shows_sky(x)]
 
     def surface_loss(
         self,
@@ -435,39 +450,6 @@ class Fitting:
             sky = scale_gradient(sky, (batch.is_sky + unknown)[:, None])
         return own + left[:, None] * sky
 
-    def bar_cells(self, everywhere: bool = True) -> None:
-        """Bars the occupancy's cells that no photo has in view, and those that photos agree to be
-        sky, unless a point lies by them.
-
-        Args:
-            everywhere: ask of all cells; else of those that are occupied, which is quicker.
-        """
-        witness, occupancy = self.pixels.witness, self.field.occupancy
-        self.held = self.cells_of_points()
-        cells = torch.arange(occupancy.occupied.numel())
-        if not everywhere:
-            cells = cells[occupancy.occupied.view(-1) > 0]
-        centre, size = occupancy.cell_centres(cells)
-        x = centre * self.field.unit + self.field.centre
-        radius = size * (self.field.unit * 3**0.5 / 2)
-        empty = ~in_view(x, radius, self.pixels.pyramids)
-        if witness is not None and self.settings.carve:
-            empty |= witness.agreed(x, radius)
-        barred = occupancy.barred.view(-1)
-        barred[cells[empty]] = True
-        near = torch.nn.functional.max_pool3d(self.held[:, None].float(), 3, 1, padding=1)
-        barred[near.view(-1) > 0] = False
-        occupancy.occupied.view(-1)[barred] = 0
-
-    def cells_of_points(self) -> Bool[Tensor, "cascades side side side"]:
-        """The occupancy's cells in which sparse points lie."""
-        held = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
-        if self.points is not None:
-            ends = self.points.rays_o + self.points.depth[:, None] * self.points.rays_d
-            cells, inside = self.field._cells(self.field.to_grid(ends))
-            held.view(-1)[cells[inside]] = True
-        return held
-
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
         occupancy = self.field.occupancy
@@ -478,7 +460,7 @@ class Fitting:
         late = self.progress > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
-            self.bar_cells(everywhere=False)
+            self.carving.bar(everywhere=False)
 
     def adapt(self, rays: int, samples: int) -> None:
         """Keeps the samples per step at their budget, and makes marching finer with time.
@@ -529,6 +511,7 @@ OUTSTANDING = 6.0  # times the mean error: the least price of a mask
 SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
+GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
 SOLID_CLASSES = torch.from_numpy(SOLID_OF.astype(np.int64))
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0

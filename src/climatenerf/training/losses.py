@@ -56,6 +56,13 @@ def depth_loss(
     return (off.sum() + (left * (2.0 - goal)).sum()) / depth.shape[0]
 
 
+def ground_loss(
+    weights: Float[Tensor, "k"], t: Float[Tensor, "k"], goal: Float[Tensor, "k"], rays: int
+) -> Float[Tensor, ""]:
+    """Mean over rays of their matter's distance from the ground at `goal`, as in `depth_loss`."""
+    return (weights * (distance_measure(t) - distance_measure(goal)).abs()).sum() / rays
+
+
 def opacity_loss(transmittance: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Mean of -o·log o of the rays' opacity o: rays see matter or sky, not half of each."""
     opacity = (1.0 - transmittance).clamp(1e-6, 1.0)  # log 0

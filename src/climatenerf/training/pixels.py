@@ -10,12 +10,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.scene.cameras import Camera
-from climatenerf.scene.classes import MERGED, SKY, UNKNOWN
+from climatenerf.scene.classes import GROUND, MERGED, SKY, UNKNOWN
 from climatenerf.training.in_view import pyramids
-from climatenerf.training.sky_witness import SkyWitness
+from climatenerf.training.pixel_directions import Directions
+from climatenerf.training.witness import Witness
 
 SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
 HORIZON = -0.05  # rays that sink more than this end on matter: levelling is good to a degree or two
+SKY_SHARE = 0.1  # of the views that have a place before them: so many must show sky there,
+GROUND_SHARE = 0.3  # or ground
 EDGE = 2  # pixels to both sides that are such an edge
 
 
@@ -70,15 +73,14 @@ class TrainingPixels:
         Masks: pixels where a mask is 0 are never drawn.
         """
         self.c2w = torch.from_numpy(np.asarray(c2w, np.float32))
-        self.pyramids = pyramids([cameras[i] for i in camera_of], c2w)
-        directions = [torch.from_numpy(camera.directions().reshape(-1, 3)) for camera in cameras]
-        sizes = torch.tensor([d.shape[0] for d in directions])
-        self.directions = torch.cat(directions)
-        start_of_camera = torch.cat([torch.zeros(1, dtype=torch.long), sizes.cumsum(0)[:-1]])
-        camera_index = torch.as_tensor(list(camera_of))
-        self.direction_start = start_of_camera[camera_index]
+        self.cameras = [cameras[i] for i in camera_of]
+        self.directions = Directions(cameras)
+        self.camera = torch.as_tensor(list(camera_of))
+        self.pyramids = pyramids(self.cameras, c2w)
         counts = torch.tensor([image.shape[0] * image.shape[1] for image in images])
-        if not torch.equal(counts, sizes[camera_index]):
+        if any(
+            i.shape[:2] != (c.height, c.width) for i, c in zip(images, self.cameras, strict=True)
+        ):
             raise ValueError("an image's size differs from its camera's")
         self.pixel_start = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
         self.rgb = torch.from_numpy(np.concatenate([i.reshape(-1, 3) for i in images]))
@@ -92,17 +94,25 @@ class TrainingPixels:
                 np.full(image.shape[:2], UNKNOWN, np.uint8) if label is None else MERGED[label]
                 for label, image in zip(labels, images, strict=True)
             ]
-            for label, i, pose in zip(merged, camera_of, c2w, strict=True):
+            for image, label in enumerate(merged):
                 # Networks take puddles and wet walls for the sky that they mirror.
-                rises = directions[i].numpy() @ np.asarray(pose)[2, :3]
-                label[(label == SKY) & (rises.reshape(label.shape) < HORIZON)] = UNKNOWN
+                row, column = np.nonzero(label == SKY)
+                place = torch.from_numpy(column), torch.from_numpy(row)
+                d = self.directions.of(self.camera[image].expand(len(row)), *place)
+                low = (d @ self.c2w[image, 2, :3] < HORIZON).numpy()
+                label[row[low], column[low]] = UNKNOWN
             flat = np.concatenate([each.reshape(-1) for each in merged])
             # Labels that know nothing are none.
             self.label = torch.from_numpy(flat) if (flat != UNKNOWN).any() else None
         if self.label is not None and bool((self.label == SKY).any()):
             edge = np.concatenate([sky_edge(each).reshape(-1) for each in merged])
             self.edge = torch.from_numpy(np.flatnonzero(edge))
-            self.witness = SkyWitness([cameras[i] for i in camera_of], c2w, merged)
+            self.witness = Witness(self.cameras, c2w, merged, [SKY], SKY_SHARE)
+        self.ground_witness = None
+        if self.label is not None and bool(
+            torch.isin(self.label, torch.tensor(GROUND, dtype=torch.uint8)).any()
+        ):
+            self.ground_witness = Witness(self.cameras, c2w, merged, GROUND, GROUND_SHARE)
         self.relative = None
         if relative is not None and any(each is not None for each in relative):
             flat = [
@@ -127,6 +137,23 @@ class TrainingPixels:
         if self.label is not None:
             other.label = torch.where(self.label == SKY, UNKNOWN, self.label).to(torch.uint8)
         return other
+
+    def label_towards(
+        self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
+    ) -> UInt8[Tensor, "n"]:
+        """Merged class that an image's label has in a direction; unknown outside the picture."""
+        out = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
+        if self.label is None:
+            return out
+        for i in image.unique().tolist():
+            some = (image == i).nonzero()[:, 0]
+            camera = self.cameras[i]
+            pixel = camera.project((rays_d[some] @ self.c2w[i, :3, :3]).numpy())
+            with np.errstate(invalid="ignore"):  # behind the camera: NaN
+                inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=-1)
+            x, y = torch.from_numpy(pixel[inside].astype(np.int64)).unbind(-1)
+            out[some[inside]] = self.label[self.pixel_start[i] + y * camera.width + x]
+        return out
 
     @property
     def knows_sky(self) -> bool:
@@ -164,15 +191,16 @@ class TrainingPixels:
             within = torch.cat([within, left, right])
             pixel = self.pixel_start[image] + within
         width = self.width[image]
+        column, row = within % width, within.div(width, rounding_mode="floor")
         place = torch.stack(
             [
-                (within % width + 0.5) / width,
-                (within.div(width, rounding_mode="floor") + 0.5) / self.height[image],
+                (column + 0.5) / width,
+                (row + 0.5) / self.height[image],
             ],
             dim=-1,
         )
         c2w = self.c2w[image]
-        d = self.directions[self.direction_start[image] + within]
+        d = self.directions.of(self.camera[image], column, row)
         unknown = torch.full((n,), UNKNOWN, dtype=torch.uint8)
         return Batch(
             rays_o=c2w[:, :3, 3].contiguous(),

@@ -23,12 +23,20 @@ class PointRays:
     image: Int[Tensor, "m"]
     """Index of the training image."""
 
+    @property
+    def ends(self) -> Float[Tensor, "m 3"]:
+        """The points, world m."""
+        return self.rays_o + self.depth[:, None] * self.rays_d
+
+    def some(self, which: Tensor) -> "PointRays":
+        """Those of the given rows, or of a mask."""
+        return PointRays(
+            self.rays_o[which], self.rays_d[which], self.depth[which], self.image[which]
+        )
+
     def draw(self, n: int, generator: torch.Generator) -> "PointRays":
         """n random ones of them."""
-        chosen = torch.randint(self.depth.shape[0], (n,), generator=generator)
-        return PointRays(
-            self.rays_o[chosen], self.rays_d[chosen], self.depth[chosen], self.image[chosen]
-        )
+        return self.some(torch.randint(self.depth.shape[0], (n,), generator=generator))
 
 
 def find_point_rays(scene: Scene) -> PointRays | None:

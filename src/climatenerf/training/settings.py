@@ -24,6 +24,8 @@ class Losses:
     """Surfaces bend between neighbouring pixels."""
     points: float = 1e-1
     """Distance of matter from sparse points, where photos are known to show them."""
+    ground: float = 0.25
+    """Distance of matter from the ground that sparse points show, on rays labelled ground."""
     monocular: float = 1e-2
     """Depth differs from a network's relative depth, up to scale and shift for each image."""
     classes: float = 4e-2
@@ -78,6 +80,7 @@ PAPER = FitSettings(
         sky_fill=0.0,
         flat=0.0,
         points=0.0,
+        ground=0.0,
         monocular=1.0,
         classes=4e-2,
         normals=7e-4,

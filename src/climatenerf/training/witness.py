@@ -1,8 +1,8 @@
-"""Where photos agree that there is nothing: what lies on a ray that ends in the sky is empty.
+"""Where photos agree that there is nothing: on a ray that ends in the sky, or above the ground.
 
 Nothing stands behind the sky, so every point of a sky ray is empty, whatever else stands about: the
-views' sky carves the scene as silhouettes carve a visual hull (Laurentini 1994). Labels err, so one
-view's word is not enough.
+views' sky carves the scene as silhouettes carve a visual hull (Laurentini 1994). Likewise all that
+is above the ground on a ray that ends on it. Labels err, so one view's word is not enough.
 """
 
 from collections.abc import Sequence
@@ -14,29 +14,35 @@ from torch import Tensor
 
 from climatenerf.ops import cpu
 from climatenerf.scene.cameras import Camera
-from climatenerf.scene.classes import SKY, UNKNOWN
+from climatenerf.scene.classes import UNKNOWN
 
 VOICES = 64  # views that are asked, at most
 WIDEST = 400  # pixels of the maps that they are asked by
 REACH = 24  # pixels: within larger footprints nothing is claimed
-LEAST_VOICES, LEAST_SHARE = 2, 0.1  # views that must say sky, and of those that have it in view
+LEAST_VOICES = 2  # views that must agree
 APART = 0.1  # of the cameras' spread: neighbouring frames err alike, so they have one voice
 
 
-class SkyWitness:
-    """Asks views whether a place is in front of their sky."""
+class Witness:
+    """Asks views whether a place is in front of what they label as one of some classes."""
 
     def __init__(
         self,
         cameras: Sequence[Camera],
         c2w: Float[np.ndarray, "v 4 4"],
         labels: Sequence[UInt8[np.ndarray, "h w"]],
+        classes: Sequence[int],
+        share: float,
     ):
-        """Takes merged classes in the size of each view's camera; c2w in world metres."""
+        """Takes merged classes in the size of each view's camera; c2w in world metres.
+
+        `share`: of the views that have a place in view, those that must show the classes there.
+        """
+        self.share = share
         labelled = [i for i, label in enumerate(labels) if (label != UNKNOWN).any()]
         chosen = np.unique(np.linspace(0, len(labelled) - 1, VOICES).round().astype(int))
         asked = [labelled[i] for i in chosen]
-        maps = [sky_depth(cameras[i], labels[i]) for i in asked]
+        maps = [depth_within(cameras[i], np.isin(labels[i], classes)) for i in asked]
         self.reach = np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])
         self.sizes = np.array([each.shape for each, _ in maps])
         self.starts = np.append(0, self.sizes.prod(1).cumsum()[:-1])
@@ -46,9 +52,9 @@ class SkyWitness:
         self.apart = APART * float(np.linalg.norm(eyes - eyes.mean(0), axis=-1).mean())
 
     def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
-        """Whether enough views see nothing but sky within `radius` (m) of places x (world m)."""
+        """Whether enough views see nothing else within `radius` (m) of places x (world m)."""
         out = torch.empty(x.shape[0], dtype=torch.bool)
-        cpu.sky_voices(
+        cpu.voices_of(
             x.contiguous().numpy(),
             radius.numpy(),
             self.reach,
@@ -56,18 +62,18 @@ class SkyWitness:
             self.sizes,
             self.pinholes,
             self.c2w,
-            (LEAST_VOICES, LEAST_SHARE, self.apart),
+            (LEAST_VOICES, self.share, self.apart),
             out.numpy(),
         )
         return out
 
 
-def sky_depth(
-    camera: Camera, label: UInt8[np.ndarray, "h w"]
+def depth_within(
+    camera: Camera, whole: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "hs ws"], tuple[float, float, float, float]]:
-    """How many pixels within the sky each pixel lies, in a small picture without distortion.
+    """How many pixels within a mask each pixel lies, in a small picture without distortion.
 
-    1 at the sky's edge, 0 outside it, at most `REACH`. Also its fx, fy, cx, cy.
+    1 at the mask's edge, 0 outside it, at most `REACH`. Also its fx, fy, cx, cy.
     """
     width = min(WIDEST, camera.width)
     small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
@@ -77,14 +83,13 @@ def sky_depth(
     with np.errstate(invalid="ignore"):
         inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=-1)
     place = np.where(inside[..., None], np.nan_to_num(pixel), 0).astype(np.int64)
-    whole = label == SKY
     for _ in range(camera.width // width // 2):  # a wire thinner than a small pixel stays
         whole = eroded(whole)
-    sky = inside & whole[place[..., 1], place[..., 0]]
-    depth = np.zeros(sky.shape, np.float32)
+    part = inside & whole[place[..., 1], place[..., 0]]
+    depth = np.zeros(part.shape, np.float32)
     for _ in range(REACH):
-        depth += sky
-        sky = eroded(sky)
+        depth += part
+        part = eroded(part)
     return depth, (small.fx, small.fy, small.cx, small.cy)
 
 

@@ -6,8 +6,8 @@ import torch
 from climatenerf.ops import reference
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import BUILDING, SKY, UNKNOWN
-from climatenerf.training import sky_witness
-from climatenerf.training.sky_witness import SkyWitness, sky_depth
+from climatenerf.training import witness
+from climatenerf.training.witness import Witness, depth_within
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 40.0, 30.0)
 TOWER = (np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 2.0]))
@@ -40,10 +40,10 @@ def labels(camera, c2w):
     return np.where(solid, BUILDING, SKY).astype(np.uint8)
 
 
-def witness(count=12, change=None):
+def asking(count=12, change=None):
     c2w = poses(count)
     maps = [labels(CAMERA, pose) for pose in c2w]
-    return SkyWitness([CAMERA] * count, c2w, change(maps) if change else maps)
+    return Witness([CAMERA] * count, c2w, change(maps) if change else maps, [SKY], 0.1)
 
 
 def places(n=4000, seed=0):
@@ -59,7 +59,7 @@ def in_matter(x, margin=0.0):
 
 def test_the_tower_and_the_ground_stay_and_the_air_beside_them_goes():
     x = places()
-    agreed = witness().agreed(x, torch.full((len(x),), 0.1))
+    agreed = asking().agreed(x, torch.full((len(x),), 0.1))
     assert not (agreed & in_matter(x, 0.1)).any()
     beside = (x[:, :2].norm(dim=-1) > 1.0) & (x[:, :2].norm(dim=-1) < 2.5)
     beside &= (x[:, 2] > 1.3) & (x[:, 2] < 2.0)
@@ -67,7 +67,7 @@ def test_the_tower_and_the_ground_stay_and_the_air_beside_them_goes():
 
 
 def test_larger_footprints_are_emptied_less():
-    x, one = places(), witness()
+    x, one = places(), asking()
     shares = [one.agreed(x, torch.full((len(x),), r)).float().mean() for r in (0.0, 0.2, 0.8)]
     assert shares[0] > shares[1] > shares[2]
 
@@ -76,7 +76,7 @@ def test_one_view_alone_empties_nothing():
     """All others have no word: they show matter everywhere, or no labels at all."""
     x = places()
     for other in (BUILDING, UNKNOWN):
-        alone = witness(
+        alone = asking(
             change=lambda maps, o=other: [maps[0]] + [np.full_like(m, o) for m in maps[1:]]
         )
         assert not alone.agreed(x, torch.zeros(len(x))).any()
@@ -89,7 +89,7 @@ def test_a_wrong_label_in_one_view_of_many_removes_no_matter():
     x = places()
     x = x[in_matter(x, -0.1)]
     assert len(x) > 100
-    assert not witness(12, err).agreed(x, torch.zeros(len(x))).any()
+    assert not asking(12, err).agreed(x, torch.zeros(len(x))).any()
 
 
 def test_neighbouring_frames_have_one_voice():
@@ -102,8 +102,8 @@ def test_neighbouring_frames_have_one_voice():
     c2w = poses(12)
     c2w[1, :3, 3] = c2w[0, :3, 3] + [0.0, 0.2, 0.0]
     maps = [labels(CAMERA, pose) for pose in c2w]
-    close = SkyWitness([CAMERA] * 12, c2w, err(maps, {0, 1}))
-    far = SkyWitness([CAMERA] * 12, c2w, err(maps, {0, 6}))
+    close = Witness([CAMERA] * 12, c2w, err(maps, {0, 1}), [SKY], 0.1)
+    far = Witness([CAMERA] * 12, c2w, err(maps, {0, 6}), [SKY], 0.1)
     assert not close.agreed(x, torch.zeros(1)).any()
     assert far.agreed(x, torch.zeros(1)).any()
 
@@ -115,15 +115,15 @@ def test_few_voices_among_many_watchers_are_not_enough(monkeypatch):
         return [np.full_like(maps[0], SKY)] * 2 + maps[2:]
 
     x = torch.tensor([[0.0, 0.0, 1.0]])
-    assert not witness(30, err).agreed(x, torch.zeros(1)).any()
-    assert witness(12, err).agreed(x, torch.zeros(1)).any()
+    assert not asking(30, err).agreed(x, torch.zeros(1)).any()
+    assert asking(12, err).agreed(x, torch.zeros(1)).any()
 
 
 def test_depth_within_the_sky_counts_pixels_from_its_edge():
     label = np.full((20, 30), BUILDING, np.uint8)
     label[3:12, 5:20] = SKY
     camera = Camera(30, 20, 25.0, 25.0, 15.0, 10.0)
-    depth, intrinsics = sky_depth(camera, label)
+    depth, intrinsics = depth_within(camera, label == SKY)
     assert intrinsics == (25.0, 25.0, 15.0, 10.0)
     assert depth[3, 10] == 1 and depth[7, 12] == 5 and depth[2, 10] == 0
     assert depth.max() == 5
@@ -131,10 +131,10 @@ def test_depth_within_the_sky_counts_pixels_from_its_edge():
 
 def test_a_thin_wire_in_a_large_photo_is_not_lost(monkeypatch):
     """One pixel wide, it would fall between the pixels of the small map."""
-    monkeypatch.setattr(sky_witness, "WIDEST", 40)
+    monkeypatch.setattr(witness, "WIDEST", 40)
     label = np.full((90, 120), SKY, np.uint8)
     label[:, 61] = BUILDING
-    depth, _ = sky_depth(Camera(120, 90, 100.0, 100.0, 60.0, 45.0), label)
+    depth, _ = depth_within(Camera(120, 90, 100.0, 100.0, 60.0, 45.0), label == SKY)
     assert (depth[5:-5, 20] == 0).all()
     assert (depth[15, 8:14] > 0).all()
 
@@ -142,7 +142,7 @@ def test_a_thin_wire_in_a_large_photo_is_not_lost(monkeypatch):
 def test_a_distorted_camera_is_asked_at_the_right_pixel():
     bent = Camera(80, 60, 60.0, 60.0, 40.0, 30.0, k1=-0.15)
     c2w = poses(12)
-    one = SkyWitness([bent] * 12, c2w, [labels(bent, pose) for pose in c2w])
+    one = Witness([bent] * 12, c2w, [labels(bent, pose) for pose in c2w], [SKY], 0.1)
     x = places()
     agreed = one.agreed(x, torch.full((len(x),), 0.1))
     assert agreed.any() and not (agreed & in_matter(x, 0.1)).any()
@@ -152,16 +152,18 @@ def test_the_kernel_matches_its_twin():
     c2w = poses(12)
     wide = Camera(100, 40, 60.0, 55.0, 52.0, 19.0)  # views need not be of one size
     cameras = [CAMERA, wide] * 6
-    found = SkyWitness(cameras, c2w, [labels(*each) for each in zip(cameras, c2w, strict=True)])
+    found = Witness(
+        cameras, c2w, [labels(*each) for each in zip(cameras, c2w, strict=True)], [SKY], 0.1
+    )
     x, radius = places(), 0.3 * torch.rand(4000, generator=torch.Generator().manual_seed(1))
     ends = found.starts + found.sizes.prod(1)
     reach = [
         torch.from_numpy(found.reach[start:end].reshape(size).astype(np.float32))
         for start, end, size in zip(found.starts, ends, found.sizes, strict=True)
     ]
-    least = (sky_witness.LEAST_VOICES, sky_witness.LEAST_SHARE, found.apart)
+    least = (witness.LEAST_VOICES, found.share, found.apart)
     views = (torch.from_numpy(found.pinholes), torch.from_numpy(found.c2w))
-    real = reference.sky_voices(x, radius, reach, *views, least)
+    real = reference.voices_of(x, radius, reach, *views, least)
     ours = found.agreed(x, radius)
     # Rounding may put a place that lies on a pixel's border into its neighbour.
     assert (ours == real).float().mean() > 0.999

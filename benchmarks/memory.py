@@ -1,0 +1,101 @@
+"""How much memory does fitting take, and how does it grow with the number of photos?
+
+python benchmarks/memory.py
+python benchmarks/memory.py --photos 50 100 200 --size 1000x750 --steps 300
+
+The embedded street's photos, enlarged and repeated as often as asked for, each as if it had a
+camera of its own (the worst case); every fit in a process of its own. Peak resident memory in GB
+(10^9 bytes), how much a photo adds, and what its 8-bit pixels are.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import common
+import numpy as np
+from PIL import Image
+
+from climatenerf.cli.render import parse_size
+from climatenerf.scene import read_scene
+
+STREET = Path(common.__file__).resolve().parents[1] / "src/climatenerf/assets/street"
+
+
+def capture(folder: Path, photos: int, width: int, height: int, labels: bool) -> None:
+    """A capture of so many photos in nerfstudio's format."""
+    scene = read_scene(STREET)
+    (folder / "images").mkdir(parents=True)
+    (folder / "labels").mkdir()
+    frames = []
+    for index in range(photos):
+        view = scene.views[index % len(scene.views)]
+        name = f"{index:04d}"
+        with Image.open(view.path) as photo:
+            photo.resize((width, height)).save(folder / f"images/{name}.jpg", quality=90)
+        if labels:
+            with Image.open(STREET / "labels" / f"{view.path.stem}.png") as label:
+                nearest = label.resize((width, height), Image.Resampling.NEAREST)
+                nearest.save(folder / f"labels/{name}.png")
+        c2w = np.array(view.c2w) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        camera = scene.cameras[view.camera].resized(width, height)
+        frames.append(
+            {
+                "file_path": f"images/{name}.jpg",
+                "transform_matrix": c2w.tolist(),
+                "w": width,
+                "h": height,
+                "fl_x": camera.fx + 1e-3 * index,
+                "fl_y": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+            }
+        )
+    (folder / "transforms.json").write_text(json.dumps({"frames": frames}))
+
+
+def peak(scene: Path, run: Path, steps: int) -> float:
+    """Peak resident memory of a fit, bytes."""
+    words = [common.PYTHON, "-m", "climatenerf", "fit", str(scene), "-o", str(run)]
+    words += ["--minutes", "60", "--steps", str(steps), "--metric-input"]
+    child = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(child.pid, 0)
+    if status:
+        sys.exit("the fit failed; what it printed says why")
+    # Linux counts in KiB, macOS in bytes.
+    return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--photos", type=int, nargs="+", default=[50, 200])
+    parser.add_argument("--size", default="1000x750")
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--no-labels", action="store_true")
+    options = parser.parse_args()
+    asked = parse_size(options.size)
+    if asked is None:
+        parser.error("--size has to be WxH")
+    width, height = asked
+    rows = []
+    for photos in options.photos:
+        with tempfile.TemporaryDirectory() as temporary:
+            scene = Path(temporary) / "scene"
+            capture(scene, photos, width, height, not options.no_labels)
+            bytes_ = peak(scene, Path(temporary) / "run", options.steps)
+        rows.append({"photos": photos, "peak_gb": bytes_ / 1e9})
+    first, last = rows[0], rows[-1]
+    grown = last["photos"] - first["photos"]
+    results = {"size": options.size, "steps": options.steps, "fits": rows}
+    if grown:
+        results["mb_per_photo"] = 1e3 * (last["peak_gb"] - first["peak_gb"]) / grown
+        results["pixels_mb_per_photo"] = 3e-6 * width * height
+    common.report("peak memory of fitting", results)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""What photos, labels and sparse points say of space before anything is learned.
+
+Cells that no photo has in view stay empty, as do those that photos agree to be before the sky or
+above the ground; where points lie, or matter that is not ground, nothing is carved.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from climatenerf.field.field import Field
+from climatenerf.scene.classes import GROUND
+from climatenerf.training.ground_map import draw_ground
+from climatenerf.training.in_view import in_view
+from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.points import PointRays
+from climatenerf.training.settings import FitSettings
+
+
+class Carving:
+    """Bars cells of a field's occupancy, and answers where sky and ground are seen."""
+
+    def __init__(
+        self,
+        field: Field,
+        pixels: TrainingPixels,
+        points: PointRays | None,
+        settings: FitSettings,
+    ):
+        self.field, self.pixels, self.points = field, pixels, points
+        self.carves = settings.carve
+        self.ground, self.standing = None, None
+        if settings.losses.ground and points is not None:
+            lies = on_the_ground(pixels.label_towards(points.image, points.rays_d))
+            self.ground = draw_ground(field.to_grid(points.some(lies).ends))
+            self.standing = points.some(~lies)
+        self.bar()
+
+    def bar(self, everywhere: bool = True) -> None:
+        """Bars the cells that are known to be empty.
+
+        Args:
+            everywhere: ask of all cells; else of those that are occupied, which is quicker.
+        """
+        witness, occupancy = self.pixels.witness, self.field.occupancy
+        self.find_cells_of_points()
+        cells = torch.arange(occupancy.occupied.numel())
+        if not everywhere:
+            cells = cells[occupancy.occupied.view(-1) > 0]
+        centre, size = occupancy.cell_centres(cells)
+        x = centre * self.field.unit + self.field.centre
+        radius = size * (self.field.unit * 3**0.5 / 2)
+        empty = ~in_view(x, radius, self.pixels.pyramids)
+        if witness is not None and self.carves:
+            empty |= witness.agreed(x, radius)
+        barred = occupancy.barred.view(-1)
+        barred[cells[empty]] = True
+        barred[_grown(self.held).view(-1)] = False
+        if self.ground is not None and self.carves:
+            over, known = self.ground.over(centre)
+            high = (known & (over > self.ground.tolerance + size * 3**0.5 / 2)).nonzero()[:, 0]
+            high = high[self.shows_ground(centre[high], radius[high])]
+            barred[cells[high]] = True
+            barred[_grown(self.stands).view(-1)] = False
+        occupancy.occupied.view(-1)[barred] = 0
+
+    def find_cells_of_points(self) -> None:
+        """Notes the occupancy's cells in which sparse points lie, and those not of the ground."""
+        self.held, self.stands = self.cells_of(self.points), self.cells_of(self.standing)
+
+    def cells_of(self, points: PointRays | None) -> Bool[Tensor, "cascades side side side"]:
+        """The occupancy's cells in which points lie."""
+        held = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
+        if points is not None:
+            cells, inside = self.field._cells(self.field.to_grid(points.ends))
+            held.view(-1)[cells[inside]] = True
+        return held
+
+    def shows_sky(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether photos agree to see sky behind places x (world m), and no point is by them."""
+        witness = self.pixels.witness
+        if witness is None or not self.carves:
+            return torch.ones(x.shape[0], dtype=torch.bool)
+        agreed = witness.agreed(x, torch.zeros(x.shape[0]))
+        cells, _ = self.field._cells(self.field.to_grid(x))
+        return agreed & ~self.held.view(-1)[cells]
+
+    def shows_ground(
+        self, q: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]
+    ) -> Bool[Tensor, "n"]:
+        """Whether photos agree to see ground behind balls about q (grid units); radius in m."""
+        witness = self.pixels.ground_witness
+        if witness is None:
+            return torch.zeros(q.shape[0], dtype=torch.bool)
+        return witness.agreed(q * self.field.unit + self.field.centre, radius)
+
+    def far_from_ground(
+        self, q: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], t: Float[Tensor, "n"]
+    ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
+        """Which samples of rays to the ground lie too far from it, and where (t) they should.
+
+        Only those where photos agree to see ground: a label that is wrong empties nothing.
+        """
+        if self.ground is None:
+            return torch.zeros(0, dtype=torch.long), t[:0]
+        over, known = self.ground.over(q)
+        ahead, _ = self.ground.over(q + STEP * rays_d)
+        nearing = (over - ahead) / STEP
+        off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
+        far = (known & (nearing > LEAST_NEARING) & (off != 0)).nonzero()[:, 0]
+        far = far[self.shows_ground(q[far], torch.zeros_like(t[far]))]
+        return far, (t[far] + off[far] / nearing[far]).clamp_min(0.0)
+
+
+def on_the_ground(label: UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Whether merged classes are such as lie on the ground."""
+    return torch.isin(label, torch.tensor(GROUND, dtype=torch.uint8))
+
+
+def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:
+    """Cells and their neighbours."""
+    return torch.nn.functional.max_pool3d(cells[:, None].float(), 3, 1, padding=1)[:, 0] > 0
+
+
+STEP = 0.05  # grid units over which a ray nears the ground
+LEAST_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst

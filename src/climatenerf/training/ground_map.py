@@ -1,0 +1,97 @@
+"""Ground as one height over each place, told by the sparse points that photos label ground.
+
+Far lawns and roads look the same wherever they lie: at grazing angles a lump of some decimetres
+hardly moves a pixel, but snow, water and smog show it. Points are few and right, and ground between
+them bends little; so rays that are labelled ground are to end near that height.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+CELLS = 33  # lines along an edge
+HALF_SIDE = 4.0  # grid units
+LEAST_POINTS, MOST_POINTS = 50, 6000  # by which a map is drawn
+REACH = 0.5  # grid units around a point in which the map is believed
+STIFF = 0.05  # price of bending against the points' mean distance
+ROUNDS = 15  # of reweighted least squares
+FINEST = 2e-3  # grid units: points are not believed to be nearer the ground
+LEAST_TOLERANCE = 7.5e-3  # grid units: kerbs and tufts that the map does not know
+ROUGHNESS = 2.0  # tolerance over the distance within which nine tenths of the points lie
+
+
+@dataclass(frozen=True)
+class GroundMap:
+    """Heights on lines about the scene's middle, rows along y; all in grid units."""
+
+    height: Float[Tensor, "c c"]
+    known: Bool[Tensor, "c c"]
+    """Where points are near."""
+    tolerance: float
+    """Ground may be this far from the map."""
+
+    def over(self, q: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
+        """Height of positions over the map, and whether the map is known there."""
+        corner, share = _cells(q)
+        nearest = corner + (share > 0.5)
+        inside = (q[:, :2].abs() < HALF_SIDE).all(-1)
+        height = torch.zeros(q.shape[0])
+        for x, y, weight in _corners(corner, share):
+            height += weight * self.height[y, x]
+        return q[:, 2] - height, inside & self.known[nearest[:, 1], nearest[:, 0]]
+
+
+def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
+    """The map through points on the ground (grid units); None for too few.
+
+    The least mean distance (not squared: labels err) plus the price of bending, the thin plate's.
+    """
+    q = q[(q[:, :2].abs() < HALF_SIDE).all(-1)]
+    if q.shape[0] < LEAST_POINTS:
+        return None
+    q = q[:: -(-q.shape[0] // MOST_POINTS)]
+    n = q.shape[0]
+    rows = torch.arange(n)
+    looks = torch.zeros(n, CELLS * CELLS, dtype=torch.float64)
+    for x, y, weight in _corners(*_cells(q)):
+        looks[rows, y * CELLS + x] = weight.double()
+    one = torch.eye(CELLS, dtype=torch.float64)
+    slope, bend = one[1:] - one[:-1], one[2:] - 2 * one[1:-1] + one[:-2]
+    along_x, along_y, twist = torch.kron(one, bend), torch.kron(bend, one), torch.kron(slope, slope)
+    price = STIFF * (along_x.T @ along_x + along_y.T @ along_y + 2 * twist.T @ twist)
+    price += 1e-9 * torch.eye(CELLS * CELLS, dtype=torch.float64)  # points in a line: singular
+    z = q[:, 2].double()
+    middle = z.median()
+    weight = torch.ones_like(z)
+    height = torch.zeros(CELLS * CELLS, dtype=torch.float64)
+    for _ in range(ROUNDS):
+        pull = looks.T * (weight / n)
+        height = torch.linalg.solve(pull @ looks + price, pull @ (z - middle))
+        weight = 1 / (looks @ height + middle - z).abs().clamp_min(FINEST)
+    off = (looks @ height + middle - z).abs()
+    line = torch.linspace(-HALF_SIDE, HALF_SIDE, CELLS)
+    lines = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
+    near = torch.cdist(lines, q[:, :2]).amin(-1)
+    return GroundMap(
+        height=(height + middle).float().view(CELLS, CELLS),
+        known=(near < REACH).view(CELLS, CELLS),
+        tolerance=max(LEAST_TOLERANCE, ROUGHNESS * float(off.quantile(0.9))),
+    )
+
+
+def _cells(q: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 2"], Float[Tensor, "n 2"]]:
+    """Lower line of each position's cell, along x and y, and its place in the cell."""
+    place = (q[:, :2] / HALF_SIDE + 1).clamp(0, 2) * ((CELLS - 1) / 2)
+    corner = place.long().clamp_max(CELLS - 2)
+    return corner, place - corner
+
+
+def _corners(corner: Int[Tensor, "n 2"], share: Float[Tensor, "n 2"]):
+    """Line along x, line along y and bilinear weight of each cell's four corners."""
+    for right in (0, 1):
+        for up in (0, 1):
+            x = share[:, 0] if right else 1 - share[:, 0]
+            y = share[:, 1] if up else 1 - share[:, 1]
+            yield corner[:, 0] + right, corner[:, 1] + up, x * y

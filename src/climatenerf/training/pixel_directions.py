@@ -1,0 +1,53 @@
+"""Directions of pixels, from a coarse lattice of them.
+
+Directions of every pixel would take four times the memory of the photos where each photo has a
+camera of its own. Distortion is smooth, so a lattice does; without distortion it is exact.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from climatenerf.scene.cameras import Camera
+
+SPACING = 4  # pixels
+WIDE = 0.1  # cosine from the axis below which directions are not scaled to depth 1
+
+
+class Directions:
+    """Directions of all pixels of some cameras."""
+
+    def __init__(self, cameras: Sequence[Camera]):
+        lattices = [_lattice(camera) for camera in cameras]
+        counts = [each.shape[0] * each.shape[1] for each in lattices]
+        self.across = torch.tensor([each.shape[1] for each in lattices])
+        self.start = torch.tensor([0, *np.cumsum(counts)[:-1].tolist()])
+        flat = [each.reshape(-1, 3) for each in lattices]
+        self.lattice = torch.from_numpy(np.concatenate(flat).astype(np.float32))
+
+    def of(
+        self, camera: Int[Tensor, "n"], column: Int[Tensor, "n"], row: Int[Tensor, "n"]
+    ) -> Float[Tensor, "n 3"]:
+        """Unit directions, in the cameras' frames, through the middles of pixels."""
+        x, y = (column + 0.5) / SPACING, (row + 0.5) / SPACING
+        i, j = x.long(), y.long()
+        u, v = (x - i)[:, None], (y - j)[:, None]
+        across = self.across[camera]
+        corner = self.start[camera] + j * across + i
+        upper = (1 - u) * self.lattice[corner] + u * self.lattice[corner + 1]
+        below = corner + across
+        lower = (1 - u) * self.lattice[below] + u * self.lattice[below + 1]
+        return torch.nn.functional.normalize((1 - v) * upper + v * lower, dim=-1)
+
+
+def _lattice(camera: Camera) -> Float[np.ndarray, "h w 3"]:
+    """Vectors along the rays through every `SPACING`th pixel corner, to past the last pixel."""
+    x = np.arange(-(-camera.width // SPACING) + 1) * SPACING
+    y = np.arange(-(-camera.height // SPACING) + 1) * SPACING
+    d = camera.directions(np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64))
+    z = d[..., 2:].astype(np.float64)
+    # Of a plane without distortion the lattice is evenly spaced; a fisheye may look backwards.
+    return d / z if z.min() > WIDE else d
