@@ -102,9 +102,25 @@ def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
     d = (foot - o) / way[:, None]
     t = way * torch.tensor([0.7, 1.0, 1.2, 1.0])  # above, on and under the ground; on the tower
     x = o + t[:, None] * d
-    far, goal = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit)
+    far, goal = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit, 0.0)
     assert far.tolist() == [0, 2]
     assert torch.allclose(goal * found.field.unit, way[[0, 2]], atol=0.15)
+
+
+def test_a_margin_spares_what_is_beside_the_tower():
+    found = carving()
+    o = torch.tensor([4.0, 0.0, 1.5]).expand(60, 3)
+    beside = torch.tensor([0.0, 0.0, 1.0]) + torch.linspace(0.55, 2.5, 60)[:, None] * torch.tensor(
+        [0.0, 1.0, 0.0]
+    )
+    beside[:, 2] = 0.9
+    t = (beside - o).norm(dim=-1)
+    d = (beside - o) / t[:, None]
+    asked = found.field.to_grid(beside), d, t / found.field.unit
+    near, _ = found.far_from_ground(*asked, 0.0)
+    wide, _ = found.far_from_ground(*asked, 0.5 / found.field.unit)
+    assert 0 < len(wide) < len(near)
+    assert beside[wide[0], 1] - beside[near[0], 1] > 0.2
 
 
 def test_a_label_is_looked_up_where_a_ray_goes_through_the_picture():

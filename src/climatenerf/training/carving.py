@@ -95,11 +95,16 @@ class Carving:
         return witness.agreed(q * self.field.unit + self.field.centre, radius)
 
     def far_from_ground(
-        self, q: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], t: Float[Tensor, "n"]
+        self,
+        q: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t: Float[Tensor, "n"],
+        margin: float,
     ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
         """Which samples of rays to the ground lie too far from it, and where (t) they should.
 
-        Only those where photos agree to see ground: a label that is wrong empties nothing.
+        Only those where photos agree to see ground, and nothing else within a margin (all in grid
+        units): a label that is wrong empties nothing.
         """
         if self.ground is None:
             return torch.zeros(0, dtype=torch.long), t[:0]
@@ -108,7 +113,8 @@ class Carving:
         nearing = (over - ahead) / STEP
         off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
         far = (known & (nearing > LEAST_NEARING) & (off != 0)).nonzero()[:, 0]
-        far = far[self.shows_ground(q[far], torch.zeros_like(t[far]))]
+        around = torch.full_like(t[far], margin * self.field.unit)
+        far = far[self.shows_ground(q[far], around)]
         return far, (t[far] + off[far] / nearing[far]).clamp_min(0.0)
 
 

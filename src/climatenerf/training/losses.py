@@ -59,8 +59,13 @@ def depth_loss(
 def ground_loss(
     weights: Float[Tensor, "k"], t: Float[Tensor, "k"], goal: Float[Tensor, "k"], rays: int
 ) -> Float[Tensor, ""]:
-    """Mean over rays of their matter's distance from the ground at `goal`, as in `depth_loss`."""
-    return (weights * (distance_measure(t) - distance_measure(goal)).abs()).sum() / rays
+    """Mean over rays of their matter's distance from the ground at `goal`, as in `depth_loss`.
+
+    At most `FAR` counts: lumps are near the ground, and the rim of a tree before a far lawn must
+    not outweigh its colours.
+    """
+    off = (distance_measure(t) - distance_measure(goal)).abs().clamp_max(FAR)
+    return (weights * off).sum() / rays
 
 
 def opacity_loss(transmittance: Float[Tensor, "n"]) -> Float[Tensor, ""]:
@@ -134,4 +139,5 @@ def masked_colour_loss(
     return ((1.0 - mask) * error + price * mask).mean()
 
 
+FAR = 0.05  # of `distance_measure`
 CREASE = 0.03  # bending that counts as an edge rather than as noise
