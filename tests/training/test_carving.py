@@ -94,6 +94,19 @@ def test_a_view_that_takes_the_tower_for_ground_does_not_remove_it():
     assert inside.sum() > 20 and not barred[inside].any()
 
 
+def test_matter_with_points_of_its_own_stays_though_half_of_the_views_take_it_for_ground():
+    def err(maps):
+        return [*maps[:6], *(np.where(m == 2, 9, m).astype(np.uint8) for m in maps[6:])]
+
+    found = carving(err)
+    x, size, barred = cells_of(found)
+    high = (x[:, 2] > size) & (x[:, 2] < 1.8)
+    side = high & ((x[:, 0] - 0.5).abs() < size / 2) & (x[:, 1].abs() < 0.4)
+    away = high & (x[:, 0] < 0) & in_matter(x)
+    assert side.sum() > 5 and not barred[side].any(), "points lie on this side"
+    assert barred[away].any(), "and none here"
+
+
 def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
     found = carving()
     o = torch.tensor([4.0, 0.0, 1.5]).expand(4, 3)

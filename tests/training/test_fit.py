@@ -12,12 +12,15 @@ from climatenerf.evaluation.metrics import psnr
 from climatenerf.field.extent import find_extent
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
+from climatenerf.render.frame import render_frame
 from climatenerf.render.samples import Samples
 from climatenerf.render.view import camera_rays, render_view
+from climatenerf.render.world import World
 from climatenerf.scene import load_image
 from climatenerf.scene.classes import ROAD, SKY, UNKNOWN, VEHICLE
 from climatenerf.training import fit, losses
 from climatenerf.training.fit import Fitting, scale_gradient
+from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings, Losses
@@ -396,6 +399,61 @@ def test_points_put_matter_where_they_are(scene):
             weights, left, samples.t / unit, rays.depth / unit, samples.ray_index()
         )
     assert off["with"] < 0.6 * off["without"], off
+
+
+def labelled(scene):
+    """The scene's pixels with the toy's ground labelled terrain, and points on that ground."""
+    labels, ends = [], []
+    for view in scene.of_split("train"):
+        _, layers = render_frame(World(FIELD), CAMERA, scene.c2w_world(view))
+        d = CAMERA.directions() @ scene.c2w_world(view)[:3, :3].T
+        x = scene.c2w_world(view)[:3, 3] + layers["depth"][..., None] * d
+        ground = np.isfinite(layers["depth"]) & (x[..., 2] < 0.02)
+        labels.append(np.where(ground, 9, np.where(np.isfinite(layers["depth"]), 2, 10)))
+        ends.append(x[ground & (layers["depth"] < 6)][::40])
+    views = scene.of_split("train")
+    seen = np.cumsum([0] + [len(each) for each in ends])
+    known = {
+        view.name: replace(view, seen=np.arange(a, b))
+        for view, a, b in zip(views, seen, seen[1:], strict=False)
+    }
+    shown = tuple(known.get(view.name, view) for view in scene.views)
+    scene = replace(scene, points=np.concatenate(ends), views=shown)
+    pixels = TrainingPixels(
+        [CAMERA],
+        [0] * len(views),
+        np.stack([scene.c2w_world(view) for view in views]),
+        [load_image(view, scene) for view in views],
+        [each.astype(np.uint8) for each in labels],
+    )
+    return scene, pixels
+
+
+def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene):
+    """Without points as depth, which would do the same: by the map of the ground alone."""
+    known, pixels = labelled(scene)
+    views = known.of_split("train")
+    extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
+    above = {}
+    for weight in (20.0, 0.0):
+        settings = FitSettings(
+            preset="tiny",
+            minutes=None,
+            steps=40,
+            samples_per_step=2**15,
+            losses=Losses(points=0.0, ground=weight),
+        )
+        fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(known))
+        fitting.run(lambda _: None)
+        batch = pixels.draw(3000, torch.Generator().manual_seed(1))
+        d, o = batch.rays_d[batch.label == 3], batch.rays_o[batch.label == 3]
+        near, far = torch.full((len(d),), fitting.field.near), torch.full((len(d),), 1e9)
+        samples = fitting.field.march(o, d, near, far)
+        weights, _ = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        ray = samples.ray_index()
+        height = o[ray, 2] + samples.t * d[ray, 2]
+        above[weight] = float((weights * (height > 0.15)).sum() / len(d))
+    assert above[20.0] < 0.5 * above[0.0], above
 
 
 @pytest.mark.slow

@@ -31,6 +31,17 @@ def test_planes_do_not_bend_however_tilted(normal):
         assert abs(losses.bending(torch.stack([middle, left, right_])[None])) < 1e-6
 
 
+def test_ground_loss_is_the_mean_distance_from_the_ground_up_to_a_bound():
+    weights = torch.tensor([0.5, 0.5, 0.2], requires_grad=True)
+    t, goal = torch.tensor([0.5, 0.9, 1.0]), torch.tensor([0.53, 0.89, 4.0])
+    loss = losses.ground_loss(weights, t, goal, 4)
+    assert loss.item() == pytest.approx((0.5 * 0.03 + 0.5 * 0.01 + 0.2 * losses.FAR) / 4)
+    (gradient,) = torch.autograd.grad(loss, weights)
+    assert torch.allclose(gradient, torch.tensor([0.03, 0.01, losses.FAR]) / 4)
+    nothing = torch.zeros(0)
+    assert losses.ground_loss(nothing, nothing, nothing, 4) == 0
+
+
 def test_a_bump_bends_and_an_edge_costs_no_more_than_one():
     bump, edge = torch.tensor([[0.97, 1.0, 1.0]]), torch.tensor([[1.0, 1.0, 9.0]])
     assert losses.bending(bump) == pytest.approx(2 * (0.97 - 1.0), rel=1e-4)
