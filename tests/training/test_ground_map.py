@@ -74,8 +74,12 @@ def test_few_points_draw_no_map():
 
 def test_many_points_are_thinned_evenly(monkeypatch):
     monkeypatch.setattr(ground_map, "MOST_POINTS", 300)
+    asked = []
+    cells = ground_map._cells
+    monkeypatch.setattr(ground_map, "_cells", lambda q: asked.append(q) or cells(q))
     xy = places(3000)
     ground = draw_ground(on(xy, hills(xy)))
+    assert len(asked) == 1 and torch.equal(asked[0], on(xy, hills(xy))[::10])
     assert ground is not None
     assert ground.over(on(xy, hills(xy)))[0].abs().quantile(0.9) < 0.012
 

@@ -18,12 +18,16 @@ def all_of(found, index, camera):
     return found.of(which, torch.from_numpy(column.ravel()), torch.from_numpy(row.ravel()))
 
 
+FOLD = Camera(80, 60, 50.0, 50.0, 40.0, 30.0, k1=-0.232)
+
+
 @pytest.mark.parametrize(
-    ("index", "camera", "pixels"), [(0, PLAIN, 1e-4), (1, BENT, 0.02), (2, FISH, 0.1)]
+    ("index", "camera", "pixels"),
+    [(0, PLAIN, 1e-4), (1, BENT, 0.02), (2, FISH, 0.1), (3, FOLD, 1e-4)],
 )
 def test_directions_are_the_cameras(index, camera, pixels):
     """Off by less than so many pixels, whatever cameras are kept beside."""
-    found = all_of(Directions([PLAIN, BENT, FISH]), index, camera).numpy()
+    found = all_of(Directions([PLAIN, BENT, FISH, FOLD]), index, camera).numpy()
     real = camera.directions().reshape(-1, 3)
     assert np.allclose(np.linalg.norm(found, axis=-1), 1, atol=1e-6)
     assert np.linalg.norm(found - real, axis=-1).max() < pixels / camera.fx

@@ -18,6 +18,7 @@ from climatenerf.scene import load_scene
 from climatenerf.scene.classes import BUILDING, SKY
 from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
+from climatenerf.training import carving as carving_module
 from climatenerf.training import run as run_module
 from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
 from climatenerf.training.settings import FitSettings
@@ -249,6 +250,30 @@ def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     restore(again, tmp_path / "run")
     assert torch.equal(again.carving.held, fitting.carving.held)
     assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
+
+
+def test_a_resumed_fit_draws_the_ground_in_the_units_of_the_run(scene, tmp_path, monkeypatch):
+    """Whatever extent is found anew: the field's is the run's."""
+    place = np.random.default_rng(0).uniform(-2, 2, (200, 2))
+    points = np.concatenate([place, np.zeros((200, 1))], axis=1)
+    views = [dataclasses.replace(view, seen=np.arange(200)) for view in scene.views]
+    scene = dataclasses.replace(scene, views=tuple(views), points=points)
+    every = torch.ones(1, dtype=torch.bool)
+    monkeypatch.setattr(carving_module, "on_the_ground", lambda label: every.expand(label.shape))
+    first = begin(scene, steps=4)
+    fitted(scene, tmp_path / "run", steps=2)
+    checkpoint(first, tmp_path / "run")
+    find_extent = run_module.find_extent
+    monkeypatch.setattr(
+        run_module,
+        "find_extent",
+        lambda *a: dataclasses.replace(find_extent(*a), unit=1.7 * find_extent(*a).unit),
+    )
+    again = begin(scene, steps=4)
+    assert not torch.equal(again.carving.ground.height, first.carving.ground.height)
+    restore(again, tmp_path / "run")
+    assert again.field.unit == first.field.unit
+    assert torch.allclose(again.carving.ground.height, first.carving.ground.height, atol=1e-5)
 
 
 def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):

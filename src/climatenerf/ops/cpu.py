@@ -448,7 +448,7 @@ def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correc
 
 @njit(cache=True, parallel=True)
 def voices_of(x, radius, reach, starts, sizes, pinholes, c2w, least, agreed):
-    """Which places enough views see before nothing but sky: see `reference.voices_of`.
+    """Which places enough views see before nothing but sky, or ground: see `reference.voices_of`.
 
     Args: the maps of all views in one row, reach, each from starts [v] on and of sizes [v, 2].
     """

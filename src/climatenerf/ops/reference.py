@@ -203,12 +203,12 @@ def voices_of(
     c2w: Float[Tensor, "v 4 4"],
     least: tuple[int, float, float],
 ) -> Bool[Tensor, "n"]:
-    """Which places enough views see before nothing but sky.
+    """Which places enough views see before nothing but what they look for (sky, or ground).
 
     Args:
         x: places, world m.
-        radius: of the ball around each that has to lie in the sky as a whole, m.
-        reach: for each view how many pixels within its sky a pixel lies, 1 at the sky's edge.
+        radius: of the ball around each that has to lie before it as a whole, m.
+        reach: for each view how many pixels within it a pixel lies, 1 at its edge.
         pinholes: fx, fy, cx, cy of those maps.
         c2w: of the views.
         least: voices needed; share of the views that have a place in their picture; distance (m)

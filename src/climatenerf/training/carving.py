@@ -1,7 +1,8 @@
 """What photos, labels and sparse points say of space before anything is learned.
 
-Cells that no photo has in view stay empty, as do those that photos agree to be before the sky or
-above the ground; where points lie, or matter that is not ground, nothing is carved.
+Cells that no photo has in view stay empty, as do those that photos agree to be before the sky,
+unless a point lies by them. Above the ground nothing is forbidden: behind a crest there may be
+matter that no photo of the ground beyond it shows. But there it costs.
 """
 
 import torch
@@ -18,7 +19,7 @@ from climatenerf.training.settings import FitSettings
 
 
 class Carving:
-    """Bars cells of a field's occupancy, and answers where sky and ground are seen."""
+    """Bars cells of a field's occupancy, and knows where sky and ground are seen."""
 
     def __init__(
         self,
@@ -28,13 +29,33 @@ class Carving:
         settings: FitSettings,
     ):
         self.field, self.pixels, self.points = field, pixels, points
-        self.carves = settings.carve
-        self.ground, self.standing = None, None
-        if settings.losses.ground and points is not None:
-            lies = on_the_ground(pixels.label_towards(points.image, points.rays_d))
-            self.ground = draw_ground(field.to_grid(points.some(lies).ends))
-            self.standing = points.some(~lies)
+        self.carves, self.moves = settings.carve, settings.refine_poses
+        self.knows_ground = settings.losses.ground > 0 and points is not None
+        self.find_ground()
         self.bar()
+
+    def find_ground(self) -> None:
+        """Draws the map of the ground, and notes the cells of points on it and off it."""
+        self.ground = None
+        places, lies = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
+        if self.knows_ground and self.points is not None:
+            places, lies = self.points_by_most_views(self.points)
+            self.ground = draw_ground(places[lies])
+        if self.ground is not None:
+            # Steps and banks that the map cannot follow are not to be levelled.
+            lies &= self.ground.over(places)[0].abs() <= self.ground.tolerance
+        self.standing = places[~lies]
+        self.find_cells_of_points()
+
+    def points_by_most_views(
+        self, points: PointRays
+    ) -> tuple[Float[Tensor, "p 3"], Bool[Tensor, "p"]]:
+        """Each point once, in grid units, and whether most views that show it label it ground."""
+        lies = on_the_ground(self.pixels.label_towards(points.image, points.rays_d))
+        place = (self.field.to_grid(points.ends) / SAME).round()
+        once, row, views = place.unique(dim=0, return_inverse=True, return_counts=True)
+        votes = torch.zeros(once.shape[0]).index_add(0, row, lies.float())
+        return once * SAME, votes > 0.5 * views
 
     def bar(self, everywhere: bool = True) -> None:
         """Bars the cells that are known to be empty.
@@ -44,36 +65,34 @@ class Carving:
         """
         witness, occupancy = self.pixels.witness, self.field.occupancy
         self.find_cells_of_points()
+        if not self.carves:
+            return
         cells = torch.arange(occupancy.occupied.numel())
         if not everywhere:
             cells = cells[occupancy.occupied.view(-1) > 0]
         centre, size = occupancy.cell_centres(cells)
         x = centre * self.field.unit + self.field.centre
         radius = size * (self.field.unit * 3**0.5 / 2)
-        empty = ~in_view(x, radius, self.pixels.pyramids)
-        if witness is not None and self.carves:
+        empty = torch.zeros(cells.shape[0], dtype=torch.bool)
+        if not self.moves:  # cameras that are still to turn have something else in view
+            empty = ~in_view(x, radius, self.pixels.pyramids)
+        if witness is not None:
             empty |= witness.agreed(x, radius)
         barred = occupancy.barred.view(-1)
         barred[cells[empty]] = True
         barred[_grown(self.held).view(-1)] = False
-        if self.ground is not None and self.carves:
-            over, known = self.ground.over(centre)
-            high = (known & (over > self.ground.tolerance + size * 3**0.5 / 2)).nonzero()[:, 0]
-            high = high[self.shows_ground(centre[high], radius[high])]
-            barred[cells[high]] = True
-            barred[_grown(self.stands).view(-1)] = False
         occupancy.occupied.view(-1)[barred] = 0
 
     def find_cells_of_points(self) -> None:
         """Notes the occupancy's cells in which sparse points lie, and those not of the ground."""
-        self.held, self.stands = self.cells_of(self.points), self.cells_of(self.standing)
+        ends = torch.zeros(0, 3) if self.points is None else self.field.to_grid(self.points.ends)
+        self.held, self.stands = self.cells_of(ends), self.cells_of(self.standing)
 
-    def cells_of(self, points: PointRays | None) -> Bool[Tensor, "cascades side side side"]:
-        """The occupancy's cells in which points lie."""
+    def cells_of(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
+        """The occupancy's cells in which places (grid units) lie."""
         held = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
-        if points is not None:
-            cells, inside = self.field._cells(self.field.to_grid(points.ends))
-            held.view(-1)[cells[inside]] = True
+        cells, inside = self.field._cells(q)
+        held.view(-1)[cells[inside]] = True
         return held
 
     def shows_sky(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
@@ -103,8 +122,8 @@ class Carving:
     ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
         """Which samples of rays to the ground lie too far from it, and where (t) they should.
 
-        Only those where photos agree to see ground, and nothing else within a margin (all in grid
-        units): a label that is wrong empties nothing.
+        Only those where most photos see ground, and nothing else within a margin (all in grid
+        units), and where no point lies that is not ground.
         """
         if self.ground is None:
             return torch.zeros(0, dtype=torch.long), t[:0]
@@ -113,6 +132,8 @@ class Carving:
         nearing = (over - ahead) / STEP
         off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
         far = (known & (nearing > LEAST_NEARING) & (off != 0)).nonzero()[:, 0]
+        cells, _ = self.field._cells(q[far])
+        far = far[~self.stands.view(-1)[cells]]
         around = torch.full_like(t[far], margin * self.field.unit)
         far = far[self.shows_ground(q[far], around)]
         return far, (t[far] + off[far] / nearing[far]).clamp_min(0.0)
@@ -128,5 +149,6 @@ def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:
     return torch.nn.functional.max_pool3d(cells[:, None].float(), 3, 1, padding=1)[:, 0] > 0
 
 
+SAME = 1e-4  # grid units within which two ends are one point
 STEP = 0.05  # grid units over which a ray nears the ground
 LEAST_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst

@@ -157,7 +157,8 @@ class Fitting:
     def compile_kernels(self) -> None:
         """Runs every kernel once on a few rays, so that compiling is not taken for fitting."""
         images = self.field.embeddings.shape[0]
-        quick = replace(self.settings, carve=False)
+        losses_ = replace(self.settings.losses, ground=0.0)
+        quick = replace(self.settings, carve=False, losses=losses_)
         twin = Fitting(self.pixels, images, self.extent, quick, self.points)
         twin.step(twin.pixels.draw(16, twin.generator))
         twin.field.grid_density(torch.zeros(16, 3))

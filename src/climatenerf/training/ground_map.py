@@ -52,25 +52,26 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
     if q.shape[0] < LEAST_POINTS:
         return None
     q = q[:: -(-q.shape[0] // MOST_POINTS)]
-    n = q.shape[0]
-    rows = torch.arange(n)
-    looks = torch.zeros(n, CELLS * CELLS, dtype=torch.float64)
-    for x, y, weight in _corners(*_cells(q)):
-        looks[rows, y * CELLS + x] = weight.double()
-    one = torch.eye(CELLS, dtype=torch.float64)
-    slope, bend = one[1:] - one[:-1], one[2:] - 2 * one[1:-1] + one[:-2]
-    along_x, along_y, twist = torch.kron(one, bend), torch.kron(bend, one), torch.kron(slope, slope)
-    price = STIFF * (along_x.T @ along_x + along_y.T @ along_y + 2 * twist.T @ twist)
-    price += 1e-9 * torch.eye(CELLS * CELLS, dtype=torch.float64)  # points in a line: singular
+    n, size = q.shape[0], CELLS * CELLS
+    # Each point looks at four places of the map only.
+    corners = list(_corners(*_cells(q)))
+    place = torch.stack([y * CELLS + x for x, y, _ in corners], dim=-1)
+    look = torch.stack([weight for _, _, weight in corners], dim=-1).double()
+    pairs = (place[:, :, None] * size + place[:, None, :]).view(-1)
+    products = look[:, :, None] * look[:, None, :]
+    price = _bending()
     z = q[:, 2].double()
     middle = z.median()
-    weight = torch.ones_like(z)
-    height = torch.zeros(CELLS * CELLS, dtype=torch.float64)
+    weight = torch.ones_like(z) / n
+    height = torch.zeros(size, dtype=torch.float64)
     for _ in range(ROUNDS):
-        pull = looks.T * (weight / n)
-        height = torch.linalg.solve(pull @ looks + price, pull @ (z - middle))
-        weight = 1 / (looks @ height + middle - z).abs().clamp_min(FINEST)
-    off = (looks @ height + middle - z).abs()
+        pull = torch.zeros(size * size, dtype=torch.float64)
+        pull.index_add_(0, pairs, (weight[:, None, None] * products).view(-1))
+        goal = torch.zeros(size, dtype=torch.float64)
+        goal.index_add_(0, place.view(-1), ((weight * (z - middle))[:, None] * look).view(-1))
+        height = torch.linalg.solve(pull.view(size, size) + price, goal)
+        off = ((look * height[place]).sum(-1) + middle - z).abs()
+        weight = 1 / (off.clamp_min(FINEST) * n)
     line = torch.linspace(-HALF_SIDE, HALF_SIDE, CELLS)
     lines = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
     near = torch.cdist(lines, q[:, :2]).amin(-1)
@@ -79,6 +80,16 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
         known=(near < REACH).view(CELLS, CELLS),
         tolerance=max(LEAST_TOLERANCE, ROUGHNESS * float(off.quantile(0.9))),
     )
+
+
+def _bending() -> Float[Tensor, "c2 c2"]:
+    """Quadratic form of the map's price for bending."""
+    one = torch.eye(CELLS, dtype=torch.float64)
+    slope, bend = one[1:] - one[:-1], one[2:] - 2 * one[1:-1] + one[:-2]
+    along_x, along_y, twist = torch.kron(one, bend), torch.kron(bend, one), torch.kron(slope, slope)
+    price = STIFF * (along_x.T @ along_x + along_y.T @ along_y + 2 * twist.T @ twist)
+    # Points in a line leave the map's turn about it open: singular without 1e-9.
+    return price + 1e-9 * torch.eye(CELLS * CELLS, dtype=torch.float64)
 
 
 def _cells(q: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 2"], Float[Tensor, "n 2"]]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from climatenerf.scene.cameras import Camera
 
-AT_ONCE = 16384  # places asked at once: their distances to all views fit into the cache
+AT_ONCE = 800_000  # distances between places and views that fit into the cache
 BORDER = 64  # points along each side of a picture from which its pyramid of sight is found
 WIDE = 0.1  # least cosine from the axis that fits into a pyramid; beyond it all counts as in view
 
@@ -51,8 +51,8 @@ def in_view(
     x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], views: Float[Tensor, "v 4 4"]
 ) -> Bool[Tensor, "n"]:
     """Whether balls about x (world m) with a radius (m) reach into any view's pyramid of sight."""
-    found = []
-    for place, reach in zip(x.split(AT_ONCE), radius.split(AT_ONCE), strict=True):
+    found, some = [], max(256, AT_ONCE // views.shape[0])
+    for place, reach in zip(x.split(some), radius.split(some), strict=True):
         outside = torch.full((place.shape[0], views.shape[0]), -torch.inf)
         for side in views.unbind(1):
             outside = torch.maximum(outside, place @ side[:, :3].T + side[:, 3])

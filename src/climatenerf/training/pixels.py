@@ -18,7 +18,7 @@ from climatenerf.training.witness import Witness
 SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
 HORIZON = -0.05  # rays that sink more than this end on matter: levelling is good to a degree or two
 SKY_SHARE = 0.1  # of the views that have a place before them: so many must show sky there,
-GROUND_SHARE = 0.3  # or ground
+GROUND_SHARE = 0.5  # or ground
 EDGE = 2  # pixels to both sides that are such an edge
 
 

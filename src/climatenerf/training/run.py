@@ -320,7 +320,7 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
     barred = fitting.field.occupancy.barred
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
     barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
-    fitting.carving.find_cells_of_points()
+    fitting.carving.find_ground()  # in the units of the run
     fitting.generator.set_state(state["generator"])
     fitting.steps, fitting.samples, fitting.rays = state["counters"].tolist()
     fitting.seconds, fitting.step_scale, fitting.error = state["floats"].tolist()

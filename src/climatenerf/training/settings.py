@@ -60,7 +60,7 @@ class FitSettings:
     sky_labels: bool = True
     """What is labelled sky is known to be; False: it is a class that nobody named."""
     carve: bool = True
-    """What photos agree to be sky is kept empty from the beginning."""
+    """What no photo has in view, or photos agree to be sky, is kept empty from the beginning."""
     crowded: float = 3.0
     """Gradients shrink within this many times the nearest distance to a camera; 0: nowhere."""
     opaque_sky: bool = False
