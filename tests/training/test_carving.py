@@ -7,6 +7,7 @@ from toy_scene import TINY
 
 from climatenerf.field.field import Field
 from climatenerf.scene.classes import BUILDING, SKY, TERRAIN
+from climatenerf.training import ground_map
 from climatenerf.training.carving import Carving
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import PointRays
@@ -63,6 +64,37 @@ def carving(change=None, **settings):
     pixels = TrainingPixels([CAMERA], [0] * 12, c2w, images, maps)
     field = Field(TINY, 12, np.array([0.0, 0.0, 0.5]), 3.0, 0.1)
     return Carving(field, pixels, points(c2w), FitSettings(**settings))
+
+
+def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tower():
+    found = carving()
+    occupancy, field = found.field.occupancy, found.field
+    centre, size = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
+    x, size, barred = (
+        centre * field.unit + field.centre,
+        size * field.unit,
+        occupancy.barred.view(-1),
+    )
+    ring = x[:, :2].norm(dim=-1)
+    clear = size * 3**0.5 / 2 + ground_map.CLEARANCE * field.unit
+    air = (ring > 2) & (ring < 4) & (x[:, 2] < 0.9)
+    assert barred[air & (x[:, 2] > clear)].float().mean() > 0.3
+    unseen = carving(losses=type(FitSettings().losses)(ground=0.0)).field.occupancy.barred.view(-1)
+    assert not (barred & ~unseen)[air & (x[:, 2] < clear - 0.02)].any()
+    assert (barred & ~unseen)[air].any()
+    touches = in_matter(x) & (x[:, 2] > -size / 2) & (ring < 5)
+    assert touches.sum() > 50 and not barred[touches].any()
+
+
+def test_what_is_below_a_crest_nearby_is_not_taken_to_be_in_the_open():
+    """A ditch 0.3 units deep: what is in it is hidden from most, though they see its far bank."""
+    xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 7
+    z = torch.where(xy[:, 0].abs() < 0.5, -0.3, 0.0)
+    ground = ground_map.draw_ground(torch.cat([xy, z[:, None]], -1))
+    assert ground is not None
+    q = torch.tensor([[0.0, 0.0, -0.15], [0.0, 0.0, 0.9], [2.5, 0.0, 0.9]])
+    assert ground.clears(q, torch.full((3,), 0.02)).tolist() == [False, True, True]
+    assert not ground.clears(q, torch.full((3,), 0.9)).any()
 
 
 def rim(shift):

@@ -1,8 +1,9 @@
 """What photos, labels and sparse points say of space before anything is learned.
 
 Cells that no photo has in view stay empty, as do those that photos agree to be before the sky,
-unless a point lies by them. Above the ground nothing is forbidden: behind a crest there may be
-matter that no photo of the ground beyond it shows. But there it costs.
+unless a point lies by them, and those well above all ground around that most photos see ground
+behind. Nearer the ground matter costs, but is not forbidden: a crest may hide a ditch and what is
+in it, and the map of the ground does not know every step.
 """
 
 import torch
@@ -81,6 +82,11 @@ class Carving:
         barred = occupancy.barred.view(-1)
         barred[cells[empty]] = True
         barred[_grown(self.held).view(-1)] = False
+        if self.ground is not None:
+            high = self.ground.clears(centre, size * (3**0.5 / 2)).nonzero()[:, 0]
+            high = high[self.shows_ground(centre[high], radius[high])]
+            high = high[~_grown(self.stands).view(-1)[cells[high]]]
+            barred[cells[high]] = True
         occupancy.occupied.view(-1)[barred] = 0
 
     def find_cells_of_points(self) -> None:

@@ -19,6 +19,8 @@ STIFF = 0.05  # price of bending against the points' mean distance
 ROUNDS = 15  # of reweighted least squares
 FINEST = 2e-3  # grid units: points are not believed to be nearer the ground
 LEAST_TOLERANCE = 7.5e-3  # grid units: kerbs and tufts that the map does not know
+CLEARANCE = 0.05  # grid units over which nothing is taken for ground
+AROUND = 4  # lines of the map that a place has to be above
 ROUGHNESS = 2.0  # tolerance over the distance within which nine tenths of the points lie
 
 
@@ -31,6 +33,19 @@ class GroundMap:
     """Where points are near."""
     tolerance: float
     """Ground may be this far from the map."""
+
+    def clears(self, q: Float[Tensor, "n 3"], reach: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """Whether balls about positions are above all ground around: no crest can hide them.
+
+        And so high above it that a step which no point has told of would not reach them.
+        """
+        highest = torch.nn.functional.max_pool2d(
+            self.height[None], 2 * AROUND + 1, stride=1, padding=AROUND
+        )[0]
+        corner, share = _cells(q)
+        x, y = (corner + (share > 0.5)).unbind(-1)
+        known = (q[:, :2].abs() < HALF_SIDE).all(-1) & self.known[y, x]
+        return known & (q[:, 2] - reach > highest[y, x] + max(CLEARANCE, self.tolerance))
 
     def over(self, q: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
         """Height of positions over the map, and whether the map is known there."""
