@@ -76,7 +76,8 @@ def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tow
         occupancy.barred.view(-1),
     )
     ring = x[:, :2].norm(dim=-1)
-    clear = size * 3**0.5 / 2 + ground_map.CLEARANCE * field.unit
+    assert found.ground is not None
+    clear = size * 3**0.5 / 2 + found.ground.tolerance * field.unit
     air = (ring > 2) & (ring < 4) & (x[:, 2] < 0.9)
     assert barred[air & (x[:, 2] > clear)].float().mean() > 0.3
     unseen = carving(losses=type(FitSettings().losses)(ground=0.0)).field.occupancy.barred.view(-1)
@@ -97,6 +98,24 @@ def test_what_is_below_a_crest_nearby_is_not_taken_to_be_in_the_open():
     assert not ground.clears(q, torch.full((3,), 0.9)).any()
 
 
+def test_where_no_point_lies_nothing_is_taken_to_be_in_the_open():
+    """A lawn without points beside a road with many may lie higher than the road."""
+    xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 4
+    xy = xy[xy[:, 0] < 0]
+    ground = ground_map.draw_ground(torch.cat([xy, torch.zeros(len(xy), 1)], -1))
+    assert ground is not None
+    q = torch.tensor([[-0.5, 0.0, 0.1], [0.1, 0.0, 0.1], [0.35, 0.0, 0.1]])
+    assert ground.over(q)[1].all(), "but the map is known there"
+    assert ground.clears(q, torch.full((3,), 0.02)).tolist() == [True, True, False]
+
+
+def refined(found):
+    """With cells of half the size, as later in a fit."""
+    found.field.occupancy.refine()
+    found.bar(everywhere=False)
+    return found
+
+
 def rim(shift):
     """Samples on rays from the side that graze the tower's left edge at 1 m, some of it beside."""
     o = torch.tensor([4.0, 0.0, 1.5]).expand(shift.shape[0], 3)
@@ -105,14 +124,17 @@ def rim(shift):
     return x, (x - o) / t[:, None], t
 
 
-def asked(found, x, d, t, margin=0.0):
-    far, _ = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit, margin)
+def asked(found, x, d, t):
+    far, _ = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit)
     return torch.zeros(len(x), dtype=torch.bool).index_fill(0, far, True)
 
 
 def test_the_air_beside_the_tower_costs_and_the_tower_does_not():
-    found = carving()
+    found = refined(carving())
     x, d, t = rim(torch.linspace(-1.5, 1.5, 61))
+    spared = asked(found, x, d, t)
+    assert spared[x[:, 1].abs() > 1.35].all(), "half of the views see it before or behind the tower"
+    found.stands[:] = False
     costs = asked(found, x, d, t)
     assert found.ground is not None and costs[x[:, 1].abs() > 1.0].all()
     assert not costs[in_matter(x)].any()
@@ -187,25 +209,27 @@ def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
     d = (foot - o) / way[:, None]
     t = way * torch.tensor([0.7, 1.0, 1.2, 1.0])  # above, on and under the ground; on the tower
     x = o + t[:, None] * d
-    far, goal = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit, 0.0)
+    far, goal = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit)
     assert far.tolist() == [0, 2]
     assert torch.allclose(goal * found.field.unit, way[[0, 2]], atol=0.15)
 
 
-def test_a_margin_spares_what_is_beside_the_tower():
+def test_what_stands_is_spared_with_a_rim_about_it():
+    """Labels alone tell of it: the tower's points are taken for ground's."""
     found = carving()
+    found.standing = found.standing[:0]
+    found.find_cells_of_points()
+    beside = torch.tensor([0.0, 0.0, 0.9]).repeat(60, 1)
+    beside[:, 1] = torch.linspace(0.0, 2.5, 60)
     o = torch.tensor([4.0, 0.0, 1.5]).expand(60, 3)
-    beside = torch.tensor([0.0, 0.0, 1.0]) + torch.linspace(0.55, 2.5, 60)[:, None] * torch.tensor(
-        [0.0, 1.0, 0.0]
-    )
-    beside[:, 2] = 0.9
     t = (beside - o).norm(dim=-1)
-    d = (beside - o) / t[:, None]
-    asked = found.field.to_grid(beside), d, t / found.field.unit
-    near, _ = found.far_from_ground(*asked, 0.0)
-    wide, _ = found.far_from_ground(*asked, 0.5 / found.field.unit)
-    assert 0 < len(wide) < len(near)
-    assert beside[wide[0], 1] - beside[near[0], 1] > 0.2
+    costs = asked(found, beside, (beside - o) / t[:, None], t)
+    cell = 2 * found.field.unit / found.field.occupancy.side
+    off = beside[:, 1] - 0.5
+    assert not costs[off < 0.5 * cell].any() and costs[off > 3 * cell].all()
+    found.stands[:] = False
+    bare = asked(found, beside, (beside - o) / t[:, None], t)
+    assert bare[off > 0].sum() > costs.sum() and not bare[off < 0].any()
 
 
 def test_a_label_is_looked_up_where_a_ray_goes_through_the_picture():

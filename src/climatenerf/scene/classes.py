@@ -7,6 +7,8 @@ CLASS_NAMES = ("road", "building", "vegetation", "terrain", "sky", "person", "ve
 UNKNOWN = 255
 GROUND = (ROAD, TERRAIN)
 """Classes that lie on the ground."""
+STANDING = (BUILDING, VEGETATION, PERSON, VEHICLE)
+"""Classes that stand on it."""
 
 MERGED = np.full(256, UNKNOWN, np.uint8)
 """Class of each Cityscapes train id: road and pavement, what is built, ..., what moves."""

@@ -1,9 +1,10 @@
 """What photos, labels and sparse points say of space before anything is learned.
 
 Cells that no photo has in view stay empty, as do those that photos agree to be before the sky,
-unless a point lies by them, and those well above all ground around that most photos see ground
-behind. Nearer the ground matter costs, but is not forbidden: a crest may hide a ditch and what is
-in it, and the map of the ground does not know every step.
+unless a point lies by them, and those above points of the ground that most photos see ground
+behind. Elsewhere matter above the ground costs, but is not forbidden: a crest may hide a ditch and
+what is in it, and the map of the ground does not know every step. What stands on the ground is
+spared, with a rim about it: a trunk is narrower than the haze that becomes one.
 """
 
 import torch
@@ -85,14 +86,28 @@ class Carving:
         if self.ground is not None:
             high = self.ground.clears(centre, size * (3**0.5 / 2)).nonzero()[:, 0]
             high = high[self.shows_ground(centre[high], radius[high])]
-            high = high[~_grown(self.stands).view(-1)[cells[high]]]
+            high = high[~self.stands.view(-1)[cells[high]]]
             barred[cells[high]] = True
         occupancy.occupied.view(-1)[barred] = 0
 
     def find_cells_of_points(self) -> None:
-        """Notes the occupancy's cells in which sparse points lie, and those not of the ground."""
+        """Notes the occupancy's cells in which sparse points lie, and those by what stands."""
         ends = torch.zeros(0, 3) if self.points is None else self.field.to_grid(self.points.ends)
-        self.held, self.stands = self.cells_of(ends), self.cells_of(self.standing)
+        self.held = self.cells_of(ends)
+        self.stands = _grown(self.cells_of(self.standing) | self.shown_to_stand())
+
+    def shown_to_stand(self) -> Bool[Tensor, "k g g g"]:
+        """The occupancy's cells where most photos see what stands on the ground."""
+        occupancy, witness = self.field.occupancy, self.pixels.standing_witness
+        stands = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
+        if self.ground is None or witness is None:
+            return stands
+        centre, size = occupancy.cell_centres(torch.arange(stands.numel()))
+        _, known = self.ground.over(centre)
+        near = known.nonzero()[:, 0]
+        x = centre[near] * self.field.unit + self.field.centre
+        stands.view(-1)[near] = witness.agreed(x, torch.zeros(near.shape[0]))
+        return stands
 
     def cells_of(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
         """The occupancy's cells in which places (grid units) lie."""
@@ -124,12 +139,10 @@ class Carving:
         q: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         t: Float[Tensor, "n"],
-        margin: float,
     ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
         """Which samples of rays to the ground lie too far from it, and where (t) they should.
 
-        Only those where most photos see ground, and nothing else within a margin (all in grid
-        units), and where no point lies that is not ground.
+        Only those where most photos see ground, away from what stands on it; t in grid units.
         """
         if self.ground is None:
             return torch.zeros(0, dtype=torch.long), t[:0]
@@ -140,8 +153,7 @@ class Carving:
         far = (known & (nearing > LEAST_NEARING) & (off != 0)).nonzero()[:, 0]
         cells, _ = self.field._cells(q[far])
         far = far[~self.stands.view(-1)[cells]]
-        around = torch.full_like(t[far], margin * self.field.unit)
-        far = far[self.shows_ground(q[far], around)]
+        far = far[self.shows_ground(q[far], torch.zeros(far.shape[0]))]
         return far, (t[far] + off[far] / nearing[far]).clamp_min(0.0)
 
 

@@ -328,7 +328,7 @@ class Fitting:
         own = ray[some]
         d = batch.rays_d.detach()[own]
         q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
-        far, goal = self.carving.far_from_ground(q, d, t[some], MARGIN)
+        far, goal = self.carving.far_from_ground(q, d, t[some])
         some = some[far]
         return losses.ground_loss(weights[some], t[some], goal, batch.rays_o.shape[0])
 
@@ -512,7 +512,6 @@ OUTSTANDING = 6.0  # times the mean error: the least price of a mask
 SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
-MARGIN = 0.02  # grid units about what stands on the ground: haze there becomes a trunk's rim
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
 SOLID_CLASSES = torch.from_numpy(SOLID_OF.astype(np.int64))
 POINT_SHARE = 16  # rays of photos for one to a sparse point

@@ -15,12 +15,12 @@ CELLS = 33  # lines along an edge
 HALF_SIDE = 4.0  # grid units
 LEAST_POINTS, MOST_POINTS = 50, 6000  # by which a map is drawn
 REACH = 0.5  # grid units around a point in which the map is believed
+AROUND = 2  # lines of the map that a place has to be above
+FINE_CELLS = 64  # along an edge: next to a point's own, the map is sure
 STIFF = 0.05  # price of bending against the points' mean distance
 ROUNDS = 15  # of reweighted least squares
 FINEST = 2e-3  # grid units: points are not believed to be nearer the ground
 LEAST_TOLERANCE = 7.5e-3  # grid units: kerbs and tufts that the map does not know
-CLEARANCE = 0.05  # grid units over which nothing is taken for ground
-AROUND = 4  # lines of the map that a place has to be above
 ROUGHNESS = 2.0  # tolerance over the distance within which nine tenths of the points lie
 
 
@@ -31,21 +31,25 @@ class GroundMap:
     height: Float[Tensor, "c c"]
     known: Bool[Tensor, "c c"]
     """Where points are near."""
+    sure: Bool[Tensor, "f f"]
+    """Cells of a finer square in or next to which a point lies, rows along y."""
     tolerance: float
     """Ground may be this far from the map."""
 
     def clears(self, q: Float[Tensor, "n 3"], reach: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether balls about positions are above all ground around: no crest can hide them.
 
-        And so high above it that a step which no point has told of would not reach them.
+        Only right above points: elsewhere the map may have missed a step.
         """
         highest = torch.nn.functional.max_pool2d(
             self.height[None], 2 * AROUND + 1, stride=1, padding=AROUND
         )[0]
         corner, share = _cells(q)
         x, y = (corner + (share > 0.5)).unbind(-1)
-        known = (q[:, :2].abs() < HALF_SIDE).all(-1) & self.known[y, x]
-        return known & (q[:, 2] - reach > highest[y, x] + max(CLEARANCE, self.tolerance))
+        inside = (q[:, :2].abs() < HALF_SIDE).all(-1)
+        high = q[:, 2] - reach > highest[y, x] + self.tolerance
+        x, y = _fine(q)
+        return inside & high & self.sure[y, x]
 
     def over(self, q: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
         """Height of positions over the map, and whether the map is known there."""
@@ -93,8 +97,23 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
     return GroundMap(
         height=(height + middle).float().view(CELLS, CELLS),
         known=(near < REACH).view(CELLS, CELLS),
+        sure=_next_to(q),
         tolerance=max(LEAST_TOLERANCE, ROUGHNESS * float(off.quantile(0.9))),
     )
+
+
+def _next_to(q: Float[Tensor, "n 3"]) -> Bool[Tensor, "f f"]:
+    """Cells of the finer square that hold a point, and their neighbours."""
+    held = torch.zeros(FINE_CELLS, FINE_CELLS)
+    x, y = _fine(q)
+    held[y, x] = 1
+    return torch.nn.functional.max_pool2d(held[None], 3, 1, padding=1)[0] > 0
+
+
+def _fine(q: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Column and row of positions in the finer square."""
+    place = ((q[:, :2] / HALF_SIDE + 1) * (FINE_CELLS / 2)).long().clamp(0, FINE_CELLS - 1)
+    return place[:, 0], place[:, 1]
 
 
 def _bending() -> Float[Tensor, "c2 c2"]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.scene.cameras import Camera
-from climatenerf.scene.classes import GROUND, MERGED, SKY, UNKNOWN
+from climatenerf.scene.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
 from climatenerf.training.in_view import pyramids
 from climatenerf.training.pixel_directions import Directions
 from climatenerf.training.witness import Witness
@@ -19,6 +19,7 @@ SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
 HORIZON = -0.05  # rays that sink more than this end on matter: levelling is good to a degree or two
 SKY_SHARE = 0.1  # of the views that have a place before them: so many must show sky there,
 GROUND_SHARE = 0.5  # or ground
+STANDING_SHARE = 0.5  # or things that stand on it
 EDGE = 2  # pixels to both sides that are such an edge
 
 
@@ -108,11 +109,12 @@ class TrainingPixels:
             edge = np.concatenate([sky_edge(each).reshape(-1) for each in merged])
             self.edge = torch.from_numpy(np.flatnonzero(edge))
             self.witness = Witness(self.cameras, c2w, merged, [SKY], SKY_SHARE)
-        self.ground_witness = None
+        self.ground_witness = self.standing_witness = None
         if self.label is not None and bool(
             torch.isin(self.label, torch.tensor(GROUND, dtype=torch.uint8)).any()
         ):
             self.ground_witness = Witness(self.cameras, c2w, merged, GROUND, GROUND_SHARE)
+            self.standing_witness = Witness(self.cameras, c2w, merged, STANDING, STANDING_SHARE)
         self.relative = None
         if relative is not None and any(each is not None for each in relative):
             flat = [
