@@ -21,7 +21,7 @@ from climatenerf.storage import read_json, read_safetensors, write_json, write_s
 from climatenerf.training import carving as carving_module
 from climatenerf.training import run as run_module
 from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
-from climatenerf.training.settings import FitSettings
+from climatenerf.training.settings import PAPER, FitSettings, Losses
 from climatenerf.training.witness import Witness
 
 
@@ -81,6 +81,7 @@ def test_a_run_folder_has_everything(toy, tmp_path):
     assert {"psnr", "ssim", "psnr_cc", "seconds", "steps", "samples"} <= set(on_disk)
     assert on_disk["steps"] == 6 and on_disk["samples"] > 0 and on_disk["seconds"] > 0
     assert on_disk["interrupted"] is False and on_disk["train_views"] == 20
+    assert on_disk["masked_fraction"] == 0, "masks begin with believing everything"
     assert sorted(on_disk["views"]) == [f"{i:02d}.png" for i in (0, 6, 12, 18)]
     for key in ("psnr", "ssim", "psnr_cc"):
         rows = [row[key] for row in on_disk["views"].values()]
@@ -104,6 +105,33 @@ def test_nothing_held_out_means_no_quality(scene, tmp_path):
     metrics = fitted(with_split(scene, set()), tmp_path / "run", steps=2)
     assert metrics["psnr"] is None and metrics["ssim"] is None and metrics["psnr_cc"] is None
     assert metrics["train_views"] == 24 and metrics["steps"] == 2
+
+
+def test_heads_on_the_appearance_grid_learn_and_come_back(scene, tmp_path, monkeypatch):
+    """As in the paper's preset: no grid of their own, the paper's weights, an opaque sky."""
+    monkeypatch.setitem(PRESETS, "tiny-paper", dataclasses.replace(TINY, surface_levels=0))
+    view = scene.of_split("train")[0]
+    settings = dataclasses.replace(
+        PAPER, preset="tiny-paper", minutes=None, steps=40, samples_per_step=2**12
+    )
+    pixels = load_pixels(scene, 1)
+    pixels.label = torch.full((len(pixels.rgb),), BUILDING, dtype=torch.uint8)
+    pixels.label[:400] = SKY
+    monkeypatch.setattr(run_module, "load_pixels", lambda *_: pixels)
+    fit_scene(scene, tmp_path / "run", settings, 1, False, nothing, nothing)
+    field = load_field(tmp_path / "run")
+    assert field.surface_grid.numel() == 0 and field.learned.tolist() == [True, True]
+    with torch.no_grad():
+        normal, logits = field.surface_at(torch.rand(50, 3))
+    assert torch.allclose(normal.norm(dim=-1), torch.ones(50), atol=1e-5)
+    solid = [kind for kind in range(7) if kind != SKY]
+    assert (logits.argmax(-1) == solid.index(BUILDING)).float().mean() > 0.9
+    assert np.isfinite(render_view(field, scene.cameras[0], scene.c2w_world(view))).all()
+
+
+def test_without_masks_no_share_of_them_is_told(scene, tmp_path):
+    metrics = fitted(scene, tmp_path / "run", steps=2, losses=Losses(transient=0.0))
+    assert metrics["masked_fraction"] is None
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(scene, tmp_path):

@@ -35,6 +35,8 @@ def test_what_one_photo_shows_is_masked_there_and_nowhere_else():
     assert m[there].mean() > 0.8, m[there].mean()
     assert m[~there].mean() < 0.03, m[~there].mean()
     assert m[image != 1].max() < 0.2  # images do not leak into each other
+    shares = masks.shares()
+    assert shares[1].isclose(torch.tensor(0.2 * 0.7), atol=0.03) and not shares[[0, 2, 3]].any()
 
 
 def test_a_static_capture_is_left_alone():

@@ -267,8 +267,10 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
 
 
 def summary(metrics: dict) -> str:
-    """One line: quality and cost."""
+    """One line: quality, cost, and what of the photos was left out."""
     cost = f"{metrics['steps']} steps, {metrics['seconds']:.0f} s of fitting"
+    if metrics["masked_fraction"]:
+        cost += f"; {metrics['masked_fraction']:.1%} of the photos masked as passers-by"
     if metrics["psnr"] is None:
         return f"no held-out photos to measure; {cost}"
     return (

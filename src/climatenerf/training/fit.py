@@ -32,7 +32,7 @@ from climatenerf.training.poses import RATE as POSE_RATE
 from climatenerf.training.poses import PoseCorrections
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.sky_fill import fill_sky
-from climatenerf.training.transients import TransientMasks
+from climatenerf.training.transients import MASKED, TransientMasks
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ class Fitting:
         movable = (batch.label == PERSON) | (batch.label == VEHICLE)
         prices = torch.where(movable, price * SUSPECT, price)
         mask = self.masks(batch.image, batch.place)
-        gone = mask.detach() > 0.5
+        gone = mask.detach() > MASKED
         label = batch.label.masked_fill(gone, UNKNOWN)
         relative = None if batch.relative is None else batch.relative.masked_fill(gone, torch.nan)
         stays = replace(batch, label=label, relative=relative)

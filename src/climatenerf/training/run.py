@@ -150,11 +150,19 @@ def fit_scene(
         "interrupted": interrupted,
         "downscale": downscale,
         "train_views": len(views),
+        "masked_fraction": masked_fraction(fitting),
     }
     write_json(run / "metrics.json", metrics)
     metrics |= evaluate(fitting.field, scene, downscale, evaluated)
     write_json(run / "metrics.json", metrics)
     return metrics
+
+
+def masked_fraction(fitting: Fitting) -> float | None:
+    """Share of the fitted pixels that is taken for passers-by; None if none was sought."""
+    if not fitting.settings.losses.transient:
+        return None
+    return float(fitting.masks.shares().mean())
 
 
 def evaluate(

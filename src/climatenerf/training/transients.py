@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 CELLS = (6, 12, 24, 48)  # along each side of an image, of the mask's levels
 HIDDEN = 16
+MASKED = 0.5  # of M: such a pixel is of a passer-by
 FEATURES = 2
 
 
@@ -36,6 +37,18 @@ class TransientMasks(nn.Module):
             place: (x, y) in the image, (0,1).
         """
         return torch.sigmoid(self.net(self.features(image, place))[:, 0])
+
+    def shares(self) -> Float[Tensor, "images"]:
+        """Share of each image's pixels that is masked, by a lattice of them."""
+        side = 2 * CELLS[-1]
+        line = (torch.arange(side) + 0.5) / side
+        place = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
+        with torch.no_grad():
+            masked = [
+                (self(torch.full((len(place),), i), place) > MASKED).float().mean()
+                for i in range(self.levels[0].shape[0])
+            ]
+        return torch.stack(masked)
 
     def features(
         self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]
