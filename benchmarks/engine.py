@@ -2,15 +2,19 @@
 
 python benchmarks/engine.py RUN
 python benchmarks/engine.py RUN --capture ../shared/data/fox --minutes 5
+python benchmarks/engine.py RUN --capture ../shared/data/fox --peer peer/bin/python
 
 `step`: samples a second of one optimiser step on the field of RUN, with rays of its photos: ours;
 the same in eager PyTorch; the same under `torch.compile`. Every sample passes every head in all
 three (density, colour, classes, normals and the normals' target); marching is in none of them.
 `frame`: seconds of a picture, as `frame_time.py`. `time_to_psnr`: seconds of fitting a capture from
-nothing until the held-out photos reach so many dB; measuring them is not counted.
+nothing until the held-out photos reach so many dB; measuring them is not counted. The peer's is of
+`peer_nerfacto.py`, run by the Python of its own environment; null: not within its minutes.
 """
 
 import argparse
+import json
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -220,11 +224,26 @@ def time_to_psnr(
             )
 
     fitting.run(look)
-    reached = {
+    return {**reached(curve), "curve": curve}
+
+
+def reached(curve: list[dict[str, float]]) -> dict[str, float | None]:
+    """Seconds until each of `GOALS`; None: not reached."""
+    return {
         str(goal): next((at["seconds"] for at in curve if at["psnr"] >= goal), None)
         for goal in GOALS
     }
-    return {**reached, "curve": curve}
+
+
+def peer_time_to_psnr(python: str, capture: Path, minutes: float, rays: int, seed: int) -> dict:
+    """The same of nerfacto, in the environment of that interpreter."""
+    script = Path(__file__).with_name("peer_nerfacto.py")
+    words = [capture, "--minutes", minutes, "--rays", rays, "--seed", seed]
+    done = subprocess.run(
+        [python, str(script), *map(str, words)], stdout=subprocess.PIPE, text=True, check=True
+    )
+    found = json.loads(done.stdout.splitlines()[-1])
+    return {**reached(found["curve"]), **found}
 
 
 def main() -> None:
@@ -241,6 +260,9 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--every", type=float, default=5.0, help="seconds between measurements")
+    parser.add_argument("--peer", help="the Python of an environment with nerfstudio")
+    parser.add_argument("--peer-minutes", type=float, default=10.0)
+    parser.add_argument("--peer-rays", type=int, default=1024, help="a step")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     scene = load_scene(options.run)
@@ -257,6 +279,10 @@ def main() -> None:
         settings = FitSettings(minutes=options.minutes, seed=options.seed)
         ours = time_to_psnr(options.capture, settings, options.downscale, options.every)
         found["time_to_psnr"] = {"capture": options.capture.name, "ours": ours}
+        if options.peer:
+            found["time_to_psnr"]["peer"] = peer_time_to_psnr(
+                options.peer, options.capture, options.peer_minutes, options.peer_rays, options.seed
+            )
     common.report("speed of a step, of a frame and of a fit", found, options.seed)
 
 
