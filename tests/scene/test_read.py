@@ -138,6 +138,20 @@ def test_labels_and_masks_are_found(tmp_path):
     assert load_mask(scene.views[2], scene) is None and load_labels(scene.views[2], scene) is None
 
 
+@pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA", "P", "PA", "1"])
+def test_masks_of_any_kind_of_picture_ignore_what_is_black(tmp_path, mode):
+    make(tmp_path, 3)
+    (tmp_path / "masks").mkdir()
+    mask = np.full((24, 32), 255, dtype=np.uint8)
+    mask[:, :16] = 0
+    kind = "TIFF" if mode == "PA" else "PNG"
+    picture = Image.fromarray(mask).convert("RGB").convert("P") if mode == "PA" else None
+    picture = (picture or Image.fromarray(mask)).convert(mode)
+    picture.save(tmp_path / "masks/001.png", format=kind)
+    usable = load_mask(read_scene(tmp_path).views[1], read_scene(tmp_path))
+    assert usable is not None and not usable[:, :16].any() and usable[:, 16:].all()
+
+
 def test_labels_of_another_size_are_brought_to_the_picture(tmp_path):
     make(tmp_path, 3)
     (tmp_path / "labels").mkdir()

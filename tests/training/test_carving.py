@@ -193,6 +193,7 @@ def test_points_off_the_map_are_no_ground_and_spare_what_is_by_them(monkeypatch)
     lies = torch.ones(3000, dtype=torch.bool)
     monkeypatch.setattr(found, "points_by_most_views", lambda _: (q, lies.clone()))
     found.find_ground()
+    found.find_cells_of_points()
     assert found.ground is not None
     over, known = found.ground.over(q)
     off = over.abs() > found.ground.tolerance

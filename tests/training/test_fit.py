@@ -9,6 +9,7 @@ from PIL import Image
 from toy_scene import CAMERA, FIELD, TINY, make_scene, picture
 
 from climatenerf.evaluation.metrics import psnr
+from climatenerf.field.colour_space import decode_srgb, encode_srgb
 from climatenerf.field.extent import find_extent
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
@@ -23,7 +24,7 @@ from climatenerf.training.fit import Fitting, scale_gradient
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.run import load_pixels
-from climatenerf.training.settings import FitSettings, Losses
+from climatenerf.training.settings import PAPER, FitSettings, Losses
 
 
 @pytest.fixture(scope="module")
@@ -251,6 +252,32 @@ def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypa
     assert (batch.label == VEHICLE).all()
 
 
+def test_a_triple_that_is_masked_in_part_is_none(scene, monkeypatch):
+    fitting = begin(scene, steps=10)
+    fitting.steps = 9
+    batch = fitting.pixels.draw(12, fitting.generator, 3)
+    n, m = batch.rays_o.shape[0], 3
+    batch.in_line[:] = True
+    mask = torch.zeros(n)
+    mask[1], mask[n - 2 * m + 2] = 0.9, 0.9  # a middle, and a side of another
+    monkeypatch.setattr(fitting, "masks", lambda image, place: mask)
+    _, stays = fitting.colour_loss(torch.ones(n), batch)
+    assert stays.in_line.tolist() == [True, False, False]
+
+
+def test_an_opaque_sky_has_its_photos_colour(scene):
+    """The paper's sky is matter: rays labelled sky have to teach it their colour."""
+    pixels = load_pixels(scene, 1)
+    pixels.label = torch.full((len(pixels.rgb),), SKY, dtype=torch.uint8)
+    settings = dataclasses.replace(PAPER, preset="tiny", minutes=None, steps=9)
+    for opaque in (True, False):
+        chosen = dataclasses.replace(settings, opaque_sky=opaque)
+        fitting = Fitting(pixels, 20, begin(scene).extent, chosen)
+        fitting.step(fitting.pixels.draw(64, fitting.generator))
+        slopes = [p.grad.abs().sum() for p in fitting.field.colour_net]
+        assert (sum(slopes) > 0) == opaque
+
+
 def test_a_fit_that_stops_early_does_not_claim_normals(scene):
     fitting = begin(scene, steps=100)
 
@@ -454,6 +481,39 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene):
         height = o[ray, 2] + samples.t * d[ray, 2]
         above[weight] = float((weights * (height > 0.15)).sum() / len(d))
     assert above[100.0] < 0.5 * above[0.0], above
+
+
+def lost_before_surfaces(field, scene):
+    """Mean share of light lost before the true surfaces, in the held-out views."""
+    lost = []
+    for view in scene.of_split("heldout"):
+        pose = scene.c2w_world(view)
+        o, d = camera_rays(CAMERA, pose)
+        end = 0.9 * depth_of(FIELD, pose).clamp_max(6.0)
+        samples = field.march(o, d, torch.full_like(end, 0.3), end)
+        _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        lost.append(1 - left)
+    return float(torch.cat(lost).mean())
+
+
+@pytest.mark.slow
+def test_exposures_do_not_become_floaters(tmp_path):
+    """Every photo is exposed anew, by a factor of 1.5 up or down."""
+    scene = make_scene(tmp_path)
+    plain = begin(scene, steps=500, seed=2)
+    random = np.random.default_rng(0)
+    for view in scene.of_split("train"):
+        with Image.open(view.path) as photo:
+            linear = decode_srgb(torch.from_numpy(np.array(photo)) / 255)
+        shown = encode_srgb(linear * 1.5 ** float(random.uniform(-1, 1))).clamp(0, 1)
+        Image.fromarray((shown.numpy() * 255 + 0.5).astype(np.uint8)).save(view.path)
+    vectors = begin(scene, steps=500, seed=2)
+    without = begin(scene, steps=500, seed=2, appearance=False)
+    lost = []
+    for fitting in (plain, vectors, without):
+        fitting.run(lambda _: None)
+        lost.append(lost_before_surfaces(fitting.field, scene))
+    assert lost[1] < 1.5 * lost[0] + 0.01 and lost[1] < lost[2], lost
 
 
 @pytest.mark.slow

@@ -261,6 +261,33 @@ def test_resuming_counts_on(scene, tmp_path):
     assert third["steps"] == 16 and third["samples"] == second["samples"], "it was finished"
 
 
+def test_a_run_that_is_resumed_for_longer_stays_as_far_as_it_was(scene, tmp_path):
+    """Nothing that a later stage has found is believed less again: near matter, masks, steps."""
+    fitted(scene, tmp_path / "run", steps=8)
+    again = begin(scene, steps=800)
+    assert again.stage == 0 and again.near() > again.field.near
+    restore(again, tmp_path / "run")
+    assert again.progress < 0.02 and again.stage == 1 and again.near() == again.field.near
+    arrays, head = read_safetensors(tmp_path / "run" / "optimiser.safetensors", "state")
+    state = {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
+    state["floats"] = state["floats"][:3]  # as earlier versions left it
+    write_safetensors(tmp_path / "run" / "optimiser.safetensors", state, {})
+    before = begin(scene, steps=800)
+    restore(before, tmp_path / "run")
+    assert before.steps == 8 and before.stage == before.progress
+
+
+def test_photos_from_one_spot_are_refused(scene, tmp_path):
+    views = []
+    for view in scene.views:
+        pose = view.c2w.copy()
+        pose[:3, 3] = scene.views[0].c2w[:3, 3] + 1e-5
+        views.append(dataclasses.replace(view, c2w=pose))
+    with pytest.raises(UserError, match="from one spot.*walk"):
+        fitted(dataclasses.replace(scene, views=tuple(views)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     points = np.array([[0.0, -0.6, 0.6], [0.6, 0.0, 0.8]])
     views = [dataclasses.replace(view, seen=np.arange(2)) for view in scene.views]

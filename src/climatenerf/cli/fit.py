@@ -269,7 +269,7 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
 def summary(metrics: dict) -> str:
     """One line: quality, cost, and what of the photos was left out."""
     cost = f"{metrics['steps']} steps, {metrics['seconds']:.0f} s of fitting"
-    if metrics["masked_fraction"]:
+    if metrics.get("masked_fraction"):  # runs of earlier versions have none
         cost += f"; {metrics['masked_fraction']:.1%} of the photos masked as passers-by"
     if metrics["psnr"] is None:
         return f"no held-out photos to measure; {cost}"

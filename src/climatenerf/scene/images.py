@@ -215,8 +215,9 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
         UserError: The file cannot be read.
     """
     opened = _opened(path)
-    # A palette's numbers say nothing of black and white.
-    mask = np.asarray(opened.convert("RGB") if opened.mode == "P" else opened)
+    # A palette's numbers say nothing of black and white, nor does alpha.
+    plain = {"P": "RGB", "PA": "RGB", "LA": "L"}.get(opened.mode)
+    mask = np.asarray(opened.convert(plain) if plain else opened)
     return (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
 
 

@@ -12,7 +12,6 @@ from climatenerf.scene.ground import find_ground
 from climatenerf.scene.images import load_depth
 from climatenerf.scene.scene import Scene
 
-ASSUMED = "camera-height-assumed"
 LEAST_DEPTHS = 5  # points in a view, and views, that depth files must reach
 LEAST_ERROR = 0.01  # of the scale by depth files
 MOST_SPREAD = 0.15  # of log depth over points: metric depth is within a tenth nearly everywhere

@@ -47,7 +47,6 @@ class Carving:
             # Steps and banks that the map cannot follow are not to be levelled.
             lies &= self.ground.over(places)[0].abs() <= self.ground.tolerance
         self.standing = places[~lies]
-        self.find_cells_of_points()
 
     def points_by_most_views(
         self, points: PointRays
@@ -102,11 +101,11 @@ class Carving:
         stands = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
         if self.ground is None or witness is None:
             return stands
-        centre, size = occupancy.cell_centres(torch.arange(stands.numel()))
-        _, known = self.ground.over(centre)
-        near = known.nonzero()[:, 0]
-        x = centre[near] * self.field.unit + self.field.centre
-        stands.view(-1)[near] = witness.agreed(x, torch.zeros(near.shape[0]))
+        for cells in torch.arange(stands.numel()).split(AT_ONCE):
+            centre, _ = occupancy.cell_centres(cells)
+            near = self.ground.over(centre)[1].nonzero()[:, 0]
+            x = centre[near] * self.field.unit + self.field.centre
+            stands.view(-1)[cells[near]] = witness.agreed(x, torch.zeros(near.shape[0]))
         return stands
 
     def cells_of(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
@@ -167,6 +166,7 @@ def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:
     return torch.nn.functional.max_pool3d(cells[:, None].float(), 3, 1, padding=1)[:, 0] > 0
 
 
+AT_ONCE = 2**18  # cells that are asked about: their places take room
 SAME = 1e-4  # grid units within which two ends are one point
 STEP = 0.05  # grid units over which a ray nears the ground
 LEAST_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst

@@ -103,11 +103,13 @@ class Fitting:
             {"params": list(self.masks.parameters()), "shares": (0.0, 1.0)},
             {"params": list(self.poses.parameters()), "shares": (0.0, POSE_SHARE)},
         ]
+        # 1e-15: a gradient that was always 0 has moments of 0, 0/0.
         self.net_adam = torch.optim.Adam(
             groups, lr=settings.net_rate, betas=(0.9, 0.99), eps=1e-15, fused=True
         )
         self.steps = 0
         self.seconds = 0.0
+        self.reached = 0.0  # stage of the run that is resumed
         self.samples = 0
         self.rays = 1024
         self.step_scale = MAX_STEP_SCALE
@@ -123,15 +125,20 @@ class Fitting:
             shares.append(self.steps / self.settings.steps)
         return min(max(shares), 1.0)
 
+    @property
+    def stage(self) -> float:
+        """How far the fit has come, [0,1]: as `progress`, but a later limit takes nothing back."""
+        return max(self.reached, self.progress)
+
     def run(self, report: Callable[[Report], None]) -> None:
         """Steps until time or steps are over; calls `report` after each."""
         self.compile_kernels()
         while self.progress < 1:
             start = time.perf_counter()
             self.update_occupancy()
-            wants_triples = self.settings.losses.flat and self.progress > REFINE_AT
+            wants_triples = self.settings.losses.flat and self.stage > REFINE_AT
             triples = int(TRIPLE_SHARE * self.rays) if wants_triples else 0
-            edges = EDGE_SHARE if self.progress > KEEP_AT else 0.0
+            edges = EDGE_SHARE if self.stage > KEEP_AT else 0.0
             batch = self.pixels.draw(self.rays, self.generator, triples, edges)
             error, samples = self.step(batch)
             seconds = time.perf_counter() - start
@@ -185,7 +192,7 @@ class Fitting:
         t, dt = samples.t / field.unit, samples.dt / field.unit
         tau = samples.sigma * samples.dt
         before, _ = dispatch.render_weights(tau, samples.offsets)
-        if self.progress > KEEP_AT:
+        if self.stage > KEEP_AT:
             field.keep_occupied(rays_o, rays_d, samples, before > SEEN_WEIGHT)
         kept, chance = self.choose(before)
         u = self.positions(batch, samples, kept)
@@ -227,7 +234,7 @@ class Fitting:
         loss.backward()
         decay = settings.final_rate**self.progress * min(1.0, (self.steps + 1) / 50)
         for group in self.net_adam.param_groups:
-            group["lr"] = settings.net_rate * decay * group["shares"][self.progress > REFINE_AT]
+            group["lr"] = settings.net_rate * decay * group["shares"][self.stage > REFINE_AT]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * decay)
         return error.mean().item(), used
@@ -247,10 +254,10 @@ class Fitting:
     ) -> tuple[Float[Tensor, ""], Batch]:
         """Mean squared error of the colours, without what is taken for transient.
 
-        Also the batch without labels and relative depth there: they are of the passer-by.
+        Also the batch without labels, relative depth and triples there: they are of the passer-by.
         """
         price = self.settings.losses.transient
-        if not price or self.progress <= REFINE_AT:
+        if not price or self.stage <= REFINE_AT:
             return error.mean(), batch
         # As long as all is wrong, nothing stands out.
         price = max(price, OUTSTANDING * self.error)
@@ -261,7 +268,8 @@ class Fitting:
         gone = mask.detach() > MASKED
         label = batch.label.masked_fill(gone, UNKNOWN)
         relative = None if batch.relative is None else batch.relative.masked_fill(gone, torch.nan)
-        stays = replace(batch, label=label, relative=relative)
+        in_line = batch.in_line & ~gone[triples(gone.shape[0], batch.in_line.shape[0])].any(0)
+        stays = replace(batch, label=label, relative=relative, in_line=in_line)
         return losses.masked_colour_loss(error, mask, prices), stays
 
     def geometry_loss(
@@ -282,7 +290,7 @@ class Fitting:
             loss = loss + weigh.opacity * losses.opacity_loss(left)
         if weigh.solid:
             below = (batch.rays_d[:, 2] < HORIZON) & (batch.label != SKY)
-            grown = min(1.0, max(0.0, self.progress / REFINE_AT - 0.5))
+            grown = min(1.0, max(0.0, self.stage / REFINE_AT - 0.5))
             loss = loss + grown * weigh.solid * losses.solid_loss(left, below)
         distance = dispatch.accumulate(weights, t[:, None], samples.offsets)[:, 0]
         mean_distance = distance / (1 - left).clamp_min(1e-3)  # nothing there: 0/0
@@ -292,7 +300,7 @@ class Fitting:
             else:
                 which = self.sky_samples(batch, samples, weights.detach())
                 # Leaves against the sky come first, clean edges last: too early, crowns are lost.
-                grown = min(1.0, max(SKY_AT_FIRST, 2 * self.progress - 0.5))
+                grown = min(1.0, max(SKY_AT_FIRST, 2 * self.stage - 0.5))
                 loss = loss + grown * weigh.sky * losses.sky_loss(weights[which], n)
         if weigh.ground and self.carving.ground is not None:
             loss = loss + weigh.ground * self.ground_loss(batch, samples, weights, t)
@@ -300,14 +308,12 @@ class Fitting:
         z = (mean_distance * batch.cosine).clamp_min(1e-3)  # of rays without matter: not counted
         m = batch.in_line.shape[0]
         if weigh.flat and m:
-            rows = torch.stack(
-                [torch.arange(m), torch.arange(n - 2 * m, n - m), torch.arange(n - m, n)]
-            )
+            rows = triples(n, m)
             label = batch.label[rows]
             alike = (label == label[0]).all(0) & (label[0] != VEGETATION) & (label[0] != SKY)
             counts = batch.in_line & alike & solid[rows].all(0)
             loss = loss + weigh.flat * losses.flat_loss(z[rows].T, counts.float())
-        if weigh.monocular and batch.relative is not None and self.progress > REFINE_AT:
+        if weigh.monocular and batch.relative is not None and self.stage > REFINE_AT:
             counts = solid & (batch.label != SKY) & torch.isfinite(batch.relative)
             loss = loss + weigh.monocular * self.relative.loss(
                 1 / z, batch.relative, batch.image, counts
@@ -364,11 +370,11 @@ class Fitting:
             target = SOLID_CLASSES[batch.label[:n].long()]
             composited = dispatch.accumulate(own, logits, offsets_of(of, n))
             loss = loss + weigh.classes * losses.class_loss(composited, target, target != UNKNOWN)
-        if (weigh.normals or weigh.bend) and self.progress > REFINE_AT:
+        if (weigh.normals or weigh.bend) and self.stage > REFINE_AT:
             at = samples.t[index[some], None]
             q = self.field.to_grid(batch.rays_o.detach()[of] + at * batch.rays_d.detach()[of])
             if weigh.normals:
-                self.field.learned[0] = self.progress > NORMALS_AT
+                self.field.learned[0] = self.stage > NORMALS_AT
                 target = self.field.density_normal(q)
                 loss = loss + weigh.normals * losses.normal_loss(own, normal, target, n)
             if weigh.bend:
@@ -403,7 +409,7 @@ class Fitting:
 
     def near(self) -> float:
         """Ray length (m) from which matter is believed at present."""
-        return max(self.field.near, self.first_near * (1 - self.progress / REFINE_AT))
+        return max(self.field.near, self.first_near * (1 - self.stage / REFINE_AT))
 
     def choose(self, weights: Float[Tensor, "s"]) -> tuple[Tensor, Tensor]:
         """The samples that get colour and gradients, and the chance that each had.
@@ -433,7 +439,7 @@ class Fitting:
         if not self.settings.appearance:
             appearance = appearance.detach()
         colour = self.field.colour_at(u, ray, batch.rays_d, appearance)
-        if self.knows_sky:
+        if self.knows_sky and not self.settings.opaque_sky:
             # Haze before the sky would take its colour and stay.
             spread = spread * (batch.label != SKY)[ray]
         colour = scale_gradient(colour, spread[:, None])
@@ -447,7 +453,7 @@ class Fitting:
         if self.knows_sky:
             # It learns from its own pixels; then it may learn fast, and in detail. What nobody has
             # labelled may be sky, and would have to be painted with matter else.
-            unknown = SKY_SHARES[self.progress > REFINE_AT] * (batch.label == UNKNOWN)
+            unknown = SKY_SHARES[self.stage > REFINE_AT] * (batch.label == UNKNOWN)
             sky = scale_gradient(sky, (batch.is_sky + unknown)[:, None])
         return own + left[:, None] * sky
 
@@ -458,7 +464,7 @@ class Fitting:
             occupancy.update(self.field.grid_density, 1.0, 0.9, self.generator)
         elif self.steps % 16 == 0 and self.steps > 128:
             occupancy.update(self.field.grid_density, 0.04, 0.8, self.generator)
-        late = self.progress > REFINE_AT and self.steps > 128
+        late = self.stage > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
             self.carving.bar(everywhere=False)
@@ -470,16 +476,21 @@ class Fitting:
         surfaces cannot become thinner than a step. The budget grows at first: early on, many small
         steps learn faster.
         """
-        budget = self.settings.samples_per_step * min(1.0, 0.25 + 2.5 * self.progress)
+        budget = self.settings.samples_per_step * min(1.0, 0.25 + 2.5 * self.stage)
         factor = min(2.0, max(0.5, budget / max(samples, 1)))
         self.rays = int(min(16384, max(256, rays * factor)))
         self.step_scale *= 1.03 if samples > SAMPLES_PER_RAY * rays else 0.98
-        coarsest = 1 + (MAX_STEP_SCALE - 1) * max(0.0, 1 - self.progress / FINE_AT)
+        coarsest = 1 + (MAX_STEP_SCALE - 1) * max(0.0, 1 - self.stage / FINE_AT)
         self.step_scale = min(coarsest, max(1.0, self.step_scale))
 
 
 def _of(named: dict[str, torch.nn.Parameter], *starts: str) -> list[torch.nn.Parameter]:
     return [p for n, p in named.items() if n.startswith(starts)]
+
+
+def triples(n: int, m: int) -> Int[Tensor, "3 m"]:
+    """Rows of a batch of n rays that are the middles, first and other sides of its m triples."""
+    return torch.stack([torch.arange(m), torch.arange(n - 2 * m, n - m), torch.arange(n - m, n)])
 
 
 def scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
@@ -501,7 +512,7 @@ EMBEDDING_SHARES = (0.0, 0.02)
 FIRST_NEAR = 0.6
 CHOSEN = 32  # samples of a ray that get colour and gradients, about
 SEEN_WEIGHT = 0.05  # samples that weigh more show that their cell is occupied
-KEEP_AT = 0.5  # progress from which this is so: before, haze is to be pruned
+KEEP_AT = 0.5  # stage from which this is so: before, haze is to be pruned
 LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
 SURFACE_SHARE = 4  # rays for one whose classes and normals are learned from
 TRIPLE_SHARE = 1 / 6  # of the rays that are the middle of three in a line
@@ -517,6 +528,6 @@ SOLID_CLASSES = torch.from_numpy(SOLID_OF.astype(np.int64))
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
-FINE_AT = 0.8  # progress from which steps are as fine as when rendering
-REFINE_AT = 0.25  # progress at which occupancy cells are halved
-NORMALS_AT = 0.35  # progress from which predicted normals, learned since then, are shown
+FINE_AT = 0.8  # stage from which steps are as fine as when rendering
+REFINE_AT = 0.25  # stage at which occupancy cells are halved
+NORMALS_AT = 0.35  # stage from which predicted normals, learned since then, are shown

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image
 
 import climatenerf
@@ -46,6 +46,7 @@ CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0
 PREVIEW_WIDTH = 240
 SMALLEST = 16  # pixels; the structural similarity looks at windows of 11
+ONE_SPOT = 1e-3  # m within which cameras are in one place
 
 
 def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
@@ -112,6 +113,7 @@ def fit_scene(
     pixels = load_pixels(scene, downscale)
     views = scene.of_split("train")
     poses = np.stack([scene.c2w_world(view) for view in views])
+    check_moves(poses)
     extent = find_extent(poses, scene.points_world())
     fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(scene))
     if resume:
@@ -156,6 +158,17 @@ def fit_scene(
     metrics |= evaluate(fitting.field, scene, downscale, evaluated)
     write_json(run / "metrics.json", metrics)
     return metrics
+
+
+def check_moves(c2w: Float[np.ndarray, "v 4 4"]) -> None:
+    """Refuses cameras that all stand in one place: nothing can be told of depth there."""
+    eyes = c2w[:, :3, 3]
+    spread = np.linalg.norm(eyes - eyes.mean(0), axis=-1).max()
+    if len(eyes) > 1 and spread < ONE_SPOT:
+        raise UserError(
+            f"all {len(eyes)} photos were taken from one spot (within {1000 * spread:.2g} mm), and"
+            " tell nothing of depth; walk while you take them"
+        )
 
 
 def masked_fraction(fitting: Fitting) -> float | None:
@@ -213,7 +226,7 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     numbers = [fitting.steps, fitting.samples, fitting.rays]
     state["counters"] = torch.tensor(numbers)
     state["floats"] = torch.tensor(
-        [fitting.seconds, fitting.step_scale, fitting.error], dtype=torch.float64
+        [fitting.seconds, fitting.step_scale, fitting.error, fitting.stage], dtype=torch.float64
     )
     write_safetensors(run / OPTIMISER, state, {})
 
@@ -329,9 +342,12 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
     barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
     fitting.carving.find_ground()  # in the units of the run
+    fitting.carving.find_cells_of_points()
     fitting.generator.set_state(state["generator"])
     fitting.steps, fitting.samples, fitting.rays = state["counters"].tolist()
-    fitting.seconds, fitting.step_scale, fitting.error = state["floats"].tolist()
+    floats = state["floats"].tolist()
+    fitting.seconds, fitting.step_scale, fitting.error = floats[:3]
+    fitting.reached = floats[3] if len(floats) > 3 else 0.0  # earlier versions did not keep it
 
 
 def save_preview(field: Field, scene: Scene, run: Path, step: int) -> None:
