@@ -1,0 +1,116 @@
+"""What relative depth is good for where nothing else tells of depth: the paper's ablation of it.
+
+python benchmarks/monocular.py --minutes 4 --keep runs/monocular
+
+A capture like the reference street, half the size, with a depth as networks give it: the true
+inverse z-depth of each photo times and plus numbers of its own, blurred, and off by smooth errors
+of a tenth. (Weights of a network are not part of the project.) Fitted without sparse points and
+without the ground that they show, with and without that depth; holes in the ground, depth and
+normals are measured against the truth. Needs `pip install ".[street]"`.
+"""
+
+import argparse
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+import common
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter
+
+from climatenerf.evaluation.reference import read_reference
+from climatenerf.evaluation.scores import Place
+from climatenerf.field.checkpoint import load_field
+from climatenerf.scene import load_scene, read_scene
+from climatenerf.training.ablation import measure_row
+from climatenerf.training.run import fit_scene
+from climatenerf.training.settings import FitSettings, Losses
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCE = ROOT / "reference" / "street"
+WIDTH, HEIGHT = 192, 108
+BLUR = 1.5  # pixels
+ERROR, ERROR_WIDTH = 0.1, 24.0  # share of the inverse depth; pixels over which it changes
+ROWS = {
+    "no depth": Losses(points=0.0, ground=0.0, monocular=0.0),
+    "relative depth": Losses(points=0.0, ground=0.0),
+    "sparse points": Losses(monocular=0.0),
+    "both": Losses(),
+}
+
+
+def inverse_z(scene, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w"]:
+    """True inverse z-depth through the pixels' middles; 0 in the sky."""
+    import mitsuba as mi
+
+    from street.truth import pixel_rays
+
+    rays = pixel_rays(pose, WIDTH, HEIGHT)
+    out = np.zeros((HEIGHT, WIDTH))
+    start = mi.Point3f(*pose[:3, 3])
+    for place in np.ndindex(HEIGHT, WIDTH):
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*rays[place])))
+        if hit.is_valid():
+            out[place] = 1 / (float(hit.t) * float(rays[place] @ pose[:3, 2]))
+    return out
+
+
+def as_networks_give_it(
+    inverse: Float[np.ndarray, "h w"], random: np.random.Generator
+) -> Float[np.ndarray, "h w"]:
+    """Blurred, with smooth errors, in a scale of the photo's own."""
+    wave = gaussian_filter(random.normal(size=inverse.shape), ERROR_WIDTH)
+    seen = gaussian_filter(inverse * (1 + ERROR * wave / wave.std()), BLUR)
+    return random.uniform(2.0, 20.0) * seen + random.uniform(0.0, 0.5)
+
+
+def make_capture(folder: Path, seed: int) -> None:
+    """The reference street's photos, labels and points, and relative depths."""
+    sys.path.insert(0, str(ROOT))
+    from street.layout import build_scene, camera_poses
+    from street.render import load
+
+    for name in ("images", "labels"):
+        shutil.copytree(REFERENCE / name, folder / name)
+    for name in ("scene.json", "points.ply", "points_seen.npz"):
+        shutil.copy(REFERENCE / name, folder / name)
+    (folder / "depth_relative").mkdir()
+    random = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as meshes:
+        scene = load(build_scene(), Path(meshes))
+        for name, pose in camera_poses():
+            given = as_networks_give_it(inverse_z(scene, pose), random).astype(np.float32)
+            path = folder / "depth_relative" / f"{Path(name).stem}.npz"
+            np.savez_compressed(path, inverse_depth=given)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=4.0)
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS))
+    parser.add_argument("--keep", type=Path, help="folder for the capture and the runs")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = options.keep or Path(temporary)
+        if not (work / "capture").exists():
+            work.mkdir(parents=True, exist_ok=True)
+            (work / "new").mkdir()
+            make_capture(work / "new", options.seed)
+            (work / "new").rename(work / "capture")
+        scene = read_scene(work / "capture")
+        found = {}
+        for name in options.rows:
+            settings = FitSettings(minutes=options.minutes, losses=ROWS[name], seed=options.seed)
+            run = work / name.replace(" ", "-")
+            fit_scene(scene, run, settings, 2, False, lambda _: None, lambda *_: None)
+            place = Place(load_field(run), load_scene(run), read_reference(REFERENCE))
+            found[name], _ = measure_row(place, settings, False)
+            print(name, found[name], file=sys.stderr)
+    common.report("fits with and without relative depth", found, options.seed)
+
+
+if __name__ == "__main__":
+    main()
