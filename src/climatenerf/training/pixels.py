@@ -122,14 +122,14 @@ class TrainingPixels:
                 for each, n in zip(relative, counts, strict=True)
             ]
             self.relative = torch.from_numpy(np.concatenate(flat).astype(np.float16))
-        self.allowed, self.usable = None, None
+        self.usable, self.share = None, 1.0
         if masks is not None and any(mask is not None for mask in masks):
             keep = [
                 np.ones(int(n), bool) if mask is None else mask.reshape(-1) > 0
                 for mask, n in zip(masks, counts, strict=True)
             ]
             self.usable = torch.from_numpy(np.concatenate(keep))
-            self.allowed = self.usable.nonzero()[:, 0]
+            self.share = int(self.usable.count_nonzero()) / max(self.usable.numel(), 1)
             self.edge = self.edge[self.usable[self.edge]]
 
     def without_sky(self) -> "TrainingPixels":
@@ -175,11 +175,7 @@ class TrainingPixels:
                 matter ends and the sky begins, and much hangs on them.
         """
         free = n - 2 * triples
-        if self.allowed is None:
-            pixel = torch.randint(self.rgb.shape[0], (free,), generator=generator)
-        else:
-            chosen = torch.randint(self.allowed.shape[0], (free,), generator=generator)
-            pixel = self.allowed[chosen]
+        pixel = self.anywhere(free, generator)
         if self.edge.numel():
             count = int(edges * (free - triples))
             chosen = torch.randint(self.edge.shape[0], (count,), generator=generator)
@@ -215,6 +211,21 @@ class TrainingPixels:
             in_line=in_line,
             relative=None if self.relative is None else self.relative[pixel].float(),
         )
+
+    def anywhere(self, n: int, generator: torch.Generator) -> Int[Tensor, "n"]:
+        """n random pixels of all that no mask hides, all alike.
+
+        Hidden ones are drawn and left out: a list of the others would take more than the photos.
+        """
+        total = self.rgb.shape[0]
+        if self.usable is None:
+            return torch.randint(total, (n,), generator=generator)
+        found = torch.zeros(0, dtype=torch.long)
+        while found.shape[0] < n:
+            more = int((n - found.shape[0]) / self.share) + 1
+            pixel = torch.randint(total, (more,), generator=generator)
+            found = torch.cat([found, pixel[self.usable[pixel]]])
+        return found[:n]
 
     def sides(
         self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator

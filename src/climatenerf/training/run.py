@@ -72,7 +72,7 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         [load_mask(view, scene, downscale) for view in views],
         [load_relative_depth(view, scene, downscale) for view in views],
     )
-    if pixels.allowed is not None and not pixels.allowed.numel():
+    if not pixels.share:
         raise UserError(
             f"the masks of {scene.root} leave no pixel to learn from; what is to be ignored is"
             " black in them, the rest white"
