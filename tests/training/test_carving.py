@@ -228,6 +228,10 @@ def test_what_stands_is_spared_with_a_rim_about_it():
     cell = 2 * found.field.unit / found.field.occupancy.side
     off = beside[:, 1] - 0.5
     assert not costs[off < 0.5 * cell].any() and costs[off > 3 * cell].all()
+    hull = found.shown_to_stand()
+    beyond = torch.roll(hull, 1, dims=2) & ~hull
+    beyond[:, :, 0] = False
+    assert beyond.any() and found.stands[beyond].all(), "neighbours along y"
     found.stands[:] = False
     bare = asked(found, beside, (beside - o) / t[:, None], t)
     assert bare[off > 0].sum() > costs.sum() and not bare[off < 0].any()
