@@ -64,6 +64,8 @@ class Fit:
     mono_depth: str | None = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
     capture's depth_relative files."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute. cuda: an NVIDIA GPU; checked in a simulator, not yet run on one."""
     seed: int = 0
     """Of all randomness."""
 
@@ -81,6 +83,7 @@ def run(options: Fit) -> int:
             "a resumed run keeps its scale; leave --camera-height, --known-length and"
             " --metric-input out, or fit anew"
         )
+    check_device(options.device)
     scene = read_scene(
         options.scene,
         holdout=options.holdout,
@@ -101,6 +104,15 @@ def run(options: Fit) -> int:
     progress.result(summary(metrics))
     progress.result(f"run: {options.out}")
     return 0
+
+
+def check_device(device: str) -> None:
+    """Refuses a device that is not there; imports torch for others than the CPU only."""
+    if device != "cpu":
+        from climatenerf.ops.placing import on
+
+        with on(device):
+            pass
 
 
 def with_perception(scene: Scene, options: Fit) -> Scene:
@@ -200,11 +212,12 @@ def fit_with_bars(scene, options: Fit) -> dict:
     """Fits with progress bars; returns the metrics."""
     # torch comes in here, so that help and errors in the input do not wait for it.
     progress.say("Preparing (the first run on a machine compiles kernels, about half a minute)")
+    from climatenerf.ops.placing import on
     from climatenerf.training.fit import Report
     from climatenerf.training.run import fit_scene
 
     settings = fit_settings(options)
-    with progress.Bar("fit", 1.0) as bar:
+    with on(options.device), progress.Bar("fit", 1.0) as bar:
 
         def report(state: Report) -> None:
             bar.update(

@@ -56,6 +56,8 @@ class Render:
     """Layers to keep beside the frames."""
     layer_format: tuple[Literal["npz", "png", "exr"], ...] = ("npz",)
     """How layers are written."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute. cuda: an NVIDIA GPU; checked in a simulator, not yet run on one."""
     smog: Smog = field(default_factory=Smog)
     flood: Flood = field(default_factory=Flood)
     snow: Snow = field(default_factory=Snow)
@@ -80,6 +82,19 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
 
         require_exr()
 
+    from climatenerf.ops.placing import on
+
+    with on(options.device):
+        return render_run(options, weather, size, layers)
+
+
+def render_run(
+    options: Render,
+    weather: KeyframedWeather,
+    size: tuple[int, int] | None,
+    layers: Sequence[str],
+) -> int:
+    """The same on the device in use, once the flags are understood."""
     from climatenerf.field.checkpoint import load_field
     from climatenerf.render.camera_path import camera_path
     from climatenerf.scene import load_scene

@@ -5,12 +5,12 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from climatenerf.errors import UserError
 from climatenerf.field.field import Field
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
+from climatenerf.ops.placing import placed
 from climatenerf.storage import check_schema, read_safetensors, write_safetensors
 
 SCHEMA_VERSION = 2
@@ -55,7 +55,7 @@ def load_field(run: Path) -> Field:
             size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
         )
         field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
-        tensors = {k: torch.from_numpy(v) for k, v in arrays.items()}
+        tensors = {k: placed(v) for k, v in arrays.items()}
         if about["schema_version"] == 1:  # without normals and classes: nothing is learned of them
             fresh = field.state_dict()
             tensors |= {k: fresh[k] for k in fresh if k.startswith(("surface_", "learned"))}

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.ops import dispatch
+from climatenerf.ops.placing import integers, uniform
 
 OPACITY = 0.3  # of a crossed cell
 
@@ -73,18 +74,18 @@ class Occupancy(torch.nn.Module):
             # Half anywhere, half occupied ones found by drawing until enough are met: listing all
             # occupied cells would cost more than looking at these.
             count = int(total * fraction / 2)
-            anywhere = torch.randint(total, (count,), generator=generator)
-            drawn = torch.randint(total, (4 * count,), generator=generator)
+            anywhere = integers(generator, 0, total, count)
+            drawn = integers(generator, 0, total, 4 * count)
             known = drawn[held[drawn] > 0][:count]
             cells = torch.cat([anywhere, known, self._neighbours(known[::2], generator)])
         centre, size = self.cell_centres(cells)
-        offset = torch.rand(centre.shape, generator=generator) - 0.5
+        offset = uniform(generator, *centre.shape) - 0.5
         seen = density_at(centre + offset * size[:, None])
         flat[cells] = torch.maximum(flat[cells] * decay, seen)
         if fraction >= 1:
             self._threshold()
         else:
-            some = torch.randint(total, (100_000,), generator=generator)
+            some = integers(generator, 0, total, 100_000)
             threshold = self._thresholds(some)
             dense = flat[cells] * size > threshold[cells // self.side**3]
             held[cells] = (dense & ~self.barred.view(-1)[cells]).to(torch.uint8)
@@ -92,7 +93,7 @@ class Occupancy(torch.nn.Module):
     def _neighbours(self, cells: Int[Tensor, "n"], generator: torch.Generator) -> Int[Tensor, "n"]:
         """A cell next to each: holes in surfaces lie beside what is known, and close this way."""
         side = self.side
-        shift = torch.randint(-1, 2, (3, cells.shape[0]), generator=generator)
+        shift = integers(generator, -1, 2, 3, cells.shape[0])
         place = [cells // side**2 % side, cells // side % side, cells % side]
         x, y, z = ((p + s).clamp(0, side - 1) for p, s in zip(place, shift, strict=True))
         return ((cells // side**3 * side + x) * side + y) * side + z

@@ -178,9 +178,9 @@ class _Network(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, x, shared, row, w1, b1, w2, b2):
-        common = torch.empty(0, w1.shape[1]) if shared is None else shared
-        rows = torch.empty(0, dtype=torch.long) if row is None else row
-        out = torch.empty(w2.shape[1], x.shape[0])
+        common = x.new_empty(0, w1.shape[1]) if shared is None else shared
+        rows = x.new_empty(0, dtype=torch.long) if row is None else row
+        out = x.new_empty(w2.shape[1], x.shape[0])
         cpu_network.network_forward(
             _array(x.T),
             _array(common),
@@ -189,7 +189,7 @@ class _Network(torch.autograd.Function):
             _array(b1),
             _array(w2.T),
             _array(b2),
-            out.numpy(),
+            _array(out),
         )
         ctx.save_for_backward(x, common, rows, w1, b1, w2)
         return out.T
@@ -198,11 +198,11 @@ class _Network(torch.autograd.Function):
     def backward(ctx, grad):
         x, common, rows, w1, b1, w2 = ctx.saved_tensors
         inputs, hidden = w1.shape
-        borders = cpu_network.chunk_borders(rows.numpy(), x.shape[0])
+        borders = cpu_network.chunk_borders(_array(rows), x.shape[0])
         chunks = borders.shape[0] - 1
-        sums1 = torch.zeros(chunks, hidden, inputs + 1)
-        sums2 = torch.zeros(chunks, w2.shape[1], hidden + 1)
-        grad_x = torch.empty(inputs if ctx.needs_input_grad[0] else 0, x.shape[0])
+        sums1 = x.new_zeros(chunks, hidden, inputs + 1)
+        sums2 = x.new_zeros(chunks, w2.shape[1], hidden + 1)
+        grad_x = x.new_empty(inputs if ctx.needs_input_grad[0] else 0, x.shape[0])
         grad_shared = torch.zeros_like(common if ctx.needs_input_grad[1] else common[:0])
         cpu_network.network_backward(
             (_array(x.T), _array(common), _array(rows)),
@@ -210,7 +210,7 @@ class _Network(torch.autograd.Function):
             (_array(w1), _array(w2)),
             _array(grad.T),
             borders,
-            (grad_x.numpy(), grad_shared.numpy(), sums1.numpy(), sums2.numpy()),
+            (_array(grad_x), _array(grad_shared), _array(sums1), _array(sums2)),
         )
         first, second = sums1.sum(0), sums2.sum(0)
         return (
@@ -304,7 +304,7 @@ def occupied_blocks(occupied: UInt8[Tensor, "k g g g"]) -> UInt8[Tensor, "k b b 
     if occupied.is_cuda:
         split = occupied.view(cascades, side // 8, 8, side // 8, 8, side // 8, 8)
         return torch.amax(split, dim=(2, 4, 6), out=blocks)
-    cpu.occupied_blocks(occupied.numpy().view(np.uint64), blocks.numpy())
+    cpu.occupied_blocks(_array(occupied).view(np.uint64), _array(blocks))
     return blocks
 
 

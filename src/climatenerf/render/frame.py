@@ -9,6 +9,7 @@ from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.field import Field
+from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.normals import plane_normals
 from climatenerf.render.surface import see_surface
 from climatenerf.render.trace import trace
@@ -38,7 +39,7 @@ def render_frame(
         labels: also the layer `label`, of a field that has learned classes.
     """
     linear, layers = see_frame(world, camera, c2w, supersample, normals, labels)
-    return (encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy(), layers
+    return array_of((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8)), layers
 
 
 def see_frame(
@@ -84,16 +85,16 @@ def _surface(
     """Normals and classes that the field has learned for a picture's rays; None what it has not."""
     if not isinstance(field, Field) or not (field.knows_normals or field.knows_classes):
         return None, None
-    rays_d = torch.from_numpy(directions.reshape(-1, 3))
-    origin = torch.from_numpy(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
+    rays_d = placed(directions.reshape(-1, 3))
+    origin = placed(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
     normal, label = see_surface(field, origin, rays_d)
     return (
-        normal.view(directions.shape).numpy() if field.knows_normals else None,
-        label.view(directions.shape[:2]).numpy() if field.knows_classes else None,
+        array_of(normal.view(directions.shape)) if field.knows_normals else None,
+        array_of(label.view(directions.shape[:2])) if field.knows_classes else None,
     )
 
 
 def _middle(values: Tensor, shape: tuple[int, int, int, int]) -> np.ndarray:
     """Of each pixel's sub-pixels the one next to its centre."""
     middle = shape[1] // 2
-    return values.view(*shape, *values.shape[1:])[:, middle, :, middle].numpy()
+    return array_of(values.view(*shape, *values.shape[1:])[:, middle, :, middle])

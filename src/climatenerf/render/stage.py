@@ -12,6 +12,7 @@ from torch import Tensor
 
 from climatenerf.errors import UserError
 from climatenerf.field.field import Field
+from climatenerf.ops.placing import array_of
 from climatenerf.render.light import scene_irradiance
 from climatenerf.render.world import Water, World
 from climatenerf.scene.scene import Scene
@@ -106,7 +107,7 @@ def prepare(
             field.trusted(),
             snowy[-1].snow,
             places,
-            (irradiance / math.pi).numpy(),
+            array_of(irradiance / math.pi),
             sun_direction(snowy[-1].sun),
             snowy[-1].seed,
             progress=lambda share: progress("snowfall", share),

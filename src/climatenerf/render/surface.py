@@ -6,6 +6,7 @@ from torch import Tensor
 
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
+from climatenerf.ops.placing import placed
 from climatenerf.render.view import RAYS_AT_ONCE, weighed_samples
 from climatenerf.scene.classes import SKY, SOLID
 
@@ -35,6 +36,6 @@ def see_surface(
         away = (mean * d).sum(-1, keepdim=True) > 0
         normals.append(torch.where(away, -mean, mean))
         best = dispatch.accumulate(seen.weights, logits, seen.offsets).argmax(-1)
-        kind = torch.from_numpy(SOLID)[best].to(torch.uint8)
+        kind = placed(SOLID)[best].to(torch.uint8)
         labels.append(torch.where(solid, kind, torch.full_like(kind, SKY)))
     return torch.cat(normals), torch.cat(labels)

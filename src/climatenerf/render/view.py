@@ -10,6 +10,7 @@ from torch import Tensor
 from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
+from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.samples import offsets_of
 from climatenerf.scene.cameras import Camera
 
@@ -24,8 +25,8 @@ def camera_rays(
     camera: Camera, c2w: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[Tensor, "hw 3"], Float[Tensor, "hw 3"]]:
     """Origins (world m) and unit directions of all pixels, row by row."""
-    directions = torch.from_numpy(camera.directions().reshape(-1, 3).astype(np.float32))
-    pose = torch.from_numpy(np.asarray(c2w, np.float32))
+    directions = placed(camera.directions().reshape(-1, 3).astype(np.float32))
+    pose = placed(np.asarray(c2w, np.float32))
     rays_d = directions @ pose[:3, :3].T
     return pose[:3, 3].expand(rays_d.shape[0], 3).contiguous(), rays_d.contiguous()
 
@@ -78,4 +79,4 @@ def render_view(
 ) -> Float[np.ndarray, "h w 3"]:
     """Display picture in [0,1] of the clean scene from one camera (c2w in world metres)."""
     linear = field_radiance(field, *camera_rays(camera, c2w))
-    return encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3).numpy()
+    return array_of(encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3))

@@ -19,6 +19,7 @@ from climatenerf.field.extent import Extent
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch, reference
+from climatenerf.ops.placing import array_of, placed, uniform
 from climatenerf.render.samples import Samples, offsets_of
 from climatenerf.render.view import LEAST_WEIGHT
 from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
@@ -67,7 +68,7 @@ class Fitting:
         self.points = points
         self.first_near = FIRST_NEAR * extent.unit
         if points is not None:  # a street that was driven along lies nearer than that
-            nearest = float(np.quantile(points.depth.numpy(), 0.02))
+            nearest = float(np.quantile(array_of(points.depth), 0.02))
             self.first_near = min(self.first_near, nearest / 2)
         self.pixels = pixels
         self.extent = extent
@@ -84,7 +85,8 @@ class Fitting:
         self.fill = fill_sky(pixels, self.generator) if self.knows_sky else None
         self.carving = Carving(self.field, pixels, points, settings)
         kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
-        classed = bool((SOLID_CLASSES[kinds.long()] != UNKNOWN).any())
+        self.solid_of = placed(SOLID_OF.astype(np.int64))
+        classed = bool((self.solid_of[kinds.long()] != UNKNOWN).any())
         weigh = settings.losses
         # Normals are learned later.
         self.field.learned[:] = torch.tensor([False, weigh.classes > 0 and classed])
@@ -185,7 +187,7 @@ class Fitting:
             torch.full((n,), self.near()),
             torch.full((n,), 1e9),
             self.step_scale,
-            torch.rand(n, generator=self.generator),
+            uniform(self.generator, n),
             stop=1e-4,
         )
         # Lengths from here on in grid units.
@@ -367,7 +369,7 @@ class Fitting:
         own, of = share[some], ray[some]
         loss = normal.sum() * 0.0
         if weigh.classes and self.pixels.label is not None:
-            target = SOLID_CLASSES[batch.label[:n].long()]
+            target = self.solid_of[batch.label[:n].long()]
             composited = dispatch.accumulate(own, logits, offsets_of(of, n))
             loss = loss + weigh.classes * losses.class_loss(composited, target, target != UNKNOWN)
         if (weigh.normals or weigh.bend) and self.stage > REFINE_AT:
@@ -396,7 +398,7 @@ class Fitting:
             torch.full((n,), field.near),
             2 * measured.depth,  # what is far behind the point shows nowhere
             self.step_scale,
-            torch.rand(n, generator=self.generator),
+            uniform(self.generator, n),
             stop=1e-4,
         )
         u = field.sample_positions(measured.rays_o, measured.rays_d, samples)
@@ -420,7 +422,7 @@ class Fitting:
         """
         chance = (CHOSEN * weights).clamp(LEAST_CHANCE, 1.0)
         # Systematic sampling: drawn ones are spread evenly among those like them.
-        passed = chance.double().cumsum(0) + torch.rand(1, generator=self.generator).double()
+        passed = chance.double().cumsum(0) + uniform(self.generator, 1).double()
         kept = (passed.floor() > (passed - chance).floor()).nonzero()[:, 0]
         return kept, chance[kept]
 
@@ -524,7 +526,6 @@ SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can m
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
-SOLID_CLASSES = torch.from_numpy(SOLID_OF.astype(np.int64))
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this

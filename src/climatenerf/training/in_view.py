@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from climatenerf.ops.placing import placed
 from climatenerf.scene.cameras import Camera
 
 AT_ONCE = 800_000  # distances between places and views that fit into the cache
@@ -44,7 +45,7 @@ def pyramids(cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]) -> Floa
         outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
         normal = outward @ pose[:3, :3].T
         planes.append(np.concatenate([normal, -normal @ pose[:3, 3:]], axis=-1))
-    return torch.from_numpy(np.stack(planes).astype(np.float32))
+    return placed(np.stack(planes).astype(np.float32))
 
 
 def in_view(

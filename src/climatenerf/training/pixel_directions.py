@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.ops.placing import placed
 from climatenerf.scene.cameras import Camera
 
 SPACING = 4  # pixels
@@ -30,7 +31,7 @@ class Directions:
         self.across = torch.tensor([each.shape[1] for each in lattices])
         self.start = torch.tensor([0, *np.cumsum(counts)[:-1].tolist()])
         flat = [each.reshape(-1, 3) for each in lattices]
-        self.lattice = torch.from_numpy(np.concatenate(flat).astype(np.float32))
+        self.lattice = placed(np.concatenate(flat).astype(np.float32))
 
     def of(
         self, camera: Int[Tensor, "n"], column: Int[Tensor, "n"], row: Int[Tensor, "n"]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from climatenerf.ops.placing import array_of, integers, placed
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
 from climatenerf.training.in_view import pyramids
@@ -73,7 +74,7 @@ class TrainingPixels:
 
         Masks: pixels where a mask is 0 are never drawn.
         """
-        self.c2w = torch.from_numpy(np.asarray(c2w, np.float32))
+        self.c2w = placed(np.asarray(c2w, np.float32))
         self.cameras = [cameras[i] for i in camera_of]
         self.directions = Directions(cameras)
         self.camera = torch.as_tensor(list(camera_of))
@@ -84,7 +85,7 @@ class TrainingPixels:
         ):
             raise ValueError("an image's size differs from its camera's")
         self.pixel_start = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
-        self.rgb = torch.from_numpy(np.concatenate([i.reshape(-1, 3) for i in images]))
+        self.rgb = placed(np.concatenate([i.reshape(-1, 3) for i in images]))
         self.width = torch.tensor([image.shape[1] for image in images])
         self.height = torch.tensor([image.shape[0] for image in images])
         self.label = None
@@ -98,16 +99,16 @@ class TrainingPixels:
             for image, label in enumerate(merged):
                 # Networks take puddles and wet walls for the sky that they mirror.
                 row, column = np.nonzero(label == SKY)
-                place = torch.from_numpy(column), torch.from_numpy(row)
+                place = placed(column), placed(row)
                 d = self.directions.of(self.camera[image].expand(len(row)), *place)
-                low = (d @ self.c2w[image, 2, :3] < HORIZON).numpy()
+                low = array_of(d @ self.c2w[image, 2, :3] < HORIZON)
                 label[row[low], column[low]] = UNKNOWN
             flat = np.concatenate([each.reshape(-1) for each in merged])
             # Labels that know nothing are none.
-            self.label = torch.from_numpy(flat) if (flat != UNKNOWN).any() else None
+            self.label = placed(flat) if (flat != UNKNOWN).any() else None
         if self.label is not None and bool((self.label == SKY).any()):
             edge = np.concatenate([sky_edge(each).reshape(-1) for each in merged])
-            self.edge = torch.from_numpy(np.flatnonzero(edge))
+            self.edge = placed(np.flatnonzero(edge))
             self.witness = Witness(self.cameras, c2w, merged, [SKY], SKY_SHARE)
         self.ground_witness = self.standing_witness = None
         if self.label is not None and bool(
@@ -121,14 +122,14 @@ class TrainingPixels:
                 np.full(int(n), np.nan, np.float16) if each is None else in_units(each).reshape(-1)
                 for each, n in zip(relative, counts, strict=True)
             ]
-            self.relative = torch.from_numpy(np.concatenate(flat).astype(np.float16))
+            self.relative = placed(np.concatenate(flat).astype(np.float16))
         self.usable, self.share = None, 1.0
         if masks is not None and any(mask is not None for mask in masks):
             keep = [
                 np.ones(int(n), bool) if mask is None else mask.reshape(-1) > 0
                 for mask, n in zip(masks, counts, strict=True)
             ]
-            self.usable = torch.from_numpy(np.concatenate(keep))
+            self.usable = placed(np.concatenate(keep))
             self.share = int(self.usable.count_nonzero()) / max(self.usable.numel(), 1)
             self.edge = self.edge[self.usable[self.edge]]
 
@@ -147,14 +148,14 @@ class TrainingPixels:
         out = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
         if self.label is None:
             return out
-        for i in image.unique().tolist():
+        for i in array_of(image.unique()).tolist():
             some = (image == i).nonzero()[:, 0]
             camera = self.cameras[i]
-            pixel = camera.project((rays_d[some] @ self.c2w[i, :3, :3]).numpy())
+            pixel = camera.project(array_of(rays_d[some] @ self.c2w[i, :3, :3]))
             with np.errstate(invalid="ignore"):  # behind the camera: NaN
                 inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=-1)
-            x, y = torch.from_numpy(pixel[inside].astype(np.int64)).unbind(-1)
-            out[some[inside]] = self.label[self.pixel_start[i] + y * camera.width + x]
+            x, y = placed(pixel[inside].astype(np.int64)).unbind(-1)
+            out[some[placed(inside)]] = self.label[self.pixel_start[i] + y * camera.width + x]
         return out
 
     @property
@@ -178,7 +179,7 @@ class TrainingPixels:
         pixel = self.anywhere(free, generator)
         if self.edge.numel():
             count = int(edges * (free - triples))
-            chosen = torch.randint(self.edge.shape[0], (count,), generator=generator)
+            chosen = integers(generator, 0, self.edge.shape[0], count)
             pixel[free - count :] = self.edge[chosen]
         image = torch.searchsorted(self.pixel_start, pixel, right=True) - 1
         within = pixel - self.pixel_start[image]
@@ -219,11 +220,11 @@ class TrainingPixels:
         """
         total = self.rgb.shape[0]
         if self.usable is None:
-            return torch.randint(total, (n,), generator=generator)
+            return integers(generator, 0, total, n)
         found = torch.zeros(0, dtype=torch.long)
         while found.shape[0] < n:
             more = int((n - found.shape[0]) / self.share) + 1
-            pixel = torch.randint(total, (more,), generator=generator)
+            pixel = integers(generator, 0, total, more)
             found = torch.cat([found, pixel[self.usable[pixel]]])
         return found[:n]
 
@@ -235,9 +236,9 @@ class TrainingPixels:
         Where one lies outside the image or its mask, the pixel itself stands for both.
         """
         m = image.shape[0]
-        spacing = torch.tensor(SPACINGS)[torch.randint(len(SPACINGS), (m,), generator=generator)]
+        spacing = torch.tensor(SPACINGS)[integers(generator, 0, len(SPACINGS), m)]
         axis = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
-        step = axis[torch.randint(len(axis), (m,), generator=generator)] * spacing[:, None]
+        step = axis[integers(generator, 0, len(axis), m)] * spacing[:, None]
         width, height = self.width[image], self.height[image]
         x, y = within % width, within.div(width, rounding_mode="floor")
         inside = (x >= spacing) & (x < width - spacing) & (y >= spacing) & (y < height - spacing)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.ops.placing import integers, placed
 from climatenerf.scene.scene import Scene
 
 
@@ -36,7 +37,7 @@ class PointRays:
 
     def draw(self, n: int, generator: torch.Generator) -> "PointRays":
         """n random ones of them."""
-        return self.some(torch.randint(self.depth.shape[0], (n,), generator=generator))
+        return self.some(integers(generator, 0, self.depth.shape[0], n))
 
 
 def find_point_rays(scene: Scene) -> PointRays | None:
@@ -56,8 +57,8 @@ def find_point_rays(scene: Scene) -> PointRays | None:
         return None
     rays_d = (end - eye)[kept] / depth[kept, None]
     return PointRays(
-        rays_o=torch.from_numpy(eye[kept].astype(np.float32)),
-        rays_d=torch.from_numpy(rays_d.astype(np.float32)),
-        depth=torch.from_numpy(depth[kept].astype(np.float32)),
-        image=torch.from_numpy(np.concatenate(of)[kept].astype(np.int64)),
+        rays_o=placed(eye[kept].astype(np.float32)),
+        rays_d=placed(rays_d.astype(np.float32)),
+        depth=placed(depth[kept].astype(np.float32)),
+        image=placed(np.concatenate(of)[kept].astype(np.int64)),
     )

@@ -16,6 +16,7 @@ from climatenerf.evaluation.metrics import psnr, psnr_cc, ssim
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.extent import find_extent
 from climatenerf.field.field import Field
+from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.view import render_view
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.images import (
@@ -221,7 +222,7 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
         state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
     state["relative"] = fitting.relative.sums
-    state["barred"] = torch.from_numpy(np.packbits(fitting.field.occupancy.barred.numpy()))
+    state["barred"] = torch.from_numpy(np.packbits(array_of(fitting.field.occupancy.barred)))
     state["generator"] = fitting.generator.get_state()
     numbers = [fitting.steps, fitting.samples, fitting.rays]
     state["counters"] = torch.tensor(numbers)
@@ -236,8 +237,8 @@ def with_corrections(scene: Scene, fitting: Fitting) -> Scene:
     if not fitting.settings.refine_poses:
         return scene
     views = scene.of_split("train")
-    given = torch.from_numpy(np.stack([scene.c2w_world(view) for view in views])).float()
-    corrected = fitting.poses.corrected(given, fitting.field.unit).double().numpy()
+    given = placed(np.stack([scene.c2w_world(view) for view in views])).float()
+    corrected = array_of(fitting.poses.corrected(given, fitting.field.unit).double())
     back = np.linalg.inv(scene.world_from_input)
     moved = {}
     for view, c2w in zip(views, corrected, strict=True):
@@ -337,7 +338,7 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
     for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
         own = {k: v for k, v in state.items() if k.startswith(f"{name}.")}
         module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in own.items()})
-    fitting.relative.sums = state["relative"]
+    fitting.relative.sums = state["relative"].to(torch.get_default_device())
     barred = fitting.field.occupancy.barred
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
     barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.field.colour_space import decode_srgb
+from climatenerf.ops.placing import uniform
 from climatenerf.scene.classes import SKY
 from climatenerf.training.pixels import TrainingPixels
 
@@ -35,7 +36,7 @@ class SkyFill:
         self, n: int, generator: torch.Generator
     ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
         """About n random directions that no photo shows, even over the sphere; their colours."""
-        at = torch.rand(n, 2, generator=generator) * torch.tensor([float(ROWS), float(COLUMNS)])
+        at = uniform(generator, n, 2) * torch.tensor([float(ROWS), float(COLUMNS)])
         row, column = at.long().unbind(-1)
         unseen = self.unseen[row, column]
         at, row, column = at[unseen], row[unseen], column[unseen]

@@ -8,11 +8,11 @@ is above the ground on a ray that ends on it. Labels err, so one view's word is 
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from climatenerf.ops import cpu
+from climatenerf.ops.placing import array_of, placed
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import UNKNOWN
 
@@ -53,19 +53,19 @@ class Witness:
 
     def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether enough views see nothing else within `radius` (m) of places x (world m)."""
-        out = torch.empty(x.shape[0], dtype=torch.bool)
+        out = np.empty(x.shape[0], bool)
         cpu.voices_of(
-            x.contiguous().numpy(),
-            radius.numpy(),
+            np.ascontiguousarray(array_of(x)),
+            array_of(radius),
             self.reach,
             self.starts,
             self.sizes,
             self.pinholes,
             self.c2w,
             (LEAST_VOICES, self.share, self.apart),
-            out.numpy(),
+            out,
         )
-        return out
+        return placed(out)
 
 
 def depth_within(

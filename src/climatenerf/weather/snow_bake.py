@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.samples import Samples
 from climatenerf.weather.parameters import Snow
 from climatenerf.weather.snow_ground import halfway, smooth_ground
@@ -226,13 +227,13 @@ def _first_hits(
     alive = np.arange(len(rays_o))
     while len(alive):
         start = begin[alive]
-        origins = torch.from_numpy((rays_o[alive] + start[:, None] * direction).astype(np.float32))
+        origins = placed((rays_o[alive] + start[:, None] * direction).astype(np.float32))
         directions = torch.tensor(direction, dtype=torch.float32).expand_as(origins).contiguous()
-        t_min = torch.from_numpy(np.maximum(-start, 0).astype(np.float32))
-        t_max = torch.from_numpy(np.minimum(length - start, stretch).astype(np.float32))
+        t_min = placed(np.maximum(-start, 0).astype(np.float32))
+        t_max = placed(np.minimum(length - start, stretch).astype(np.float32))
         samples = field.march(origins, directions, t_min, t_max)
         parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
-        found = halfway(*(part.detach().numpy() for part in parts), depth[alive])
+        found = halfway(*(array_of(part) for part in parts), depth[alive])
         where[alive] = np.where(np.isnan(found[0]), where[alive], found[0] + start)
         depth[alive] = found[1]
         begin[alive] += stretch
@@ -259,9 +260,9 @@ def _shade(
     sun = light.sun_direction
     lift = (snow.depth or 0.0) + max(0.05, spacing)
     lower, upper = field.bounds
-    across = float(np.linalg.norm(np.asarray(upper) - np.asarray(lower)))
+    across = float((upper - lower).norm())
     shades = []
-    for points in torch.from_numpy(hits).split(_CHUNK):
+    for points in placed(hits).split(_CHUNK):
         nearest = viewers[torch.cdist(points, viewers).argmin(1)]
         away = points - nearest
         # A camera inside the ground's fuzz would give a direction of length 0.
@@ -278,5 +279,5 @@ def _shade(
             thick.index_add_(0, samples.ray_index(), (samples.sigma * samples.dt).detach())
             visible = torch.exp(-thick).float()
         shade = shade * (snow.sun_share * visible + snow.shade)
-        shades.append(shade.detach().clamp(0, 1).float().numpy())
+        shades.append(array_of(shade.clamp(0, 1).float()))
     return np.concatenate(shades)

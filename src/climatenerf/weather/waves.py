@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Complex, Float, Int64
 from torch import Tensor
 
+from climatenerf.ops.placing import placed
 from climatenerf.weather.parameters import Flood
 from climatenerf.weather.spectrum import (
     LOWEST,
@@ -150,7 +151,7 @@ def make_tile(
     inside = (k >= band[0]) & (k < band[1]) & (k > 0)
     inside &= (np.abs(index) < n // 2)[:, None] & (np.abs(index) < n // 2)
     deviation = np.sqrt(np.where(inside, energy, 0) / 2) * 2 * math.pi / length
-    noise = torch.randn(n, n, dtype=torch.complex128, generator=generator)
+    noise = torch.randn(n, n, dtype=torch.complex128, generator=generator, device="cpu")
     forward = noise * torch.from_numpy(deviation)  # torch's complex normal has E|z|^2 = 1
     backward = forward.flip(0, 1).roll((1, 1), (0, 1)).conj().resolve_conj()
     power = (forward.abs() ** 2 + backward.abs() ** 2).numpy()  # mean over time of |h(k, t)|^2
@@ -158,13 +159,13 @@ def make_tile(
     kept, shared = _level_variances(slope_power, kx, ky, length)
     return WaveTile(
         length,
-        torch.from_numpy(np.stack([kx, ky], axis=-1)).float(),
-        torch.from_numpy(omega),
-        forward.to(torch.complex64),
-        backward.to(torch.complex64),
+        placed(np.stack([kx, ky], axis=-1)).float(),
+        placed(omega),
+        forward.to(torch.get_default_device(), torch.complex64),
+        backward.to(torch.get_default_device(), torch.complex64),
         float(slope_power.sum()),
-        torch.from_numpy(kept).float(),
-        torch.from_numpy(shared).float(),
+        placed(kept).float(),
+        placed(shared).float(),
     )
 
 

@@ -1,0 +1,56 @@
+"""On which device numbers lie.
+
+Work is done on the device of the `with torch.device(...)` block around it: what torch makes lies
+there by itself, and this brings the rest. Random numbers are drawn on the CPU, so that a seed means
+the same on every device.
+"""
+
+import contextlib
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from climatenerf.errors import UserError
+
+
+@contextlib.contextmanager
+def on(device: str) -> Iterator[None]:
+    """Work within it is done on that device, "cpu" or "cuda".
+
+    Raises:
+        UserError: there is no such device.
+    """
+    if device == "cpu":
+        yield
+        return
+    if not torch.cuda.is_available():
+        raise UserError(
+            "PyTorch finds no NVIDIA GPU; install PyTorch with CUDA and the card's driver, or leave"
+            " --device out"
+        )
+    with torch.device(device):
+        yield
+
+
+def placed(array: np.ndarray) -> Tensor:
+    """An array's numbers on the device in use; on a CPU they share its memory."""
+    return torch.from_numpy(array).to(torch.get_default_device())
+
+
+def array_of(tensor: Tensor) -> np.ndarray:
+    """A tensor's numbers on the CPU; it shares the memory of one that is there."""
+    return tensor.detach().cpu().numpy()
+
+
+def uniform(generator: torch.Generator, *shape: int) -> Float[Tensor, "..."]:
+    """Random numbers in [0,1)."""
+    return torch.rand(shape, generator=generator, device="cpu").to(torch.get_default_device())
+
+
+def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> Int[Tensor, "..."]:
+    """Random whole numbers from low to high - 1."""
+    drawn = torch.randint(low, high, shape, generator=generator, device="cpu")
+    return drawn.to(torch.get_default_device())

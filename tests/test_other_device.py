@@ -1,0 +1,144 @@
+"""Fits and frames on another device than the CPU: a toy one that computes as the CPU does."""
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_device import TOY, kernels_for_toys
+from training.toy_scene import CAMERA, TINY, make_scene
+
+from climatenerf import cli
+from climatenerf.field.checkpoint import load_field
+from climatenerf.field.extent import find_extent
+from climatenerf.field.presets import PRESETS
+from climatenerf.render.frame import render_frame
+from climatenerf.render.stage import prepare
+from climatenerf.scene import load_image
+from climatenerf.training.fit import Fitting
+from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.points import find_point_rays
+from climatenerf.training.run import fit_scene
+from climatenerf.training.settings import FitSettings, Losses
+from climatenerf.weather.description import weather_from_table
+
+WEATHER = {
+    "smog": {"visibility": "20 m"},
+    "flood": {"level": "0.2 m", "wind_speed": "3 m/s"},
+    "snow": {"depth": "10 cm"},
+    "sun": {"elevation": "40 deg"},
+}
+
+
+@contextlib.contextmanager
+def on_toy():
+    with kernels_for_toys(), TOY:
+        yield
+
+
+def nothing(*_):
+    pass
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A run of each device, both stopped and resumed."""
+    folder = tmp_path_factory.mktemp("runs")
+    scene = make_scene(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        for name, device in (("cpu", contextlib.nullcontext()), ("toy", on_toy())):
+            with device:
+                for steps in (30, 60):
+                    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**12}
+                    settings = FitSettings(steps=steps, refine_poses=True, **chosen)
+                    fit_scene(
+                        scene,
+                        folder / name,
+                        settings,
+                        1,
+                        steps > 30,
+                        lambda _: None,
+                        lambda *_: None,
+                    )
+    return scene, folder
+
+
+def test_the_toy_device_refuses_to_meet_the_cpu():
+    with TOY:
+        there = torch.arange(3)
+        assert there.device == TOY and (there + 1).cpu().tolist() == [1, 2, 3]
+    with pytest.raises(RuntimeError, match="of the CPU"):
+        there + torch.ones(3)
+
+
+def test_a_fit_is_the_same_on_both(runs):
+    _, folder = runs
+    ours, theirs = load_field(folder / "cpu"), load_field(folder / "toy")
+    for (name, a), b in zip(ours.state_dict().items(), theirs.state_dict().values(), strict=True):
+        assert torch.equal(a, b), name
+    assert (folder / "toy" / "metrics.json").is_file()
+
+
+def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
+    """Sky, ground, points, relative depth, moving cameras, normals that move matter."""
+    scene, _ = runs
+    place = np.random.default_rng(0).uniform(-2, 2, (200, 2))
+    points = np.concatenate([place, np.zeros((200, 1))], axis=1)
+    views = [replace(view, seen=np.arange(200)) for view in scene.views]
+    scene = replace(scene, views=tuple(views), points=points)
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    with on_toy():
+        train = scene.of_split("train")
+        images = [load_image(view, scene) for view in train]
+        labels = [np.where(np.arange(36)[:, None] < 12, 10, 9) for _ in train]  # sky over terrain
+        labels = [np.broadcast_to(each, (36, 48)).astype(np.uint8) for each in labels]
+        relative = [np.random.default_rng(i).random((36, 48)) for i in range(len(train))]
+        poses = np.stack([scene.c2w_world(view) for view in train])
+        pixels = TrainingPixels(
+            scene.cameras, [0] * len(train), poses, images, labels, None, relative
+        )
+        settings = FitSettings(
+            preset="tiny",
+            minutes=None,
+            steps=8,
+            samples_per_step=2**12,
+            losses=Losses(bend=0.01),
+            refine_poses=True,
+        )
+        extent = find_extent(poses, None)
+        fitting = Fitting(pixels, len(train), extent, settings, find_point_rays(scene))
+        assert fitting.knows_sky and fitting.carving.ground is not None
+        fitting.run(nothing)
+        assert fitting.field.embeddings.device == TOY and fitting.poses.shift.device == TOY
+
+
+@pytest.mark.slow
+def test_a_frame_in_all_weathers_is_the_same_on_both(runs):
+    scene, folder = runs
+    pose = scene.c2w_world(scene.views[0])
+    frames = []
+    for device in (contextlib.nullcontext(), on_toy()):
+        with device, torch.no_grad():
+            field = load_field(folder / "cpu")
+            field.occupancy.seen.fill_(1)
+            weather = weather_from_table(WEATHER)
+            stage = prepare(
+                field, scene, weather, pose[None, :3, 3], np.array([0.0]), lambda *_: None
+            )
+            small = CAMERA.resized(16, 12)
+            frames.append(render_frame(stage.at(0.0), small, pose, 2, normals=True, labels=True))
+    (ours, layers), (theirs, others) = frames
+    assert ours.std() > 5 and np.array_equal(ours, theirs)
+    assert {"mask_water", "mask_snow", "mask_smog", "normal"} <= set(layers)
+    for name, values in layers.items():
+        assert np.array_equal(values, others[name], equal_nan=True), name
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused(tmp_path, capsys):
+    for words in (["fit", "capture", "-o", "run"], ["render", "run", "-o", "out"]):
+        assert cli.main([*words, "--device", "cuda"]) == 2
+        said = capsys.readouterr().err
+        assert "NVIDIA GPU" in said and "Traceback" not in said
