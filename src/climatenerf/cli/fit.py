@@ -109,7 +109,7 @@ def run(options: Fit) -> int:
 def check_device(device: str) -> None:
     """Refuses a device that is not there; imports torch for others than the CPU only."""
     if device != "cpu":
-        from climatenerf.ops.placing import on
+        from climatenerf.field.device import on
 
         with on(device):
             pass
@@ -212,7 +212,7 @@ def fit_with_bars(scene, options: Fit) -> dict:
     """Fits with progress bars; returns the metrics."""
     # torch comes in here, so that help and errors in the input do not wait for it.
     progress.say("Preparing (the first run on a machine compiles kernels, about half a minute)")
-    from climatenerf.ops.placing import on
+    from climatenerf.field.device import on
     from climatenerf.training.fit import Report
     from climatenerf.training.run import fit_scene
 

@@ -82,7 +82,7 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
 
         require_exr()
 
-    from climatenerf.ops.placing import on
+    from climatenerf.field.device import on
 
     with on(options.device):
         return render_run(options, weather, size, layers)

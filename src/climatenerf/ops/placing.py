@@ -5,34 +5,10 @@ there by itself, and this brings the rest. Random numbers are drawn on the CPU, 
 the same on every device.
 """
 
-import contextlib
-from collections.abc import Iterator
-
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-
-from climatenerf.errors import UserError
-
-
-@contextlib.contextmanager
-def on(device: str) -> Iterator[None]:
-    """Work within it is done on that device, "cpu" or "cuda".
-
-    Raises:
-        UserError: there is no such device.
-    """
-    if device == "cpu":
-        yield
-        return
-    if not torch.cuda.is_available():
-        raise UserError(
-            "PyTorch finds no NVIDIA GPU; install PyTorch with CUDA and the card's driver, or leave"
-            " --device out"
-        )
-    with torch.device(device):
-        yield
 
 
 def placed(array: np.ndarray) -> Tensor:

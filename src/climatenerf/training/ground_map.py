@@ -7,9 +7,12 @@ them bends little; so rays that are labelled ground are to end near that height.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from climatenerf.ops.placing import placed
 
 CELLS = 33  # lines along an edge
 HALF_SIDE = 4.0  # grid units
@@ -91,7 +94,7 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
         height = torch.linalg.solve(pull.view(size, size) + price, goal)
         off = ((look * height[place]).sum(-1) + middle - z).abs()
         weight = 1 / (off.clamp_min(FINEST) * n)
-    line = torch.linspace(-HALF_SIDE, HALF_SIDE, CELLS)
+    line = placed(np.linspace(-HALF_SIDE, HALF_SIDE, CELLS, dtype=np.float32))
     lines = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
     near = torch.cdist(lines, q[:, :2]).amin(-1)
     return GroundMap(
