@@ -52,6 +52,9 @@ def _call(func, args, kwargs):
         if foreign and x.dim() and toys and func not in CROSSING:
             raise RuntimeError(f"{func}: tensors of the device and of the CPU")
     device = kwargs.get("device")
+    here = device is not None and torch.device(device).type == "toy"
+    if here and kwargs.get("generator") is not None:
+        raise RuntimeError(f"{func}: a generator of the CPU on the device")
     args, kwargs = pytree.tree_map(_bare, (args, kwargs))
     out = func(*args, **kwargs)
     leaves = device is not None and torch.device(device).type == "cpu"

@@ -20,8 +20,8 @@ def on(device: str) -> Iterator[None]:
         return
     if not torch.cuda.is_available():
         raise UserError(
-            "PyTorch finds no NVIDIA GPU; install PyTorch with CUDA and the card's driver, or leave"
-            " --device out"
+            "PyTorch finds no NVIDIA GPU; install PyTorch with CUDA, the card's driver and the CUDA"
+            " toolkit, or leave --device out"
         )
     with torch.device(device):
         yield

@@ -1,8 +1,8 @@
 """On which device numbers lie.
 
 Work is done on the device of the `with torch.device(...)` block around it: what torch makes lies
-there by itself, and this brings the rest. Random numbers are drawn on the CPU, so that a seed means
-the same on every device.
+there by itself, and this brings the rest. A fit's random numbers (but for its networks' first
+values) are drawn on the CPU, so that a seed means much the same on every device.
 """
 
 import numpy as np

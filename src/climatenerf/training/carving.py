@@ -47,6 +47,7 @@ class Carving:
             # Steps and banks that the map cannot follow are not to be levelled.
             lies &= self.ground.over(places)[0].abs() <= self.ground.tolerance
         self.standing = places[~lies]
+        self.hull = None
 
     def points_by_most_views(
         self, points: PointRays
@@ -93,7 +94,12 @@ class Carving:
         """Notes the occupancy's cells in which sparse points lie, and those by what stands."""
         ends = torch.zeros(0, 3) if self.points is None else self.field.to_grid(self.points.ends)
         self.held = self.cells_of(ends)
-        self.stands = _grown(self.cells_of(self.standing) | self.shown_to_stand())
+        if self.hull is None:
+            self.hull = self.shown_to_stand()
+        while self.hull.shape[1] < self.field.occupancy.side:  # asking of all again takes seconds
+            for axis in (1, 2, 3):
+                self.hull = self.hull.repeat_interleave(2, dim=axis)
+        self.stands = _grown(self.cells_of(self.standing) | self.hull)
 
     def shown_to_stand(self) -> Bool[Tensor, "k g g g"]:
         """The occupancy's cells where most photos see what stands on the ground."""

@@ -21,6 +21,7 @@ HORIZON = -0.05  # rays that sink more than this end on matter: levelling is goo
 SKY_SHARE = 0.1  # of the views that have a place before them: so many must show sky there,
 GROUND_SHARE = 0.5  # or ground
 STANDING_SHARE = 0.5  # or things that stand on it
+AT_MOST = 2**22  # pixels drawn at once where masks hide nearly all
 EDGE = 2  # pixels to both sides that are such an edge
 
 
@@ -223,7 +224,7 @@ class TrainingPixels:
             return integers(generator, 0, total, n)
         found = torch.zeros(0, dtype=torch.long)
         while found.shape[0] < n:
-            more = int((n - found.shape[0]) / self.share) + 1
+            more = min(int((n - found.shape[0]) / self.share) + 1, AT_MOST)
             pixel = integers(generator, 0, total, more)
             found = torch.cat([found, pixel[self.usable[pixel]]])
         return found[:n]
