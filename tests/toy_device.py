@@ -53,7 +53,7 @@ def _call(func, args, kwargs):
             raise RuntimeError(f"{func}: tensors of the device and of the CPU")
     device = kwargs.get("device")
     here = device is not None and torch.device(device).type == "toy"
-    if here and kwargs.get("generator") is not None:
+    if (here or toys) and kwargs.get("generator") is not None:
         raise RuntimeError(f"{func}: a generator of the CPU on the device")
     args, kwargs = pytree.tree_map(_bare, (args, kwargs))
     out = func(*args, **kwargs)

@@ -237,6 +237,15 @@ def test_what_stands_is_spared_with_a_rim_about_it():
     assert bare[off > 0].sum() > costs.sum() and not bare[off < 0].any()
 
 
+def test_what_stands_is_kept_when_cells_are_halved():
+    found = refined(carving())
+    asked_again = found.shown_to_stand()
+    assert found.hull is not None and found.hull.shape == asked_again.shape
+    both, either = (found.hull & asked_again).sum(), (found.hull | asked_again).sum()
+    assert asked_again.any() and both > 0.6 * either, (both, either)
+    assert (found.stands | ~asked_again).float().mean() > 0.999
+
+
 def test_a_label_is_looked_up_where_a_ray_goes_through_the_picture():
     found = carving()
     pixels = found.pixels

@@ -338,7 +338,7 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
     for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
         own = {k: v for k, v in state.items() if k.startswith(f"{name}.")}
         module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in own.items()})
-    fitting.relative.sums = state["relative"].to(torch.get_default_device())
+    fitting.relative.sums.copy_(state["relative"])
     barred = fitting.field.occupancy.barred
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
     barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
