@@ -6,7 +6,8 @@ from test_witness import CAMERA, TOWER, in_matter, labels, poses
 from toy_scene import TINY
 
 from climatenerf.field.field import Field
-from climatenerf.scene.classes import BUILDING, SKY, TERRAIN
+from climatenerf.ops.reference import contract
+from climatenerf.scene.classes import BUILDING, SKY, SOLID, TERRAIN
 from climatenerf.training import ground_map
 from climatenerf.training.carving import Carving
 from climatenerf.training.pixels import TrainingPixels
@@ -124,8 +125,8 @@ def rim(shift):
     return x, (x - o) / t[:, None], t
 
 
-def asked(found, x, d, t):
-    far, _ = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit)
+def asked(found, x, d, t, classed=False):
+    far, _ = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit, classed)
     return torch.zeros(len(x), dtype=torch.bool).index_fill(0, far, True)
 
 
@@ -199,7 +200,8 @@ def test_points_off_the_map_are_no_ground_and_spare_what_is_by_them(monkeypatch)
     off = over.abs() > found.ground.tolerance
     assert known.all() and 0.02 < off.float().mean() < 0.2
     cells, _ = found.field._cells(q[off])
-    assert found.stands.view(-1)[cells].all()
+    assert found.stands.view(-1)[cells].all() and found.stepped.view(-1)[cells].all()
+    assert not found.stepped.view(-1)[found.field._cells(q[over.abs() < 0.01])[0]].all()
 
 
 def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
@@ -235,6 +237,31 @@ def test_what_stands_is_spared_with_a_rim_about_it():
     found.stands[:] = False
     bare = asked(found, beside, (beside - o) / t[:, None], t)
     assert bare[off > 0].sum() > costs.sum() and not bare[off < 0].any()
+
+
+def test_lumps_by_the_tower_cost_once_the_field_takes_them_for_ground(monkeypatch):
+    """It takes all that is more than 5 cm beside the tower for ground; a step is let be."""
+    found = carving()
+    field, edge = found.field, 0.55
+
+    def surface_at(u):
+        middle = contract(field.to_grid(torch.tensor([[0.0, edge, 1.0]])))[0, 1]
+        logits = torch.zeros(u.shape[0], len(SOLID))
+        logits[:, SOLID.tolist().index(BUILDING)] = 1.0
+        logits[u[:, 1] > middle, SOLID.tolist().index(TERRAIN)] = 2.0
+        return torch.zeros(u.shape[0], 3), logits
+
+    monkeypatch.setattr(field, "surface_at", surface_at)
+    x, d, t = rim(torch.linspace(-0.5, 1.5, 41))
+    before, later = asked(found, x, d, t), asked(found, x, d, t, classed=True)
+    by_class = x[:, 1] > edge
+    spared = found.stands.view(-1)[field._cells(field.to_grid(x))[0]]
+    assert (by_class & spared).any() and not before[spared].any()
+    assert later[by_class].all() and torch.equal(later[~by_class], before[~by_class])
+    found.steps = found.standing = field.to_grid(x[by_class])
+    found.find_cells_of_points()
+    stepped = asked(found, x, d, t, classed=True)
+    assert not stepped[by_class].any()
 
 
 def test_what_stands_is_kept_when_cells_are_halved():

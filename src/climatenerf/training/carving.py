@@ -4,7 +4,8 @@ Cells that no photo has in view stay empty, as do those that photos agree to be 
 unless a point lies by them, and those above points of the ground that most photos see ground
 behind. Elsewhere matter above the ground costs, but is not forbidden: a crest may hide a ditch and
 what is in it, and the map of the ground does not know every step. What stands on the ground is
-spared, with a rim about it: a trunk is narrower than the haze that becomes one.
+spared, with a rim about it: a trunk is narrower than the haze that becomes one. Once the field has
+learned classes of its own they say better what stands, and lumps in the rim are pulled as well.
 """
 
 import torch
@@ -12,7 +13,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.field.field import Field
-from climatenerf.scene.classes import GROUND
+from climatenerf.ops import reference
+from climatenerf.ops.placing import placed
+from climatenerf.scene.classes import GROUND, SOLID
 from climatenerf.training.ground_map import draw_ground
 from climatenerf.training.in_view import in_view
 from climatenerf.training.pixels import TrainingPixels
@@ -37,15 +40,16 @@ class Carving:
         self.bar()
 
     def find_ground(self) -> None:
-        """Draws the map of the ground, and notes the cells of points on it and off it."""
-        self.ground = None
+        """Draws the map of the ground, and notes points that stand on it, and steps off it."""
+        self.ground, self.steps = None, torch.zeros(0, 3)
         places, lies = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
         if self.knows_ground and self.points is not None:
             places, lies = self.points_by_most_views(self.points)
             self.ground = draw_ground(places[lies])
         if self.ground is not None:
             # Steps and banks that the map cannot follow are not to be levelled.
-            lies &= self.ground.over(places)[0].abs() <= self.ground.tolerance
+            steps = lies & (self.ground.over(places)[0].abs() > self.ground.tolerance)
+            self.steps, lies = places[steps], lies & ~steps
         self.standing = places[~lies]
         self.hull = None
 
@@ -100,6 +104,7 @@ class Carving:
             for axis in (1, 2, 3):
                 self.hull = self.hull.repeat_interleave(2, dim=axis)
         self.stands = _grown(self.cells_of(self.standing) | self.hull)
+        self.stepped = _grown(self.cells_of(self.steps))
 
     def shown_to_stand(self) -> Bool[Tensor, "k g g g"]:
         """The occupancy's cells where most photos see what stands on the ground."""
@@ -144,10 +149,12 @@ class Carving:
         q: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         t: Float[Tensor, "n"],
+        classed: bool = False,
     ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
         """Which samples of rays to the ground lie too far from it, and where (t) they should.
 
-        Only those where most photos see ground, away from what stands on it; t in grid units.
+        Only those where most photos see ground, away from what stands on it, and with `classed`
+        those that the field takes for ground, away from steps; t in grid units.
         """
         if self.ground is None:
             return torch.zeros(0, dtype=torch.long), t[:0]
@@ -157,14 +164,24 @@ class Carving:
         off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
         far = (known & (nearing > LEAST_NEARING) & (off != 0)).nonzero()[:, 0]
         cells, _ = self.field._cells(q[far])
-        far = far[~self.stands.view(-1)[cells]]
-        far = far[self.shows_ground(q[far], torch.zeros(far.shape[0]))]
+        pulled = torch.zeros(far.shape[0], dtype=torch.bool)
+        if classed:
+            pulled = self.taken_for_ground(q[far]) & ~self.stepped.view(-1)[cells]
+        rest = (~pulled & ~self.stands.view(-1)[cells]).nonzero()[:, 0]
+        pulled[rest] = self.shows_ground(q[far[rest]], torch.zeros(rest.shape[0]))
+        far = far[pulled]
         return far, (t[far] + off[far] / nearing[far]).clamp_min(0.0)
 
+    @torch.no_grad()
+    def taken_for_ground(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether matter at q (grid units) is ground by the field's own classes."""
+        _, logits = self.field.surface_at(reference.contract(q))
+        return on_the_ground(placed(SOLID)[logits.argmax(-1)])
 
-def on_the_ground(label: UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
+
+def on_the_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Whether merged classes are such as lie on the ground."""
-    return torch.isin(label, torch.tensor(GROUND, dtype=torch.uint8))
+    return torch.isin(label, torch.tensor(GROUND, dtype=label.dtype))
 
 
 def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:

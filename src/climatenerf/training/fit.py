@@ -336,9 +336,11 @@ class Fitting:
         own = ray[some]
         d = batch.rays_d.detach()[own]
         q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
-        far, goal = self.carving.far_from_ground(q, d, t[some])
-        some = some[far]
-        return losses.ground_loss(weights[some], t[some], goal, batch.rays_o.shape[0])
+        # Later the field has learned what is ground: pulled harder, nothing else goes with it.
+        classed = self.stage > REFINE_AT and bool(self.field.learned[1])
+        far, goal = self.carving.far_from_ground(q, d, t[some], classed)
+        some, pull = some[far], SURE_PULL if classed else 1.0
+        return pull * losses.ground_loss(weights[some], t[some], goal, batch.rays_o.shape[0])
 
     def sky_samples(
         self, batch: Batch, samples: Samples, weights: Float[Tensor, "s"]
@@ -525,6 +527,7 @@ OUTSTANDING = 6.0  # times the mean error: the least price of a mask
 SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
+SURE_PULL = 4.0  # of the ground loss's weight, where the field's own classes tell ground
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0
