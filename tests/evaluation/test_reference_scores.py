@@ -97,6 +97,20 @@ def test_floaters_and_sky_are_counted_where_they_are():
     assert (free[~truth.sky] < truth.depth[~truth.sky]).all() and np.isinf(free[truth.sky]).all()
 
 
+def test_clear_sky_has_sky_all_around():
+    truth = truth_of()
+    truth.depth[:10] = np.inf
+    truth.depth[5, 5] = 3.0  # a leaf
+    passed = np.ones(truth.depth.shape)
+    passed[4:7, 4:7] = passed[9] = 0.5  # what is beside it, and above the ground
+    found = geometry.emptiness_scores([1 - passed], [passed], (truth,))
+    assert found["clear_sky_empty_fraction"] == 1 > found["sky_empty_fraction"] + 0.05
+    passed[2, :8] = 0.5
+    found = geometry.emptiness_scores([1 - passed], [passed], (truth,))
+    clear = 9 * truth.depth.shape[1] - 9
+    assert found["clear_sky_empty_fraction"] == pytest.approx(1 - 8 / clear)
+
+
 def waterline(depth, level, truth, mask):
     return weather_scores.waterline_scores(
         [depth], [mask], [truth.c2w], level, (truth,), 0.3, 1 / CAMERA.fx

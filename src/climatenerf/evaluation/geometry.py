@@ -117,14 +117,25 @@ def emptiness_scores(
 
     Returns:
         `floater_mass`, the mean share lost before the surface; `sky_empty_fraction`, the share of
-        true sky pixels that at least `EMPTY` of the light passes.
+        true sky pixels that at least `EMPTY` of the light passes; `clear_sky_empty_fraction`, the
+        same of those with sky all around (a pixel beside a leaf is leaf in part, whatever its
+        middle shows).
     """
     lost = np.concatenate([a[~t.sky] for a, t in zip(absorbed, truths, strict=True)])
     passed = np.concatenate([s[t.sky] for s, t in zip(skyward, truths, strict=True)])
+    clear = np.concatenate([within(t.sky)[t.sky] for t in truths])
     return {
         "floater_mass": float(lost.mean()),
-        "sky_empty_fraction": float((passed >= EMPTY).mean()) if passed.size else float("nan"),
+        "sky_empty_fraction": _share(passed >= EMPTY),
+        "clear_sky_empty_fraction": _share(passed[clear] >= EMPTY),
     }
+
+
+def within(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose neighbours are in the mask too; beyond the border there are none."""
+    padded = np.pad(mask, 1, mode="edge")
+    rows = padded[:-2] & padded[1:-1] & padded[2:]
+    return rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]
 
 
 def nearest_pixels(
@@ -155,6 +166,10 @@ def label_scores(
             union = ((ours == kind) | (real == kind)).sum()
             each[f"iou_{name}"] = float(((ours == kind) & (real == kind)).sum() / union)
     return {"miou": float(np.mean(list(each.values()))), **each}
+
+
+def _share(which: Bool[np.ndarray, "n"]) -> float:
+    return float(which.mean()) if which.size else float("nan")
 
 
 def _median(values: np.ndarray) -> float:
