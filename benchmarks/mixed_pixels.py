@@ -10,6 +10,7 @@ photos' areas rightly can score no better than that. Needs `pip install ".[stree
 """
 
 import argparse
+import sys
 import tempfile
 from pathlib import Path
 
@@ -61,6 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rays", type=int, default=6)
     rays = parser.parse_args().rays
+    sys.path.insert(0, str(ROOT))
     from street.layout import build_scene, measuring_poses
     from street.render import load
 
