@@ -209,9 +209,13 @@ def begin(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
 
 
 def time_to_psnr(
-    capture: Path, settings: FitSettings, downscale: int, every: float
+    capture: Path,
+    settings: FitSettings,
+    downscale: int,
+    every: float,
+    goals: tuple[int, ...] = GOALS,
 ) -> dict[str, object]:
-    """Seconds of fitting until the held-out photos reach `GOALS`; the whole curve beside them."""
+    """Seconds of fitting until the held-out photos reach `goals`; the whole curve beside them."""
     scene = read_scene(capture)
     fitting = begin(scene, settings, downscale)
     curve: list[dict[str, float]] = []
@@ -220,18 +224,27 @@ def time_to_psnr(
         if report.seconds >= every * (len(curve) + 1) or report.progress >= 1:
             found = evaluate(fitting.field, scene, downscale, lambda done, total: None)
             curve.append(
-                {"seconds": report.seconds, "psnr": found["psnr"], "psnr_cc": found["psnr_cc"]}
+                {
+                    "seconds": report.seconds,
+                    "samples": report.samples,
+                    "psnr": found["psnr"],
+                    "psnr_cc": found["psnr_cc"],
+                }
             )
 
     fitting.run(look)
-    return {**reached(curve), "curve": curve}
+    last = curve[-1]
+    per_second = last["samples"] / last["seconds"]
+    return {**reached(curve, goals), "samples_per_s": per_second, "curve": curve}
 
 
-def reached(curve: list[dict[str, float]]) -> dict[str, float | None]:
-    """Seconds until each of `GOALS`; None: not reached."""
+def reached(
+    curve: list[dict[str, float]], goals: tuple[int, ...] = GOALS
+) -> dict[str, float | None]:
+    """Seconds until each of the goals; None: not reached."""
     return {
         str(goal): next((at["seconds"] for at in curve if at["psnr"] >= goal), None)
-        for goal in GOALS
+        for goal in goals
     }
 
 

@@ -6,8 +6,10 @@ The simulator takes a millisecond a thread or more, hence the small sizes.
 import numpy as np
 import pytest
 import torch
+from random_field import random_field
 
-from climatenerf.ops import dispatch, gpu, reference
+from climatenerf.field.field import _to_radiance
+from climatenerf.ops import cpu, dispatch, gpu, gpu_render, reference
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 # The simulator's numbers are NumPy's, which warns where a hash's products wrap around.
@@ -168,6 +170,45 @@ def test_marching(generator, monkeypatch, skip, share):
         assert torch.allclose(u[offsets[r] : offsets[r + 1]], reference.contract(q), atol=1e-6)
     # Where a step ends on a cell's face, rounding may put it on either side.
     assert agree >= n - 1 and offsets[-1] > 20
+
+
+def test_whole_rays_are_what_their_parts_are(generator, monkeypatch):
+    """One launch against marching, encoding, networks and compositing on the CPU."""
+    field, n = random_field(), 12
+    o = field.centre + 0.7 * field.unit * random(generator, n, 3)
+    d = torch.nn.functional.normalize(random(generator, n, 3), dim=-1)
+    o[0] = field.centre + 40 * field.unit  # outside all cells, looking away
+    d[0] = torch.nn.functional.normalize(o[0] - field.centre, dim=-1)
+    near = torch.full((n,), 0.2)
+    with torch.no_grad():
+        field.view_net[1] += 0.3  # some colours are beyond white
+        field.geometry_net[-1] += 3.0  # dense enough that rays end in it
+    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: cpu)
+    field.shown = 1
+    real = field.composited(o, d, near, 4.0)
+    assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.3).sum() > 3, (
+        "some see matter, one does not"
+    )
+    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: gpu)
+    marched = []
+    monkeypatch.setattr(gpu, "march", lambda *given: marched.append(given))
+    field = field.to(DEVICE)
+    with torch.device(DEVICE):
+        found = field.composited(o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0)
+    assert not marched, "one launch"
+    for ours, theirs in zip(found, real, strict=True):
+        # Where a step ends on a cell's face, rounding may put it on either side.
+        off = (ours.cpu() - theirs).abs().view(n, -1).amax(-1)
+        assert (off > 2e-3 * theirs.abs().max()).sum() <= 1, off
+
+
+@pytest.mark.parametrize("raw", [-3.0, -0.5, -0.47, 0.1, 1.9, 2.1, 40.0])
+def test_a_colour_is_decoded_as_the_field_does(raw):
+    if DEVICE == "cuda":
+        pytest.skip("a device function cannot be called from here; covered by whole rays")
+    assert float(gpu_render._radiance(np.float32(raw))) == pytest.approx(
+        float(_to_radiance(torch.tensor([raw]))), rel=1e-4, abs=1e-9
+    )
 
 
 def test_merging_two_lists(generator, rays):

@@ -442,3 +442,30 @@ def test_no_parameters_give_nan():
                 assert torch.isfinite(getattr(seen, name)).all(), (flood, name)
             assert not torch.isnan(seen.depth).any()
             assert (seen.rgb >= 0).all()
+
+
+class Unknown:
+    """A field that the renderer knows nothing of but what it promises."""
+
+    def __init__(self, field):
+        self.bounds, self.march, self.density = field.bounds, field.march, field.density
+        self.colour, self.sky = field.colour, field.sky
+
+
+@pytest.mark.parametrize("wet", [False, True])
+def test_without_weather_a_short_way_leads_to_the_same(wet):
+    field = random_field()
+    with torch.no_grad():
+        field.geometry_net[-1] += 2.0
+    water = flooded(0.5) if wet else None
+    d = directions(300)
+    o = (field.centre + torch.tensor([0.0, 0.0, 1.5])).expand(300, 3)
+    angle = torch.full((300,), 0.01)
+    short, long = (
+        trace(World(each, 0.1, water=water), o, d, angle) for each in (field, Unknown(field))
+    )
+    assert ((long.mask_water > 0.2).sum() > 30) == wet
+    assert torch.isfinite(long.depth).float().mean() > 0.1
+    for each in dataclasses.fields(short):
+        ours, theirs = getattr(short, each.name), getattr(long, each.name)
+        assert torch.allclose(ours, theirs, atol=1e-5, rtol=1e-4), each.name

@@ -20,7 +20,7 @@ from climatenerf.field.directions import spherical_harmonics
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops import dispatch, reference
-from climatenerf.render.samples import Samples
+from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import SOLID
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
@@ -223,6 +223,42 @@ class Field(nn.Module):
         )
         return Samples(offsets, t * self.unit, dt * self.unit, sigma / self.unit)
 
+    @torch.no_grad()
+    def composited(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        step_scale: float = 1.0,
+        stop: float = 1e-3,
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """What rays see of matter, in the appearance shown; arguments as those of `march`.
+
+        Returns:
+            Linear radiance, transmittance left, and the weighted sum of the samples' lengths (m).
+        """
+        n = rays_o.shape[0]
+        shared = self._seen_from(rays_d, self.shown_embedding.expand(n, -1))
+        endless, start = torch.full_like(t_min, 1e9), torch.zeros_like(t_min)
+        found = dispatch.composite(
+            (self.to_grid(rays_o), rays_d),
+            torch.stack([t_min / self.unit, endless, start], dim=-1),
+            self.occupancy.cells(),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale),
+            (stop, LEAST_WEIGHT),
+            self._net(),
+            ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
+        )
+        if found is not None:
+            return found[:, :3], found[:, 4], found[:, 3] * self.unit
+        samples = self.march(rays_o, rays_d, t_min, endless, step_scale, stop=stop)
+        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        far = dispatch.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
+        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+        u, ray = self.sample_positions(rays_o, rays_d, samples)[keep], samples.ray_index()[keep]
+        colour = self._coloured(u, ray, shared)
+        return dispatch.accumulate(weights[keep], colour, offsets_of(ray, n)), left, far
+
     def sample_positions(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], samples: Samples
     ) -> Float[Tensor, "s 3"]:
@@ -337,13 +373,20 @@ class Field(nn.Module):
             rays_d: unit directions of the rays.
             embedding: appearance of each ray.
         """
-        features = dispatch.hash_encode(u, self.appearance_grid, self.appearance_resolutions)
-        view = torch.cat([spherical_harmonics(rays_d), embedding], dim=-1)
-        # One layer on what a ray's samples share, added to the first layer of the samples' own.
+        return self._coloured(u, ray, self._seen_from(rays_d, embedding))
+
+    def _seen_from(
+        self, rays_d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]
+    ) -> Float[Tensor, "n h"]:
+        """What a ray's samples share: one layer, added to the first of the samples' own."""
         weight, bias = self.view_net
-        return _to_radiance(
-            dispatch.mlp(features, _pairs(self.colour_net), view @ weight + bias, ray)
-        )
+        return torch.cat([spherical_harmonics(rays_d), embedding], dim=-1) @ weight + bias
+
+    def _coloured(
+        self, u: Float[Tensor, "s 3"], ray: Int[Tensor, "s"], shared: Float[Tensor, "n h"]
+    ) -> Float[Tensor, "s 3"]:
+        features = dispatch.hash_encode(u, self.appearance_grid, self.appearance_resolutions)
+        return _to_radiance(dispatch.mlp(features, _pairs(self.colour_net), shared, ray))
 
     def surface_at(
         self, u: Float[Tensor, "s 3"]

@@ -375,6 +375,39 @@ def march(
     return offsets, torch.cat(parts, dim=1)
 
 
+@torch.no_grad()
+def composite(
+    rays: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
+    spans: Float[Tensor, "n 3"],
+    cells: Cells,
+    steps: tuple[float, float],
+    limits: tuple[float, float],
+    net: Net,
+    colours: tuple[Net, Float[Tensor, "n h"]],
+) -> Float[Tensor, "n 5"] | None:
+    """Whole rays in one launch on a GPU; None elsewhere: march and composite then.
+
+    Args:
+        rays, spans, cells, steps, net: as those of `march`.
+        limits: transmittance at which a ray ends, weight from which a sample has a colour.
+        colours: encoding and network of the appearance, and what is added to its hidden layer.
+
+    Returns:
+        Linear radiance of matter, weighted sum of ray lengths (grid units), transmittance.
+    """
+    kernels = _kernels(*rays, *net, *colours[0])
+    if kernels is None or kernels is cpu:
+        return None
+    from climatenerf.ops import gpu_render
+
+    looks, shared = colours
+    out = spans.new_empty(spans.shape[0], 5)
+    weights = tuple(map(_array, net)), tuple(map(_array, looks))
+    given = tuple(map(_array, rays)), _array(spans), tuple(map(_array, cells))
+    gpu_render.composite(*given, steps, limits, *weights, _array(shared), _array(out))
+    return out
+
+
 def _room(rays_o: Tensor, at_once: int, by_block: bool) -> Tensor:
     """Room for the samples of some rays: in blocks of rays, or a column for each."""
     n = min(at_once, max(rays_o.shape[0], 1))

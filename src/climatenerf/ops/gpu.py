@@ -165,9 +165,10 @@ def _unit_cube(qx, qy, qz, u):
 
 
 @cuda.jit(device=True)
-def _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, u, features):
-    """Density (1/grid unit) at one point; u [3] and features are room to work in."""
-    m = _unit_cube(qx, qy, qz, u)
+def _density(q, net, u, features):
+    """Density (1/grid unit) at q [3]; u [3] and features are room to work in, u its coordinates."""
+    table, resolutions, w1, b1, w2, b2 = net
+    m = _unit_cube(q[0], q[1], q[2], u)
     for level in range(table.shape[0]):
         _encode(u[0], u[1], u[2], table, level, resolutions[level], features)
     raw = b2[0]
@@ -180,19 +181,17 @@ def _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, u, features):
 
 
 @cuda.jit
-def _density_at(q, table, resolutions, w1, b1, w2, b2, out):
+def _density_at(q, net, out):
     p = cuda.grid(1)
     if p < q.shape[0]:
         u = cuda.local.array(3, float32)
         features = cuda.local.array(FEATURES, float32)
-        out[p] = _density(
-            q[p, 0], q[p, 1], q[p, 2], table, resolutions, w1, b1, w2, b2, u, features
-        )
+        out[p] = _density(q[p], net, u, features)
 
 
 def density_at(q, net, out) -> None:
     """Density (1/grid unit) at q [n,3] in grid units → out [n]."""
-    launch(_density_at, q.shape[0], q, *net, out)
+    launch(_density_at, q.shape[0], q, net, out)
 
 
 @cuda.jit(device=True)
@@ -204,9 +203,10 @@ def _exit(o, d, index, cell, half):
 
 
 @cuda.jit(device=True)
-def _next(o, d, t, end, occupied, blocks, steps, place):
-    """The next step in an occupied cell: its start, or `end` if there is none; place [4] gets the
-    step's length and its middle."""
+def _next(o, d, t, end, cells, steps, place):
+    """The next step in an occupied cell: its start, or `end` if there is none; place [4] gets its
+    middle and the step's length."""
+    occupied, blocks = cells
     cascades, side = occupied.shape[0], occupied.shape[1]
     size = side // blocks.shape[1]
     dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
@@ -228,7 +228,7 @@ def _next(o, d, t, end, occupied, blocks, steps, place):
             cell *= np.float32(size)
             ix, iy, iz = ix // size, iy // size, iz // size
         elif occupied[cascade, ix, iy, iz]:
-            place[0], place[1], place[2], place[3] = dt, qx, qy, qz
+            place[0], place[1], place[2], place[3] = qx, qy, qz, dt
             return t
         leave = min(
             _exit(o[0], d[0], ix, cell, half),
@@ -253,31 +253,34 @@ def _clip(o, d, far, span):
             span[1] = min(span[1], max(a, b))
 
 
+@cuda.jit(device=True)
+def _begin(rays, r, spans, cells, steps, o, d, span):
+    """Ray r into o and d [3]; into span [2] where its comb begins and ends in the cells."""
+    for axis in range(3):
+        o[axis], d[axis] = rays[0][r, axis], rays[1][r, axis]
+    span[0], span[1] = spans[r, 0], spans[r, 1]
+    _clip(o, d, np.float32(2.0 ** (cells[0].shape[0] - 1)), span)
+    span[0] += spans[r, 2] * max(np.float32(steps[0]), np.float32(steps[1]) * span[0])
+
+
 @cuda.jit
-def _march(rays_o, rays_d, spans, occupied, blocks, steps, stop,
-           table, resolutions, w1, b1, w2, b2, rows, counts):  # fmt: skip
+def _march(rays, spans, cells, steps, stop, net, rows, counts):
     r = cuda.grid(1)
-    if r >= rays_o.shape[0]:
+    if r >= spans.shape[0]:
         return
     o, d = cuda.local.array(3, float32), cuda.local.array(3, float32)
     u, span = cuda.local.array(3, float32), cuda.local.array(2, float32)
     place, features = cuda.local.array(4, float32), cuda.local.array(FEATURES, float32)
-    for axis in range(3):
-        o[axis], d[axis] = rays_o[r, axis], rays_d[r, axis]
-    span[0], span[1] = spans[r, 0], spans[r, 1]
-    _clip(o, d, np.float32(2.0 ** (occupied.shape[0] - 1)), span)
+    _begin(rays, r, spans, cells, steps, o, d, span)
     t, end = span[0], span[1]
-    t += spans[r, 2] * max(np.float32(steps[0]), np.float32(steps[1]) * t)
     tau, enough = np.float32(0.0), np.float32(-math.log(stop))
     k, capacity = 0, rows.shape[1]
     while k < capacity and tau < enough:
-        t = _next(o, d, t, end, occupied, blocks, steps, place)
+        t = _next(o, d, t, end, cells, steps, place)
         if t >= end:
             break
-        dt = place[0]
-        sigma = _density(
-            place[1], place[2], place[3], table, resolutions, w1, b1, w2, b2, u, features
-        )
+        dt = place[3]
+        sigma = _density(place, net, u, features)
         if sigma * dt > LEAST_TAU:
             # By step, then by ray: neighbouring threads write side by side.
             rows[0, k, r] = t + np.float32(0.5) * dt
@@ -297,9 +300,7 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts) -> None:
     stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
     rows [3, capacity, n] receive t, dt and sigma, counts [n] how many.
     """
-    occupied, blocks = cells
-    launch(_march, rays_o.shape[0], rays_o, rays_d, spans, occupied, blocks, steps, stop, *net,
-           rows, counts)  # fmt: skip
+    launch(_march, spans.shape[0], (rays_o, rays_d), spans, cells, steps, stop, net, rows, counts)
 
 
 @cuda.jit

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
+
 
 @dataclass
 class Samples:

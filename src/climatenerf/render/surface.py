@@ -7,7 +7,7 @@ from torch import Tensor
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
 from climatenerf.ops.placing import placed
-from climatenerf.render.view import RAYS_AT_ONCE, weighed_samples
+from climatenerf.render.view import rays_at_once, weighed_samples
 from climatenerf.scene.classes import SKY, SOLID
 
 
@@ -27,7 +27,8 @@ def see_surface(
         (`scene.classes`), sky there.
     """
     normals, labels = [], []
-    for o, d in zip(rays_o.split(RAYS_AT_ONCE), rays_d.split(RAYS_AT_ONCE), strict=True):
+    size = rays_at_once(rays_o)
+    for o, d in zip(rays_o.split(size), rays_d.split(size), strict=True):
         seen = weighed_samples(field, o, d)
         normal, logits = field.surface_at(seen.u)
         solid = seen.left < 0.5

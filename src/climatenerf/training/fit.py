@@ -20,8 +20,7 @@ from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.placing import array_of, placed, uniform
-from climatenerf.render.samples import Samples, offsets_of
-from climatenerf.render.view import LEAST_WEIGHT
+from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.training import losses
 from climatenerf.training.carving import Carving, on_the_ground

@@ -1,0 +1,109 @@
+"""What an NVIDIA GPU makes of it: fitting, a capture from nothing, and frames, in one command.
+
+python benchmarks/gpu.py RUN --capture ../shared/data/fox
+
+`step`: million samples a second of one optimiser step on the field of RUN, every sample through
+every head, as in `engine.py`, beside eager PyTorch on the same device. `fit`: the capture from
+nothing: samples a second in practice, and seconds of fitting until the held-out photos reach so
+many dB (measuring them is not counted). `frames`: seconds and frames a second of a view of RUN in
+each size, clean and with water on about 40 % of it. Memory is the peak on the device. `--device
+cpu` tries the same without a GPU; its figures are the CPU's.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import common
+import torch
+from engine import begin, drawn, our_step, time_to_psnr, twin_step
+from frame_time import frames
+
+from climatenerf.errors import UserError
+from climatenerf.field.checkpoint import load_field
+from climatenerf.field.device import on
+from climatenerf.scene import load_scene
+from climatenerf.training.settings import FitSettings
+
+GOALS = (20, 22, 24, 25)  # dB
+WEATHERS = ("clean", "flood")
+
+
+def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
+    """The job, until the device is done with it."""
+
+    def wait() -> None:
+        job()
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    return wait
+
+
+def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
+    """Samples a second of a step, ours and eager PyTorch's, on the same field and rays."""
+    fitting = begin(load_scene(run), FitSettings(seed=seed), 1)
+    fitting.field = load_field(run).requires_grad_()
+    at = drawn(fitting, samples)
+    size, found = at.samples.t.shape[0], {}
+    makers = {"ours": our_step, "eager": lambda field, at: twin_step(field, at, False)}
+    for name, make in makers.items():  # made one by one: the twin takes our optimiser's buffers
+        job = finished(make(fitting.field, at), device)
+        seconds = common.measure(job, repeats, warm_up=3)
+        found[name] = {"samples_per_s": size / seconds["median"], "seconds": seconds}
+    return {"samples": size, **found}
+
+
+def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> dict[str, Any]:
+    """Frames a second in each size and weather."""
+    rows: dict[str, Any] = {}
+    for size in sizes:
+        found = frames(run, size, view, repeats, seed)["frames"]
+        rows[size] = {
+            name: {**found[name], "frames_per_s": 1 / found[name]["seconds"]["median"]}
+            for name in WEATHERS
+        }
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--capture", type=Path, help="fitted from nothing; default: not asked")
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--minutes", type=float, default=3.0)
+    parser.add_argument("--every", type=float, default=2.0, help="seconds between measurements")
+    parser.add_argument("--preset", default="gpu", help="of the capture's fit")
+    parser.add_argument("--samples", type=int, default=2**20, help="of a step")
+    parser.add_argument("--sizes", nargs="+", default=["1280x720", "1920x1080"])
+    parser.add_argument("--path", default="still")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
+    options = parser.parse_args()
+    device, seed = options.device, options.seed
+    found: dict[str, Any] = {"run": options.run.name, "device": "CPU"}
+    try:
+        with on(device):
+            if device == "cuda":
+                found["device"] = torch.cuda.get_device_name()
+                found["cuda"] = torch.version.cuda
+            found["step"] = steps(options.run, options.samples, options.repeats, device, seed)
+            if options.capture:
+                settings = FitSettings(options.preset, options.minutes, seed=seed)
+                found["fit"] = time_to_psnr(
+                    options.capture, settings, options.downscale, options.every, GOALS
+                )
+            found["frames"] = shown(options.run, options.sizes, options.path, options.repeats, seed)
+            if device == "cuda":
+                found["peak_gb"] = torch.cuda.max_memory_allocated() / 1e9
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    common.report("speed on a GPU", found, seed)
+
+
+if __name__ == "__main__":
+    main()
