@@ -385,7 +385,7 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
     """A fitted kind of field, snow and water: Numba's kernels, not the closed form's torch."""
     import numba
 
-    from climatenerf.render import trace as module
+    from climatenerf.render import view as module
 
     field = random_field(full=True)
     field.occupancy.occupied[..., field.occupancy.side // 2 :] = 0  # air above the middle
@@ -415,7 +415,7 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
 
 
 def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):
-    from climatenerf.render import trace as module
+    from climatenerf.render import view as module
 
     world = World(street(), 0.0, medium(Smog(visibility=60.0), 0.0), None, flooded(0.3))
     whole = linear(world).rgb
