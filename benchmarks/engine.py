@@ -31,6 +31,7 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.extent import find_extent
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch, reference
+from climatenerf.ops.placing import uniform
 from climatenerf.render.samples import Samples
 from climatenerf.scene import Scene, load_scene, read_scene
 from climatenerf.scene.classes import SOLID
@@ -109,7 +110,7 @@ def drawn(fitting: Fitting, samples: int) -> Drawn:
         batch = fitting.pixels.draw(rays, fitting.generator)
         n = batch.rays_o.shape[0]
         near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
-        jitter = torch.rand(n, generator=fitting.generator)
+        jitter = uniform(fitting.generator, n)
         found = field.march(batch.rays_o, batch.rays_d, near, far, 1.0, jitter, stop=1e-4)
         if 0.9 * samples < found.t.shape[0] < 1.1 * samples or rays > 2**16:
             break

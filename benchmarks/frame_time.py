@@ -42,7 +42,12 @@ def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:
     return float(min(np.quantile(height, wanted), eye - 0.05)) - scene.ground_z
 
 
-def frames(run: Path, size: str, view: str, repeats: int, seed: int) -> dict[str, Any]:
+WEATHERS = ("clean", "flood", "smog", "snow")
+
+
+def frames(
+    run: Path, size: str, view: str, repeats: int, seed: int, wanted: tuple[str, ...] = WEATHERS
+) -> dict[str, Any]:
     """Seconds of one view of a run in each weather; the first frame of the camera path `view`."""
     field, scene = load_field(run), load_scene(run)
     path = camera_path(view, scene, 1, parse_size(size))
@@ -54,7 +59,7 @@ def frames(run: Path, size: str, view: str, repeats: int, seed: int) -> dict[str
         "snow": Weather(snow=Snow(depth=0.1), seed=seed),
     }
     rows: dict[str, dict] = {}
-    for name, weather in weathers.items():
+    for name, weather in ((name, weathers[name]) for name in wanted):
         start = time.perf_counter()
         stage = prepare(field, scene, KeyframedWeather(weather, {}), path.c2w[:, :3, 3],
                         np.zeros(1), lambda *_: None)  # fmt: skip

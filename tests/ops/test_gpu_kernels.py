@@ -8,6 +8,7 @@ import pytest
 import torch
 from random_field import random_field
 
+from climatenerf.field import field as field_module
 from climatenerf.field.field import _to_radiance
 from climatenerf.ops import cpu, dispatch, gpu, gpu_render, reference
 
@@ -172,7 +173,8 @@ def test_marching(generator, monkeypatch, skip, share):
     assert agree >= n - 1 and offsets[-1] > 20
 
 
-def test_whole_rays_are_what_their_parts_are(generator, monkeypatch):
+@pytest.mark.parametrize(("stop", "least"), [(1e-3, 1e-4), (0.4, 0.1)])
+def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least):
     """One launch against marching, encoding, networks and compositing on the CPU."""
     field, n = random_field(), 12
     o = field.centre + 0.7 * field.unit * random(generator, n, 3)
@@ -180,13 +182,14 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch):
     o[0] = field.centre + 40 * field.unit  # outside all cells, looking away
     d[0] = torch.nn.functional.normalize(o[0] - field.centre, dim=-1)
     near = torch.full((n,), 0.2)
+    monkeypatch.setattr(field_module, "LEAST_WEIGHT", least)
     with torch.no_grad():
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
     monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: cpu)
     field.shown = 1
-    real = field.composited(o, d, near, 4.0)
-    assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.3).sum() > 3, (
+    real = field.composited(o, d, near, 4.0, stop)
+    assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.4).sum() > 3, (
         "some see matter, one does not"
     )
     monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: gpu)
@@ -194,7 +197,7 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch):
     monkeypatch.setattr(gpu, "march", lambda *given: marched.append(given))
     field = field.to(DEVICE)
     with torch.device(DEVICE):
-        found = field.composited(o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0)
+        found = field.composited(o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop)
     assert not marched, "one launch"
     for ours, theirs in zip(found, real, strict=True):
         # Where a step ends on a cell's face, rounding may put it on either side.

@@ -223,12 +223,24 @@ def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
     assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
-    assert again.field.knows_classes
+    assert again.field.knows_classes and again.classed_at == fitting.classed_at < 0.5
     fitting.run(nothing)
     again.run(nothing)
     fitting.seconds = again.seconds
     assert_same(fitting, again)
     assert all(map(torch.equal, fitting.masks.parameters(), again.masks.parameters()))
+
+
+def test_labels_that_come_with_a_resumed_run_are_not_believed_at_once(scene, tmp_path):
+    fitting = begin(scene, steps=40)
+    with pytest.raises(KeyboardInterrupt):
+        fitting.run(stop_at(20))
+    write_json(tmp_path / "config.json", run_module._config(fitting.settings, 1, fitting.field))
+    checkpoint(fitting, tmp_path)
+    again = labelled(begin(scene, steps=40))
+    restore(again, tmp_path)
+    assert again.field.knows_classes and not fitting.field.knows_classes
+    assert again.classed_at == pytest.approx(0.5 + fitting.classed_at)
 
 
 def test_refined_poses_are_kept_and_not_left_behind(scene, tmp_path):

@@ -27,6 +27,19 @@ def launch(kernel, count: int, *arguments: object) -> None:
         kernel[(count + THREADS - 1) // THREADS, THREADS](*arguments)
 
 
+# --- Python's own min and max do not compile for CUDA from Numba 0.66 on -------------------------
+
+
+@cuda.jit(device=True)
+def _low(a, b):
+    return a if a < b else b
+
+
+@cuda.jit(device=True)
+def _high(a, b):
+    return a if a > b else b
+
+
 # --- hash encoding -------------------------------------------------------------------------------
 
 
@@ -158,9 +171,9 @@ def _unit_cube(qx, qy, qz, u):
     one, two, quarter = np.float32(1.0), np.float32(2.0), np.float32(0.25)
     s = quarter * (one if m <= one else (two - one / m) / m)
     half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
-    u[0] = min(max(qx * s + half, low), high)
-    u[1] = min(max(qy * s + half, low), high)
-    u[2] = min(max(qz * s + half, low), high)
+    u[0] = _low(_high(qx * s + half, low), high)
+    u[1] = _low(_high(qy * s + half, low), high)
+    u[2] = _low(_high(qz * s + half, low), high)
     return m
 
 
@@ -176,8 +189,8 @@ def _density(q, net, u, features):
         h = b1[j]
         for i in range(w1.shape[0]):
             h += features[i] * w1[i, j]
-        raw += max(h, np.float32(0.0)) * w2[j, 0]
-    return math.exp(min(raw, np.float32(15.0))) / max(m * m, np.float32(1.0))
+        raw += _high(h, np.float32(0.0)) * w2[j, 0]
+    return math.exp(_low(raw, np.float32(15.0))) / _high(m * m, np.float32(1.0))
 
 
 @cuda.jit
@@ -212,31 +225,29 @@ def _next(o, d, t, end, cells, steps, place):
     dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
     one, two = np.float32(1.0), np.float32(2.0)
     while t < end:
-        dt = min(max(dt_min, cone * t), end - t)
+        dt = _low(_high(dt_min, cone * t), end - t)
         tm = t + np.float32(0.5) * dt
         qx, qy, qz = o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
-        m = max(abs(qx), abs(qy), abs(qz))
+        m = _high(_high(abs(qx), abs(qy)), abs(qz))
         cascade, half = 0, one
         while m > half and cascade < cascades - 1:
             half *= two
             cascade += 1
         cell = two * half / np.float32(side)
-        ix = min(max(int((qx + half) / cell), 0), side - 1)
-        iy = min(max(int((qy + half) / cell), 0), side - 1)
-        iz = min(max(int((qz + half) / cell), 0), side - 1)
+        ix = _low(_high(int((qx + half) / cell), 0), side - 1)
+        iy = _low(_high(int((qy + half) / cell), 0), side - 1)
+        iz = _low(_high(int((qz + half) / cell), 0), side - 1)
         if not blocks[cascade, ix // size, iy // size, iz // size]:
             cell *= np.float32(size)
             ix, iy, iz = ix // size, iy // size, iz // size
         elif occupied[cascade, ix, iy, iz]:
             place[0], place[1], place[2], place[3] = qx, qy, qz, dt
             return t
-        leave = min(
-            _exit(o[0], d[0], ix, cell, half),
-            _exit(o[1], d[1], iy, cell, half),
-            _exit(o[2], d[2], iz, cell, half),
-        )
+        leave = _exit(o[0], d[0], ix, cell, half)
+        leave = _low(leave, _exit(o[1], d[1], iy, cell, half))
+        leave = _low(leave, _exit(o[2], d[2], iz, cell, half))
         # Whole steps, so that the sampling comb does not depend on the cells crossed.
-        t += dt * max(np.float32(math.ceil((leave - tm) / dt)), one)
+        t += dt * _high(np.float32(math.ceil((leave - tm) / dt)), one)
     return end
 
 
@@ -249,8 +260,8 @@ def _clip(o, d, far, span):
                 span[1] = np.float32(-1.0)
         else:
             a, b = (-far - o[axis]) / d[axis], (far - o[axis]) / d[axis]
-            span[0] = max(span[0], min(a, b))
-            span[1] = min(span[1], max(a, b))
+            span[0] = _high(span[0], _low(a, b))
+            span[1] = _low(span[1], _high(a, b))
 
 
 @cuda.jit(device=True)
@@ -260,7 +271,7 @@ def _begin(rays, r, spans, cells, steps, o, d, span):
         o[axis], d[axis] = rays[0][r, axis], rays[1][r, axis]
     span[0], span[1] = spans[r, 0], spans[r, 1]
     _clip(o, d, np.float32(2.0 ** (cells[0].shape[0] - 1)), span)
-    span[0] += spans[r, 2] * max(np.float32(steps[0]), np.float32(steps[1]) * span[0])
+    span[0] += spans[r, 2] * _high(np.float32(steps[0]), np.float32(steps[1]) * span[0])
 
 
 @cuda.jit

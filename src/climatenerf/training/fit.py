@@ -111,6 +111,7 @@ class Fitting:
         self.steps = 0
         self.seconds = 0.0
         self.reached = 0.0  # stage of the run that is resumed
+        self.classed_at = REFINE_AT  # stage from which the field's own classes are believed
         self.samples = 0
         self.rays = 1024
         self.step_scale = MAX_STEP_SCALE
@@ -335,8 +336,9 @@ class Fitting:
         own = ray[some]
         d = batch.rays_d.detach()[own]
         q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
-        # Later the field has learned what is ground: pulled harder, nothing else goes with it.
-        classed = self.stage > REFINE_AT and bool(self.field.learned[1])
+        # Later the field has learned what is ground, so lumps by what stands are pulled as well,
+        # and all harder: less goes with them.
+        classed = self.stage > self.classed_at and bool(self.field.learned[1])
         far, goal = self.carving.far_from_ground(q, d, t[some], classed)
         some, pull = some[far], SURE_PULL if classed else 1.0
         return pull * losses.ground_loss(weights[some], t[some], goal, batch.rays_o.shape[0])
@@ -526,7 +528,7 @@ OUTSTANDING = 6.0  # times the mean error: the least price of a mask
 SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
-SURE_PULL = 4.0  # of the ground loss's weight, where the field's own classes tell ground
+SURE_PULL = 4.0  # of the ground loss's weight, once the field's own classes tell ground
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0

@@ -36,7 +36,7 @@ from climatenerf.storage import (
     write_json,
     write_safetensors,
 )
-from climatenerf.training.fit import Fitting, Report
+from climatenerf.training.fit import REFINE_AT, Fitting, Report
 from climatenerf.training.folder import OPTIMISER, check_folder
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
@@ -321,6 +321,8 @@ def restore(fitting: Fitting, run: Path) -> None:
             f"{run / OPTIMISER} is damaged ({type(error).__name__}: {error}); the run can be"
             " rendered but not resumed, fit anew into another folder"
         ) from error
+    if not field.knows_classes:  # labels are new: the head that learns them begins now
+        fitting.classed_at = fitting.stage + REFINE_AT
 
 
 def _restore_state(fitting: Fitting, arrays: dict) -> None:
