@@ -3,6 +3,12 @@
 The simulator takes a millisecond a thread or more, hence the small sizes.
 """
 
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -241,3 +247,18 @@ def test_adam_leaves_entries_without_gradient_alone(generator):
         assert (given == 0).all()
     assert torch.allclose(ours.cpu()[some], theirs.detach()[some], rtol=1e-4)
     assert torch.equal(ours.cpu()[~some], start[~some])
+
+
+def test_all_kernels_compile_for_cuda():
+    """NVIDIA's code generator comes as a wheel (extra `dev`, Linux on x86-64); no GPU is needed."""
+    found = find_spec("nvidia.cuda_nvcc") if find_spec("nvidia") else None
+    if found is None or not found.submodule_search_locations:
+        pytest.skip("needs the package nvidia-cuda-nvcc-cu12, which is for Linux on x86-64")
+    home = next(iter(found.submodule_search_locations))
+    environment = {**os.environ, "CUDA_HOME": home, "NUMBA_ENABLE_CUDASIM": "0"}
+    script = Path(__file__).with_name("compile_kernels.py")
+    done = subprocess.run(
+        [sys.executable, str(script)], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert {"_march", "_composite", "_adam"} < set(done.stdout.split())
