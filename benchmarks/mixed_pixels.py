@@ -28,31 +28,11 @@ def depths(scene, pose: Float[np.ndarray, "4 4"], size: tuple[int, int], rays: i
     """Ray lengths at random places of each pixel's area, [h, w, rays²]; +inf in the sky."""
     import mitsuba as mi
 
-    from street.layout import FIELD_OF_VIEW
+    from street.render import render_view
 
     width, height = size
-    # Mitsuba's camera looks along +z with +x to the left and +y up.
-    to_world = mi.ScalarTransform4f((pose @ np.diag([-1.0, -1.0, 1.0, 1.0])).tolist())
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": FIELD_OF_VIEW,
-            "fov_axis": "x",
-            "near_clip": 0.05,
-            "far_clip": 2000.0,
-            "to_world": to_world,
-            "sampler": {"type": "independent", "sample_count": 1},
-            "film": {
-                "type": "hdrfilm",
-                "width": width * rays,
-                "height": height * rays,
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-        }
-    )
     asked = mi.load_dict({"type": "aov", "aovs": "t:depth"})
-    t = np.array(mi.render(scene, integrator=asked, sensor=sensor, spp=1))[..., -1]
+    t = render_view(scene, pose, width * rays, height * rays, 1, 0, asked)[..., -1]
     t = np.where(t > 0, t, np.inf).reshape(height, rays, width, rays)
     return t.transpose(0, 2, 1, 3).reshape(height, width, rays * rays)
 

@@ -185,12 +185,17 @@ def stop_at(step):
     return report
 
 
-def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
-    fitting = begin(scene, steps=40)
+def stop_half_way(fitting, run):
+    """Leaves what a fit of 40 steps that is stopped after 20 leaves."""
     with pytest.raises(KeyboardInterrupt):
         fitting.run(stop_at(20))
-    write_json(tmp_path / "config.json", run_module._config(fitting.settings, 1, fitting.field))
-    checkpoint(fitting, tmp_path)
+    write_json(run / "config.json", run_module._config(fitting.settings, 1, fitting.field))
+    checkpoint(fitting, run)
+
+
+def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
+    fitting = begin(scene, steps=40)
+    stop_half_way(fitting, tmp_path)
     again = begin(scene, steps=40)
     restore(again, tmp_path)
     assert_same(fitting, again)
@@ -216,10 +221,7 @@ def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
     """Masks, relative depth's sums and the cells that the sky bars are in the checkpoint."""
     fitting = labelled(begin(scene, steps=40))
     assert fitting.field.occupancy.barred.any()
-    with pytest.raises(KeyboardInterrupt):
-        fitting.run(stop_at(20))
-    write_json(tmp_path / "config.json", run_module._config(fitting.settings, 1, fitting.field))
-    checkpoint(fitting, tmp_path)
+    stop_half_way(fitting, tmp_path)
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
     assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
@@ -233,10 +235,7 @@ def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
 
 def test_labels_that_come_with_a_resumed_run_are_not_believed_at_once(scene, tmp_path):
     fitting = begin(scene, steps=40)
-    with pytest.raises(KeyboardInterrupt):
-        fitting.run(stop_at(20))
-    write_json(tmp_path / "config.json", run_module._config(fitting.settings, 1, fitting.field))
-    checkpoint(fitting, tmp_path)
+    stop_half_way(fitting, tmp_path)
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
     assert again.field.knows_classes and not fitting.field.knows_classes
