@@ -26,6 +26,7 @@ from climatenerf.render.view import render_view  # noqa: E402
 from climatenerf.scene import Scene, load_image  # noqa: E402
 from climatenerf.training import fit  # noqa: E402
 from climatenerf.training.run import load_pixels  # noqa: E402
+from climatenerf.training.settings import Losses  # noqa: E402
 
 VARIANTS = {
     "as it is": {},
@@ -33,7 +34,7 @@ VARIANTS = {
     "a least chance of 0.1, 16 samples": {"LEAST_CHANCE": 0.1, "CHOSEN": 16},
     "a least chance of 0.5": {"LEAST_CHANCE": 0.5},
     "near matter from the start": {"FIRST_NEAR": 0.0},
-    "no pressure below the horizon": {"solid_weight": 0.0},
+    "no pressure below the horizon": {"losses": Losses(solid=0.0)},
     "colours by direction from the start": {"VIEW_SHARES": (1.0, 1.0)},
 }
 

@@ -140,7 +140,7 @@ class Fitting:
             self.update_occupancy()
             wants_triples = self.settings.losses.flat and self.stage > REFINE_AT
             triples = int(TRIPLE_SHARE * self.rays) if wants_triples else 0
-            edges = EDGE_SHARE if self.stage > KEEP_AT else 0.0
+            edges = EDGE_SHARE if self.stage > EDGES_AT else 0.0
             batch = self.pixels.draw(self.rays, self.generator, triples, edges)
             error, samples = self.step(batch)
             seconds = time.perf_counter() - start
@@ -194,8 +194,7 @@ class Fitting:
         t, dt = samples.t / field.unit, samples.dt / field.unit
         tau = samples.sigma * samples.dt
         before, _ = dispatch.render_weights(tau, samples.offsets)
-        if self.stage > KEEP_AT:
-            field.keep_occupied(rays_o, rays_d, samples, before > SEEN_WEIGHT)
+        field.keep_occupied(rays_o, rays_d, samples, before > SEEN_WEIGHT)
         kept, chance = self.choose(before)
         u = self.positions(batch, samples, kept)
         # Near a camera many rays crowd into little space that few other cameras see, and haze there
@@ -313,8 +312,9 @@ class Fitting:
             rows = triples(n, m)
             label = batch.label[rows]
             alike = (label == label[0]).all(0) & (label[0] != VEGETATION) & (label[0] != SKY)
-            counts = batch.in_line & alike & solid[rows].all(0)
-            loss = loss + weigh.flat * losses.flat_loss(z[rows].T, counts.float())
+            counts = (batch.in_line & alike & solid[rows].all(0)).float()
+            counts = torch.where(label[0] == UNKNOWN, UNSURE_FLAT, 1.0) * counts
+            loss = loss + weigh.flat * losses.flat_loss(z[rows].T, counts)
         if weigh.monocular and batch.relative is not None and self.stage > REFINE_AT:
             counts = solid & (batch.label != SKY) & torch.isfinite(batch.relative)
             loss = loss + weigh.monocular * self.relative.loss(
@@ -516,13 +516,16 @@ EMBEDDING_SHARES = (0.0, 0.02)
 # seen from elsewhere too, and a wall before each camera would satisfy every photo.
 FIRST_NEAR = 0.6
 CHOSEN = 32  # samples of a ray that get colour and gradients, about
-SEEN_WEIGHT = 0.05  # samples that weigh more show that their cell is occupied
-KEEP_AT = 0.5  # stage from which this is so: before, haze is to be pruned
+# Samples that weigh more show that their cell is occupied. A lamp post fills a tenth of the first,
+# large cells, and what is pruned once never comes back.
+SEEN_WEIGHT = 0.05
 LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
 SURFACE_SHARE = 4  # rays for one whose classes and normals are learned from
+UNSURE_FLAT = 0.3  # of the flatness's weight where no label says what it is: a statue is not flat
 TRIPLE_SHARE = 1 / 6  # of the rays that are the middle of three in a line
 SKY_AT_FIRST = 0.2  # of the sky loss's weight, whole from three quarters of the fit
-EDGE_SHARE = 0.1  # of the other rays that are drawn from the sky's edges, late in the fit
+EDGE_SHARE = 0.1  # of the other rays that are drawn from the sky's edges,
+EDGES_AT = 0.5  # from this stage on
 SKY_LOOKS = 64  # directions in which the sky is filled, a step
 OUTSTANDING = 6.0  # times the mean error: the least price of a mask
 SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move

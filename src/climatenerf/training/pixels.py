@@ -1,7 +1,8 @@
 """All training pixels as one long list of rays with their colours."""
 
 import copy
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ SKY_SHARE = 0.1  # of the views that have a place before them: so many must show
 GROUND_SHARE = 0.5  # or ground
 STANDING_SHARE = 0.5  # or things that stand on it
 AT_MOST = 2**22  # pixels drawn at once where masks hide nearly all
+IN_MEMORY = 2_000_000_000  # bytes that the colours of all photos may take there, or their labels
 EDGE = 2  # pixels to both sides that are such an edge
 
 
@@ -66,13 +68,14 @@ class TrainingPixels:
         cameras: Sequence[Camera],
         camera_of: Sequence[int],
         c2w: Float[np.ndarray, "v 4 4"],
-        images: Sequence[UInt8[np.ndarray, "h w 3"]],
-        labels: Sequence[UInt8[np.ndarray, "h w"] | None] | None = None,
-        masks: Sequence[np.ndarray | None] | None = None,
-        relative: Sequence[np.ndarray | None] | None = None,
+        images: Iterable[UInt8[np.ndarray, "h w 3"]],
+        labels: Iterable[UInt8[np.ndarray, "h w"] | None] | None = None,
+        masks: Iterable[np.ndarray | None] | None = None,
+        relative: Iterable[np.ndarray | None] | None = None,
     ):
         """Takes images in the size of their (already downscaled) cameras; c2w in world metres.
 
+        Images, labels, masks and depths are taken one at a time, so a generator saves memory.
         Masks: pixels where a mask is 0 are never drawn.
         """
         self.c2w = placed(np.asarray(c2w, np.float32))
@@ -80,36 +83,31 @@ class TrainingPixels:
         self.directions = Directions(cameras)
         self.camera = torch.as_tensor(list(camera_of))
         self.pyramids = pyramids(self.cameras, c2w)
-        counts = torch.tensor([image.shape[0] * image.shape[1] for image in images])
-        if any(
-            i.shape[:2] != (c.height, c.width) for i, c in zip(images, self.cameras, strict=True)
-        ):
-            raise ValueError("an image's size differs from its camera's")
+        self.width = torch.tensor([camera.width for camera in self.cameras])
+        self.height = torch.tensor([camera.height for camera in self.cameras])
+        counts = self.width * self.height
         self.pixel_start = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
-        self.rgb = placed(np.concatenate([i.reshape(-1, 3) for i in images]))
-        self.width = torch.tensor([image.shape[1] for image in images])
-        self.height = torch.tensor([image.shape[0] for image in images])
+        shapes = [(camera.height, camera.width) for camera in self.cameras]
+        rgb, _ = in_one_row(shapes, images, np.uint8, 0, channels=3)
+        self.rgb = placed(rgb)
         self.label = None
         self.witness = None
         self.edge = torch.zeros(0, dtype=torch.long)
-        if labels is not None:
-            merged = [
-                np.full(image.shape[:2], UNKNOWN, np.uint8) if label is None else MERGED[label]
-                for label, image in zip(labels, images, strict=True)
-            ]
-            for image, label in enumerate(merged):
-                # Networks take puddles and wet walls for the sky that they mirror.
-                row, column = np.nonzero(label == SKY)
-                place = placed(column), placed(row)
-                d = self.directions.of(self.camera[image].expand(len(row)), *place)
-                low = array_of(d @ self.c2w[image, 2, :3] < HORIZON)
-                label[row[low], column[low]] = UNKNOWN
-            flat = np.concatenate([each.reshape(-1) for each in merged])
-            # Labels that know nothing are none.
-            self.label = placed(flat) if (flat != UNKNOWN).any() else None
+        known = (None if label is None else MERGED[label] for label in labels or ())
+        flat, merged = in_one_row(shapes, known, np.uint8, UNKNOWN)
+        for image, own in enumerate(merged):
+            # Networks take puddles and wet walls for the sky that they mirror.
+            row, column = np.nonzero(own == SKY)
+            place = placed(column), placed(row)
+            d = self.directions.of(self.camera[image].expand(len(row)), *place)
+            low = array_of(d @ self.c2w[image, 2, :3] < HORIZON)
+            own[row[low], column[low]] = UNKNOWN
+        if (flat != UNKNOWN).any():  # labels that know nothing are none
+            self.label = placed(flat)
         if self.label is not None and bool((self.label == SKY).any()):
-            edge = np.concatenate([sky_edge(each).reshape(-1) for each in merged])
-            self.edge = placed(np.flatnonzero(edge))
+            at = [np.flatnonzero(sky_edge(each)) for each in merged]
+            starts = array_of(self.pixel_start)[:-1]
+            self.edge = placed(np.concatenate([e + s for e, s in zip(at, starts, strict=True)]))
             self.witness = Witness(self.cameras, c2w, merged, [SKY], SKY_SHARE)
         self.ground_witness = self.standing_witness = None
         if self.label is not None and bool(
@@ -117,21 +115,15 @@ class TrainingPixels:
         ):
             self.ground_witness = Witness(self.cameras, c2w, merged, GROUND, GROUND_SHARE)
             self.standing_witness = Witness(self.cameras, c2w, merged, STANDING, STANDING_SHARE)
-        self.relative = None
-        if relative is not None and any(each is not None for each in relative):
-            flat = [
-                np.full(int(n), np.nan, np.float16) if each is None else in_units(each).reshape(-1)
-                for each, n in zip(relative, counts, strict=True)
-            ]
-            self.relative = placed(np.concatenate(flat).astype(np.float16))
+        scaled = (None if depth is None else in_units(depth) for depth in relative or ())
+        flat, _ = in_one_row(shapes, scaled, np.float16, np.nan)
+        self.relative = placed(flat) if flat.size else None
         self.usable, self.share = None, 1.0
-        if masks is not None and any(mask is not None for mask in masks):
-            keep = [
-                np.ones(int(n), bool) if mask is None else mask.reshape(-1) > 0
-                for mask, n in zip(masks, counts, strict=True)
-            ]
-            self.usable = placed(np.concatenate(keep))
-            self.share = int(self.usable.count_nonzero()) / max(self.usable.numel(), 1)
+        usable = (None if mask is None else mask > 0 for mask in masks or ())
+        flat, _ = in_one_row(shapes, usable, np.bool_, True)
+        if flat.size:
+            self.usable = placed(flat)
+            self.share = int(flat.sum()) / flat.size
             self.edge = self.edge[self.usable[self.edge]]
 
     def without_sky(self) -> "TrainingPixels":
@@ -249,6 +241,49 @@ class TrainingPixels:
             inside = inside & self.usable[start - shift] & self.usable[start + shift]
             shift = shift * inside
         return within - shift, within + shift, inside
+
+
+def in_one_row(
+    shapes: Sequence[tuple[int, int]],
+    pictures: Iterable[np.ndarray | None],
+    kind: type[np.generic],
+    empty: float,
+    channels: int | None = None,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """All pixels of pictures (h, w) in one row, and each picture's part of it; nothing if all lack.
+
+    Above `IN_MEMORY` bytes it is a temporary file, of which the system keeps in memory what it can.
+
+    Args:
+        shapes: height and width of each picture.
+        pictures: taken one at a time; None: `empty` throughout.
+        kind: of the numbers.
+        empty: what stands where a picture lacks.
+        channels: of each pixel; None: pixels are single numbers.
+    """
+    row, parts = np.empty(0, kind), []
+    per_pixel = () if channels is None else (channels,)
+    starts = np.cumsum([0] + [h * w for h, w in shapes])
+    for index, picture in enumerate(pictures):
+        if picture is None:
+            continue
+        if not parts:
+            whole = (int(starts[-1]), *per_pixel)
+            row = _room(whole, np.dtype(kind))
+            row.fill(empty)
+            spans = zip(starts[:-1], starts[1:], shapes, strict=True)
+            parts = [row[a:b].reshape(*shape, *per_pixel) for a, b, shape in spans]
+        if picture.shape != parts[index].shape:
+            raise ValueError("a picture's size differs from its camera's")
+        parts[index][:] = picture
+    return row, parts
+
+
+def _room(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
+    if kind.itemsize * int(np.prod(shape)) <= IN_MEMORY:
+        return np.empty(shape, kind)
+    # Gone with the last reference to it, however the program ends.
+    return np.memmap(tempfile.TemporaryFile(), kind, "w+", shape=shape)
 
 
 def in_units(relative: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

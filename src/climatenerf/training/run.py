@@ -68,10 +68,10 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         cameras,
         [view.camera for view in views],
         np.stack([scene.c2w_world(view) for view in views]),
-        [load_image(view, scene, downscale) for view in views],
-        [load_labels(view, scene, downscale) for view in views],
-        [load_mask(view, scene, downscale) for view in views],
-        [load_relative_depth(view, scene, downscale) for view in views],
+        (load_image(view, scene, downscale) for view in views),
+        (load_labels(view, scene, downscale) for view in views),
+        (load_mask(view, scene, downscale) for view in views),
+        (load_relative_depth(view, scene, downscale) for view in views),
     )
     if not pixels.share:
         raise UserError(

@@ -1,0 +1,54 @@
+"""Pixels of all photos in one row: in memory or, beyond a bound, in a file."""
+
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.scene.cameras import Camera
+from climatenerf.scene.classes import UNKNOWN
+from climatenerf.training import pixels as module
+from climatenerf.training.pixels import TrainingPixels, in_one_row
+
+CAMERAS = [Camera(20, 14, 20.0, 20.0, 10.0, 7.0), Camera(14, 20, 20.0, 20.0, 7.0, 10.0)]
+
+
+def made() -> TrainingPixels:
+    """Four pictures of two cameras; some lack label, mask and depth."""
+    rng = np.random.default_rng(0)
+    camera_of = [0, 1, 0, 1]
+    shapes = [(CAMERAS[i].height, CAMERAS[i].width) for i in camera_of]
+    images = (rng.integers(0, 256, (*shape, 3), dtype=np.uint8) for shape in shapes)
+    labels = [None, *(np.full(shape, 8, np.uint8) for shape in shapes[1:])]
+    masks = [np.arange(20 * 14).reshape(shapes[0]) % 3 > 0, None, None, None]
+    relative = [None, None, np.linspace(1, 2, 20 * 14, dtype=np.float32).reshape(shapes[2]), None]
+    poses = np.stack([np.eye(4)] * 4)
+    return TrainingPixels(CAMERAS, camera_of, poses, images, labels, masks, relative)
+
+
+def test_pixels_beyond_the_bound_are_drawn_from_a_file_just_the_same(monkeypatch):
+    inside = made()
+    monkeypatch.setattr(module, "IN_MEMORY", 100)
+    outside = made()
+    row, parts = in_one_row([(2, 3), (30, 40)], [None, np.ones((30, 40), np.uint8)], np.uint8, 7)
+    assert isinstance(row, np.memmap) and (row[:6] == 7).all() and (row[6:] == 1).all()
+    assert np.shares_memory(row, parts[1])
+    a, b = (each.draw(400, torch.Generator().manual_seed(0), 60) for each in (inside, outside))
+    for name in ("rgb", "label", "in_line", "image"):
+        assert torch.equal(getattr(a, name), getattr(b, name)), name
+    assert a.relative is not None and b.relative is not None
+    assert torch.equal(a.relative.nan_to_num(-1), b.relative.nan_to_num(-1))
+
+
+def test_what_a_picture_lacks_is_unknown_there_alone():
+    pixels = made()
+    assert pixels.label is not None and pixels.relative is not None and pixels.usable is not None
+    n = 20 * 14
+    assert (pixels.label[:n] == UNKNOWN).all() and (pixels.label[n:] != UNKNOWN).all()
+    known = torch.isfinite(pixels.relative.float())
+    assert known[2 * n : 3 * n].all() and known.sum() == n
+    assert pixels.usable[n:].all() and pixels.share == pytest.approx(1 - 94 / (4 * n))
+
+
+def test_a_picture_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="size differs"):
+        TrainingPixels(CAMERAS, [0], np.eye(4)[None], [np.zeros((20, 14, 3), np.uint8)])
