@@ -165,7 +165,7 @@ def geometry_scores(place: Place, dry: list[Dry], scale: float) -> dict[str, flo
     """Depth, normals, floaters and sky; `scale` is that of the run's metres, see `frame_scores`."""
     truths = place.reference.truths
     normals = [each.normal @ each.c2w[:3, :3] for each in dry]
-    absorbed, skyward = [], []
+    absorbed, skyward, spread = [], [], []
     for truth in truths:
         camera, c2w = place.pose(truth)
         free = torch.from_numpy((scale * geometry.free_space(truth)).astype(np.float32).ravel())
@@ -173,9 +173,12 @@ def geometry_scores(place: Place, dry: list[Dry], scale: float) -> dict[str, flo
         absorbed.append(lost.view(truth.depth.shape).numpy())
         whole = passing(place.fitted, camera, c2w, torch.full_like(free, 1e9))
         skyward.append(whole.view(truth.depth.shape).numpy())
+        own = depth_spread(place.fitted, camera, c2w).numpy()
+        spread.append(own[~truth.sky.ravel() & np.isfinite(own)])
     return {
         "open_sky": open_sky(place),
         **geometry.depth_scores([each.depth for each in dry], truths),
+        "depth_spread": float(np.concatenate(spread).mean()),
         **geometry.normal_scores(normals, truths),
         **geometry.emptiness_scores(absorbed, skyward, truths),
     }
@@ -191,6 +194,25 @@ def passing(
     samples = fitted.march(rays_o, rays_d, start, t_max.clamp_min(fitted.near), RENDER_STEP)
     _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
     return left
+
+
+@torch.no_grad()
+def depth_spread(
+    fitted: Field, camera: Camera, c2w: Float[np.ndarray, "4 4"]
+) -> Float[torch.Tensor, "n"]:
+    """Standard deviation of where a pixel's light comes from, over its mean; NaN: mostly sky.
+
+    0 is a sharp surface; haze about it shows in no depth, but takes snow and smog.
+    """
+    rays_o, rays_d = camera_rays(camera, c2w)
+    near = torch.full((rays_o.shape[0],), fitted.near)
+    samples = fitted.march(rays_o, rays_d, near, torch.full_like(near, 1e9), RENDER_STEP)
+    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    ray, opacity = samples.ray_index(), (1 - left).clamp_min(1e-6)  # nothing there: 0/0
+    own = weights / opacity[ray]
+    mean = torch.zeros_like(left).index_add(0, ray, own * samples.t)
+    off = torch.zeros_like(left).index_add(0, ray, own * (samples.t - mean[ray]).square())
+    return torch.where(opacity > 0.5, off.sqrt() / mean, torch.nan)
 
 
 @torch.no_grad()

@@ -46,6 +46,7 @@ CELL = 256  # pixels of a picture's width
 MEASURED = {
     "psnr": "clean, dB",
     "depth_abs_rel": "depth",
+    "depth_spread": "spread",
     "ground_holes": "holes",
     "normal_median_deg": "normals, deg",
     "normal_ground_roof_median_deg": "ground, roofs",
