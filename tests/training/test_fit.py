@@ -499,6 +499,38 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
     assert above[100.0] < 0.5 * above[0.0], above
 
 
+def test_what_rays_meet_is_occupied_from_the_first_step_on(scene, monkeypatch):
+    """Nothing else has told the occupancy of density yet: `update_occupancy` is not called here."""
+    monkeypatch.setattr(fit, "SEEN_WEIGHT", 1e-4)  # an untrained field is haze
+    fitting = begin(scene, steps=1000)
+    assert not (fitting.field.occupancy.density > 0).any()
+    fitting.step(fitting.pixels.draw(1024, fitting.generator))
+    assert (fitting.field.occupancy.density > 0).sum() > 100
+
+
+def test_surfaces_that_no_label_names_are_flattened_less(scene):
+    nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
+    fitting = begin(scene, steps=1000, losses=Losses(**{**nothing, "flat": 1.0}))
+    field, batch = fitting.field, fitting.pixels.draw(900, torch.Generator().manual_seed(0), 150)
+    near, far = torch.full((900,), field.near), torch.full((900,), 1e9)
+    samples = field.march(batch.rays_o, batch.rays_d, near, far)
+    dense = 100 * samples.sigma * samples.dt  # an untrained field is haze; flat is what is solid
+    weights, left = dispatch.render_weights(dense, samples.offsets)
+    t, dt = samples.t / field.unit, samples.dt / field.unit
+    found = {
+        kind: float(
+            fitting.geometry_loss(
+                replace(batch, label=torch.full_like(batch.label, kind)),
+                *(samples, weights, left, t, dt),
+            )
+        )
+        for kind in (UNKNOWN, ROAD, SKY)
+    }
+    assert found[ROAD] > 0 and found[SKY] == 0
+    assert found[UNKNOWN] == pytest.approx(fit.UNSURE_FLAT * found[ROAD], rel=1e-4)
+    assert fit.UNSURE_FLAT < 1
+
+
 def lost_before_surfaces(field, scene):
     """Mean share of light lost before the true surfaces, in the held-out views."""
     lost = []
