@@ -30,6 +30,17 @@ def test_it_wants_to_know_against_what(capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_an_ablation_wants_a_capture_with_its_truth(capsys, tmp_path, monkeypatch):
+    words = ["evaluate", REFERENCE, "--ablation", "-o", tmp_path / "out"]
+    assert "above 0" in complaint(capsys, *words, "--minutes", "0")
+    assert "--reference" in complaint(capsys, *words, "--reference")
+    street = REFERENCE.parents[1] / "src/climatenerf/assets/street"
+    err = complaint(capsys, "evaluate", street, "--ablation", "-o", tmp_path / "out")
+    assert "reference" in err and not (tmp_path / "out").exists()
+    err = complaint(capsys, *words[:-1], REFERENCE / "truth")
+    assert "lies in the reference set" in err
+
+
 def test_a_folder_without_a_run_is_refused(capsys, tmp_path):
     err = complaint(capsys, "evaluate", tmp_path, "--reference", "-o", tmp_path / "out")
     assert str(tmp_path) in err and not (tmp_path / "out").exists()

@@ -17,7 +17,7 @@ from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
 from climatenerf.cli.render import LAYER_NAMES
 from climatenerf.storage import read_safetensors, write_safetensors
-from climatenerf.training.settings import PAPER
+from climatenerf.training.settings import PAPER, Losses
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
 SMALL = ["--size", "96x54", "--frames", "2"]
@@ -64,6 +64,25 @@ def complaint(capsys, *words):
 
 
 # --- fit --------------------------------------------------------------------------------------
+
+
+def test_steps_alone_have_no_time_limit_and_the_device_chooses_the_preset():
+    fit = Fit(Path("scene"), Path("run"))
+    assert (fit_settings(fit).minutes, fit_settings(fit).preset) == (5.0, "cpu")
+    assert fit_settings(dataclasses.replace(fit, steps=9)).minutes is None
+    both = fit_settings(dataclasses.replace(fit, steps=9, minutes=2.0))
+    assert (both.minutes, both.steps) == (2.0, 9)
+    assert fit_settings(dataclasses.replace(fit, device="cuda")).preset == "gpu"
+    chosen = dataclasses.replace(fit, device="cuda", preset="cpu")
+    assert fit_settings(chosen).preset == "cpu"
+
+
+def test_the_help_names_every_loss(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["fit", "--help"])
+    told = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert end.value.code == 0
+    assert all(f" {each.name}" in told for each in dataclasses.fields(Losses))
 
 
 def test_fit_leaves_a_run(run_folder):

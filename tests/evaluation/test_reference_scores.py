@@ -2,15 +2,19 @@
 
 import dataclasses
 import json
+import math
 
 import numpy as np
 import pytest
+import torch
 
 from climatenerf.errors import UserError
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
+from climatenerf.evaluation.scores import depth_spread
+from climatenerf.render.samples import Samples
 from climatenerf.scene import Camera
 from climatenerf.scene.srgb import to_display
 
@@ -52,6 +56,27 @@ def truth_of(rise=0.0, label=ROAD):
         world_rays(CAMERA, pose).astype(float),
         pose,
     )
+
+
+class TwoLayers:
+    """Half of the light from 1 m, half from 3 m; or, for every other ray, nothing but air."""
+
+    near = 0.1
+
+    def march(self, rays_o, rays_d, near, far, step):
+        n = rays_o.shape[0]
+        offsets = torch.zeros(n + 1, dtype=torch.long)
+        offsets[1:] = (2 * (torch.arange(n) % 2 == 0)).cumsum(0)
+        met = int(offsets[-1]) // 2
+        sigma = torch.tensor([math.log(2.0), 1e3]).repeat(met)
+        t = torch.tensor([1.0, 3.0]).repeat(met)
+        return Samples(offsets, t, torch.ones_like(t), sigma)
+
+
+def test_the_spread_of_depth_is_that_of_the_light():
+    found = depth_spread(TwoLayers(), CAMERA, np.eye(4)).numpy()
+    assert np.allclose(found[::2], 0.5, atol=1e-4)  # 2 m in the mean, 1 m off
+    assert np.isnan(found[1::2]).all()
 
 
 def test_depth_errors_are_those_put_in():

@@ -18,7 +18,7 @@ from climatenerf.render.samples import Samples
 from climatenerf.render.view import camera_rays, render_view
 from climatenerf.render.world import World
 from climatenerf.scene import load_image
-from climatenerf.scene.classes import ROAD, SKY, UNKNOWN, VEHICLE
+from climatenerf.scene.classes import PERSON, ROAD, SKY, UNKNOWN, VEHICLE
 from climatenerf.training import fit, losses
 from climatenerf.training.carving import Carving
 from climatenerf.training.fit import Fitting, scale_gradient
@@ -497,6 +497,86 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
         height = o[ray, 2] + samples.t * d[ray, 2]
         above[weight] = float((weights * (height > 0.15)).sum() / len(d))
     assert above[100.0] < 0.5 * above[0.0], above
+
+
+def with_labels(scene, relabel, **settings):
+    """A fit of the labelled scene, with its labels changed, that is past a quarter."""
+    known, labels = labelled(scene)
+    views = known.of_split("train")
+    extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
+    chosen = FitSettings(preset="tiny", minutes=None, steps=1000, **settings)
+    pixels = labelled_pixels(known, [relabel(each) for each in labels])
+    fitting = Fitting(pixels, len(views), extent, chosen, find_point_rays(known))
+    fitting.reached = 0.5
+    return fitting
+
+
+def test_classes_and_normals_move_no_matter(scene, monkeypatch):
+    """Colours' errors are taken away, so that nothing else is left to learn from."""
+    monkeypatch.setattr(losses, "colour_error", lambda linear, _: 0.0 * linear.sum(-1))
+    nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
+    for bend, moves in ((0.0, False), (1.0, True)):
+        weights = Losses(**{**nothing, "classes": 1.0, "normals": 1.0, "bend": bend})
+        fitting = with_labels(scene, np.asarray, losses=weights)
+        field = fitting.field
+        before = {name: value.clone() for name, value in field.named_parameters()}
+        for _ in range(3):
+            fitting.step(fitting.pixels.draw(1024, fitting.generator))
+        moved = {n for n, value in field.named_parameters() if not torch.equal(value, before[n])}
+        assert any(name.startswith("surface_net") for name in moved)
+        assert any(name.startswith("geometry") for name in moved) == moves, moved
+
+
+@pytest.mark.parametrize(("kept", "told"), [((9,), False), ((2,), False), ((2, 9), True)])
+def test_a_single_class_is_not_learned(scene, kept, told):
+    """As the fall-back's labels are, sky and terrain: all else would be called terrain too."""
+    fitting = with_labels(scene, lambda ids: np.where(np.isin(ids, (*kept, 10)), ids, 255))
+    assert fitting.field.knows_classes == told
+
+
+def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypatch):
+    """A network calls the ground a person, but points lie on it."""
+    prices = []
+
+    def recorded(error, mask, price):
+        prices.append(price)
+        return (error + mask).mean()
+
+    monkeypatch.setattr(losses, "masked_colour_loss", recorded)
+    fitting = with_labels(scene, lambda ids: np.where(ids == 9, 11, ids))
+    batch = fitting.pixels.draw(4000, torch.Generator().manual_seed(0))
+    fitting.colour_loss(torch.zeros(4000), batch)
+    person = batch.label == PERSON
+    full = fitting.settings.losses.transient
+    assert torch.isclose(prices[0][~person], torch.tensor(full)).all()
+    still = torch.isclose(prices[0][person], torch.tensor(full))
+    suspected = torch.isclose(prices[0][person], torch.tensor(fit.SUSPECT * full))
+    assert (still | suspected).all() and still.float().mean() > 0.05 and suspected.any()
+    fitting.points = None
+    assert not fitting.cells_of_points(24).any()
+
+
+def test_the_sky_goes_on_where_no_photo_looked(scene):
+    """It begins as noise, which upwards only the fill can take away."""
+    up = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
+    up[:, 2] = 2 * up[:, 2].abs() + 1.0
+    up = torch.nn.functional.normalize(up, dim=-1)
+    off = {}
+    for weight in (Losses.sky_fill, 0.0):
+        fitting = with_labels(scene, np.asarray, losses=Losses(sky_fill=weight))
+        fitting.reached, field = 0.0, fitting.field
+        with torch.no_grad():
+            field.sky_grid.normal_(0.0, 10.0, generator=torch.Generator().manual_seed(0))
+        for _ in range(150):
+            fitting.step(fitting.pixels.draw(512, fitting.generator))
+            fitting.steps += 1
+        batch = fitting.pixels.draw(2000, fitting.generator)
+        seen = decode_srgb(batch.rgb[batch.label == SKY]).mean()
+        with torch.no_grad():
+            shown = field.sky_colour(up, field.mean_embedding.expand(500, -1))
+        ratio = shown.mean(-1) / seen
+        off[weight] = float(((ratio < 0.5) | (ratio > 2.0)).float().mean())
+    assert off[Losses.sky_fill] < 0.5 * off[0.0], off
 
 
 def test_what_rays_meet_is_occupied_from_the_first_step_on(scene, monkeypatch):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import UNKNOWN
 from climatenerf.training import pixels as module
@@ -47,6 +48,23 @@ def test_what_a_picture_lacks_is_unknown_there_alone():
     known = torch.isfinite(pixels.relative.float())
     assert known[2 * n : 3 * n].all() and known.sum() == n
     assert pixels.usable[n:].all() and pixels.share == pytest.approx(1 - 94 / (4 * n))
+
+
+def test_a_full_disk_is_a_sentence(monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "IN_MEMORY", 100)
+    monkeypatch.setattr(module.tempfile, "TemporaryFile", full)
+    with pytest.raises(UserError, match=r"No space left.*TMPDIR"):
+        made()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_pictures_and_cameras_are_as_many(count):
+    images = [np.zeros((14, 20, 3), np.uint8)] * count
+    with pytest.raises(ValueError, match=f"{count} pictures for 2 cameras"):
+        TrainingPixels(CAMERAS, [0, 0], np.stack([np.eye(4)] * 2), images)
 
 
 def test_a_picture_of_another_size_is_refused():

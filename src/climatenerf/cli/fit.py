@@ -26,10 +26,11 @@ class Fit:
     mip-NeRF 360, KITTI-360 or Mega-NeRF."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Run folder to make."""
-    minutes: float = 5.0
-    """Time for fitting steps; reading, previews, saving and measuring come on top."""
+    minutes: float | None = None
+    """Time for fitting steps; reading, previews, saving and measuring come on top. Default: 5, or
+    no limit where --steps is given."""
     steps: int | None = None
-    """Stop after this many steps, if that is sooner."""
+    """Stop after this many steps; with --minutes too, after what is sooner."""
     downscale: int = 1
     """Reduce the photos this many times in width and height."""
     holdout: str | None = None
@@ -37,12 +38,14 @@ class Fit:
     own split, else every 8th by name."""
     resume: bool = False
     """Continue the run in the folder; --minutes then counts from its beginning."""
-    preset: Literal["cpu", "gpu", "paper"] = "cpu"
-    """Size of the field. gpu: larger tables (still on the CPU). paper: the paper's sizes and
-    weights of losses (docs/physics.md tells what in them is ours); its sky is opaque, by each
-    photo's own labels, and shelters from snow."""
+    preset: Literal["cpu", "gpu", "paper"] | None = None
+    """Size of the field. gpu: larger tables. paper: the paper's sizes and weights of losses
+    (docs/physics.md tells what in them is ours); its sky is opaque, by each photo's own labels, and
+    shelters from snow. Default: gpu with --device cuda, else cpu."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Weight of a loss, such as sky=0, which switches it off; may be given again for others."""
+    """Weight of a loss, such as sky=0, which switches it off; may be given again for others. They
+    are: distortion, opacity, solid, sky, sky_fill, flat, points, ground, monocular, classes,
+    normals, bend, transient (docs/physics.md)."""
     refine_poses: bool = False
     """Correct the cameras while fitting."""
     camera_height: OptionalLength = None
@@ -63,7 +66,7 @@ class Fit:
     name or folder. Default: the capture's label files, else simple if it surely shows sky."""
     mono_depth: str | None = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
-    capture's depth_relative files."""
+    capture's depth_relative files, else its depth files; none leaves both alone."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute. cuda: an NVIDIA GPU; checked in a simulator, not yet run on one."""
     seed: int = 0
@@ -72,7 +75,8 @@ class Fit:
 
 def run(options: Fit) -> int:
     """Reads the capture, fits, and says where the run is and how good."""
-    if not options.minutes > 0 or (options.steps is not None and options.steps < 1):
+    minutes = 5.0 if options.minutes is None else options.minutes
+    if not minutes > 0 or (options.steps is not None and options.steps < 1):
         raise UserError("--minutes and --steps must be above 0; try --minutes 5")
     fit_settings(options)  # what is wrong with them is to be known before photos are read
     if options.downscale < 1:
@@ -240,7 +244,7 @@ def fit_with_bars(scene, options: Fit) -> dict:
 
 def fit_settings(options: Fit) -> FitSettings:
     """What the flags say of the fit, on top of what its preset says."""
-    settings = settings_of(options.preset)
+    settings = settings_of(options.preset or ("gpu" if options.device == "cuda" else "cpu"))
     weights = parse_losses(options.loss)
     if weights.get("bend") and weights.get("normals") == 0:
         raise UserError("--loss bend needs predicted normals; leave --loss normals=0 out")
@@ -249,7 +253,7 @@ def fit_settings(options: Fit) -> FitSettings:
     return replace(
         settings,
         losses=replace(settings.losses, **weights),
-        minutes=options.minutes,
+        minutes=5.0 if options.minutes is None and options.steps is None else options.minutes,
         steps=options.steps,
         refine_poses=options.refine_poses,
         seed=options.seed,

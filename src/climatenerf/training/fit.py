@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
@@ -83,9 +83,12 @@ class Fitting:
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
         self.fill = fill_sky(pixels, self.generator) if self.knows_sky else None
         self.carving = Carving(self.field, pixels, points, settings)
-        kinds = torch.zeros(0) if pixels.label is None else pixels.label.unique()
+        kinds = pixels.rgb[:0, 0] if pixels.label is None else pixels.label.unique()
+        self.still = self.cells_of_points(images)
         self.solid_of = placed(SOLID_OF.astype(np.int64))
-        classed = bool((self.solid_of[kinds.long()] != UNKNOWN).any())
+        kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]
+        # A head that has met one class alone, or nothing but ground, would say so of everything.
+        classed = kinds.numel() > 1 and not bool(on_the_ground(kinds).all())
         weigh = settings.losses
         # Normals are learned later.
         self.field.learned[:] = torch.tensor([False, weigh.classes > 0 and classed])
@@ -262,8 +265,11 @@ class Fitting:
             return error.mean(), batch
         # As long as all is wrong, nothing stands out.
         price = max(price, OUTSTANDING * self.error)
-        # What can move is suspected sooner; but a word alone removes nothing.
+        # What can move is suspected sooner; but a word alone removes nothing, and what several
+        # photos show in one place has not moved.
         movable = (batch.label == PERSON) | (batch.label == VEHICLE)
+        cell = (batch.place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
+        movable &= ~self.still[batch.image, cell[:, 1], cell[:, 0]]
         prices = torch.where(movable, price * SUSPECT, price)
         mask = self.masks(batch.image, batch.place)
         gone = mask.detach() > MASKED
@@ -272,6 +278,23 @@ class Fitting:
         in_line = batch.in_line & ~gone[triples(gone.shape[0], batch.in_line.shape[0])].any(0)
         stays = replace(batch, label=label, relative=relative, in_line=in_line)
         return losses.masked_colour_loss(error, mask, prices), stays
+
+    def cells_of_points(self, images: int) -> Bool[Tensor, "images cells cells"]:
+        """Where in each image sparse points lie on what it labels person or vehicle.
+
+        A point is found by several photos in one place: a parked car, or a cairn that a network
+        takes for a person.
+        """
+        still = torch.zeros(images, STILL_CELLS, STILL_CELLS, dtype=torch.bool)
+        if self.points is None:
+            return still
+        image, d = self.points.image, self.points.rays_d
+        label = self.pixels.label_towards(image, d)
+        own = (label == PERSON) | (label == VEHICLE)
+        place = self.pixels.place_towards(image[own], d[own])
+        cell = (place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
+        still[image[own], cell[:, 1], cell[:, 0]] = True
+        return still
 
     def geometry_loss(
         self,
@@ -517,7 +540,7 @@ EMBEDDING_SHARES = (0.0, 0.02)
 FIRST_NEAR = 0.6
 CHOSEN = 32  # samples of a ray that get colour and gradients, about
 # Samples that weigh more show that their cell is occupied. A lamp post fills a tenth of the first,
-# large cells, and what is pruned once never comes back.
+# large cells, and what is pruned hardly ever comes back.
 SEEN_WEIGHT = 0.05
 LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
 SURFACE_SHARE = 4  # rays for one whose classes and normals are learned from
@@ -528,7 +551,8 @@ EDGE_SHARE = 0.1  # of the other rays that are drawn from the sky's edges,
 EDGES_AT = 0.5  # from this stage on
 SKY_LOOKS = 64  # directions in which the sky is filled, a step
 OUTSTANDING = 6.0  # times the mean error: the least price of a mask
-SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move
+SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move,
+STILL_CELLS = 24  # unless points lie on it in a cell of so many along a photo's sides
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
 SURE_PULL = 4.0  # of the ground loss's weight, once the field's own classes tell ground

@@ -1,6 +1,7 @@
 """All training pixels as one long list of rays with their colours."""
 
 import copy
+import os
 import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from climatenerf.errors import UserError
 from climatenerf.ops.placing import array_of, integers, placed
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
@@ -134,6 +136,21 @@ class TrainingPixels:
             other.label = torch.where(self.label == SKY, UNKNOWN, self.label).to(torch.uint8)
         return other
 
+    def place_towards(
+        self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n 2"]:
+        """Where in its picture, (x, y) in (0,1), an image shows a direction; NaN outside it."""
+        out = torch.full((image.shape[0], 2), torch.nan)
+        for i in array_of(image.unique()).tolist():
+            some = (image == i).nonzero()[:, 0]
+            camera = self.cameras[i]
+            pixel = camera.project(array_of(rays_d[some] @ self.c2w[i, :3, :3]))
+            place = pixel / (camera.width, camera.height)
+            with np.errstate(invalid="ignore"):  # behind the camera: NaN
+                inside = np.all((place >= 0) & (place < 1), axis=-1)
+            out[some[placed(inside)]] = placed(place[inside].astype(np.float32))
+        return out
+
     def label_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> UInt8[Tensor, "n"]:
@@ -141,14 +158,14 @@ class TrainingPixels:
         out = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
         if self.label is None:
             return out
-        for i in array_of(image.unique()).tolist():
-            some = (image == i).nonzero()[:, 0]
-            camera = self.cameras[i]
-            pixel = camera.project(array_of(rays_d[some] @ self.c2w[i, :3, :3]))
-            with np.errstate(invalid="ignore"):  # behind the camera: NaN
-                inside = np.all((pixel >= 0) & (pixel < (camera.width, camera.height)), axis=-1)
-            x, y = placed(pixel[inside].astype(np.int64)).unbind(-1)
-            out[some[placed(inside)]] = self.label[self.pixel_start[i] + y * camera.width + x]
+        place = self.place_towards(image, rays_d)
+        inside = ~place[:, 0].isnan()
+        image, place = image[inside], place[inside]
+        width, height = self.width[image], self.height[image]
+        # Rounding may bring the last pixel's border to 1.
+        x = (place[:, 0] * width).long().minimum(width - 1)
+        y = (place[:, 1] * height).long().minimum(height - 1)
+        out[inside] = self.label[self.pixel_start[image] + y * width + x]
         return out
 
     @property
@@ -264,8 +281,10 @@ def in_one_row(
     row, parts = np.empty(0, kind), []
     per_pixel = () if channels is None else (channels,)
     starts = np.cumsum([0] + [h * w for h, w in shapes])
+    count = 0
     for index, picture in enumerate(pictures):
-        if picture is None:
+        count += 1
+        if picture is None or count > len(shapes):
             continue
         if not parts:
             whole = (int(starts[-1]), *per_pixel)
@@ -276,14 +295,25 @@ def in_one_row(
         if picture.shape != parts[index].shape:
             raise ValueError("a picture's size differs from its camera's")
         parts[index][:] = picture
+    if count not in (0, len(shapes)):
+        raise ValueError(f"{count} pictures for {len(shapes)} cameras")
     return row, parts
 
 
 def _room(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
-    if kind.itemsize * int(np.prod(shape)) <= IN_MEMORY:
+    size = kind.itemsize * int(np.prod(shape))
+    if size <= IN_MEMORY:
         return np.empty(shape, kind)
-    # Gone with the last reference to it, however the program ends.
-    return np.memmap(tempfile.TemporaryFile(), kind, "w+", shape=shape)
+    try:
+        with tempfile.TemporaryFile() as file:  # the map holds it, and with the map it is gone
+            if hasattr(os, "posix_fallocate"):  # a full disk would be a bus error later
+                os.posix_fallocate(file.fileno(), 0, size)
+            return np.memmap(file, kind, "w+", shape=shape)
+    except OSError as error:
+        raise UserError(
+            f"{size / 1e9:.1f} GB of pixels do not fit into the folder for temporary files"
+            f" ({error.strerror}); set TMPDIR to a folder with room, or fit with --downscale 2"
+        ) from error
 
 
 def in_units(relative: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
