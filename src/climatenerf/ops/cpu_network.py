@@ -17,56 +17,95 @@ CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients
 def _add_product(weight, rows, first, out, into, size):
     """out [m, into:into + size] += weight [m, k] @ rows [k, first:first + size].
 
-    Four rows in one sweep over the samples. Slices of single rows are known to be contiguous, those
-    of a table are not, and would not vectorise.
+    Two by four rows in one sweep over the samples: what is loaded is used twice. Slices of single
+    rows are known to be contiguous, those of a table are not, and would not vectorise.
     """
     k = rows.shape[0]
     whole = k // 4 * 4
-    for m in range(out.shape[0]):
-        own = out[m][into : into + size]
-        w = weight[m]
+    for m in range(0, out.shape[0] - 1, 2):
+        own, next_ = out[m][into : into + size], out[m + 1][into : into + size]
+        v, w = weight[m], weight[m + 1]
         for i in range(0, whole, 4):
             r0 = rows[i][first : first + size]
             r1 = rows[i + 1][first : first + size]
             r2 = rows[i + 2][first : first + size]
             r3 = rows[i + 3][first : first + size]
+            v0, v1, v2, v3 = v[i], v[i + 1], v[i + 2], v[i + 3]
             w0, w1, w2, w3 = w[i], w[i + 1], w[i + 2], w[i + 3]
             for s in range(size):
-                own[s] += (w0 * r0[s] + w1 * r1[s]) + (w2 * r2[s] + w3 * r3[s])
+                a0, a1, a2, a3 = r0[s], r1[s], r2[s], r3[s]
+                own[s] += (v0 * a0 + v1 * a1) + (v2 * a2 + v3 * a3)
+                next_[s] += (w0 * a0 + w1 * a1) + (w2 * a2 + w3 * a3)
         for i in range(whole, k):
             row = rows[i][first : first + size]
             for s in range(size):
-                own[s] += w[i] * row[s]
+                own[s] += v[i] * row[s]
+                next_[s] += w[i] * row[s]
+    if out.shape[0] % 2:
+        own, v = out[-1][into : into + size], weight[-1]
+        for i in range(0, whole, 4):
+            r0 = rows[i][first : first + size]
+            r1 = rows[i + 1][first : first + size]
+            r2 = rows[i + 2][first : first + size]
+            r3 = rows[i + 3][first : first + size]
+            v0, v1, v2, v3 = v[i], v[i + 1], v[i + 2], v[i + 3]
+            for s in range(size):
+                own[s] += (v0 * r0[s] + v1 * r1[s]) + (v2 * r2[s] + v3 * r3[s])
+        for i in range(whole, k):
+            row = rows[i][first : first + size]
+            for s in range(size):
+                own[s] += v[i] * row[s]
 
 
 @njit(cache=True, fastmath=True)
 def _add_outer(left, from_left, right, from_right, out, size):
-    """out [a, b] += left [a, from:from + size] @ right [b, from:from + size]ᵀ, four at a time."""
-    b = right.shape[0]
+    """out [a, b] += left [a, from:from + size] @ right [b, from:from + size]ᵀ, two by four."""
+    a, b = left.shape[0], right.shape[0]
     whole = b // 4 * 4
-    for i in range(left.shape[0]):
+    for i in range(0, a - 1, 2):
         own = left[i][from_left : from_left + size]
+        next_ = left[i + 1][from_left : from_left + size]
         for j in range(0, whole, 4):
             r0 = right[j][from_right : from_right + size]
             r1 = right[j + 1][from_right : from_right + size]
             r2 = right[j + 2][from_right : from_right + size]
             r3 = right[j + 3][from_right : from_right + size]
             t0 = t1 = t2 = t3 = np.float32(0.0)
+            u0 = u1 = u2 = u3 = np.float32(0.0)
             for s in range(size):
-                t0 += own[s] * r0[s]
-                t1 += own[s] * r1[s]
-                t2 += own[s] * r2[s]
-                t3 += own[s] * r3[s]
+                x, y = own[s], next_[s]
+                t0 += x * r0[s]
+                t1 += x * r1[s]
+                t2 += x * r2[s]
+                t3 += x * r3[s]
+                u0 += y * r0[s]
+                u1 += y * r1[s]
+                u2 += y * r2[s]
+                u3 += y * r3[s]
             out[i, j] += t0
             out[i, j + 1] += t1
             out[i, j + 2] += t2
             out[i, j + 3] += t3
+            out[i + 1, j] += u0
+            out[i + 1, j + 1] += u1
+            out[i + 1, j + 2] += u2
+            out[i + 1, j + 3] += u3
         for j in range(whole, b):
-            row = right[j][from_right : from_right + size]
-            total = np.float32(0.0)
-            for s in range(size):
-                total += own[s] * row[s]
-            out[i, j] += total
+            out[i, j] += _inner(own, right[j][from_right : from_right + size])
+            out[i + 1, j] += _inner(next_, right[j][from_right : from_right + size])
+    if a % 2:
+        own = left[-1][from_left : from_left + size]
+        for j in range(b):
+            out[-1, j] += _inner(own, right[j][from_right : from_right + size])
+
+
+@njit(cache=True, fastmath=True)
+def _inner(a, b):
+    """Inner product."""
+    total = np.float32(0.0)
+    for s in range(a.shape[0]):
+        total += a[s] * b[s]
+    return total
 
 
 @njit(cache=True, fastmath=True)
