@@ -701,7 +701,7 @@ def test_a_step_has_every_loss_and_all_gradients_are_finite(scene):
     """Late in a fit, with labels, relative depth, moving cameras and normals that move matter."""
     pixels = load_pixels(scene, 1)
     grey = pixels.rgb.float().mean(-1)
-    others = torch.where(grey > 80, ROAD, VEHICLE)  # one class alone would not be learned
+    others = torch.where(grey > 100, VEHICLE, ROAD)  # one class alone would not be learned
     pixels.label = torch.where(grey > 128, SKY, others).to(torch.uint8)
     pixels.relative = torch.rand(len(pixels.rgb)).half()
     settings = FitSettings(

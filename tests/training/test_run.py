@@ -15,7 +15,7 @@ from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.render.view import render_view
 from climatenerf.scene import load_scene
-from climatenerf.scene.classes import BUILDING, SKY
+from climatenerf.scene.classes import BUILDING, SKY, VEGETATION
 from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import carving as carving_module
@@ -116,7 +116,7 @@ def test_heads_on_the_appearance_grid_learn_and_come_back(scene, tmp_path, monke
     )
     pixels = load_pixels(scene, 1)
     pixels.label = torch.full((len(pixels.rgb),), BUILDING, dtype=torch.uint8)
-    pixels.label[:400] = SKY
+    pixels.label[:400], pixels.label[400:800] = SKY, VEGETATION
     monkeypatch.setattr(run_module, "load_pixels", lambda *_: pixels)
     fit_scene(scene, tmp_path / "run", settings, 1, False, nothing, nothing)
     field = load_field(tmp_path / "run")
@@ -207,10 +207,11 @@ def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path)
 
 
 def labelled(fitting):
-    """A fit of the same pixels, of which bright ones are sky and the rest built."""
+    """A fit of the same pixels, bright ones sky, dark ones grown, the rest built."""
     pixels = fitting.pixels
-    bright = pixels.rgb.float().mean(-1) > 128
-    pixels.label = torch.where(bright, SKY, BUILDING).to(torch.uint8)
+    grey = pixels.rgb.float().mean(-1)
+    others = torch.where(grey > 100, BUILDING, VEGETATION)
+    pixels.label = torch.where(grey > 128, SKY, others).to(torch.uint8)
     sizes = (pixels.pixel_start[1:] - pixels.pixel_start[:-1]).tolist()
     maps = [part.view(36, 48).numpy() for part in pixels.label.split(sizes)]
     pixels.witness = Witness([CAMERA] * len(maps), pixels.c2w.numpy(), maps, [SKY], 0.1)
