@@ -13,12 +13,23 @@ BLOCK = 128  # samples at a time: 64 hidden rows of them are 32 kB
 CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients over
 
 
+@njit(cache=True, fastmath=True, inline="always")
+def _four(rows, i, first, size):
+    """Samples of four rows; a single row's slice is known to be contiguous, so loops vectorise."""
+    stop = first + size
+    return (
+        rows[i][first:stop],
+        rows[i + 1][first:stop],
+        rows[i + 2][first:stop],
+        rows[i + 3][first:stop],
+    )
+
+
 @njit(cache=True, fastmath=True)
 def _add_product(weight, rows, first, out, into, size):
     """out [m, into:into + size] += weight [m, k] @ rows [k, first:first + size].
 
-    Two by four rows in one sweep over the samples: what is loaded is used twice. Slices of single
-    rows are known to be contiguous, those of a table are not, and would not vectorise.
+    Two by four rows in one sweep over the samples: what is loaded is used twice.
     """
     k = rows.shape[0]
     whole = k // 4 * 4
@@ -26,10 +37,7 @@ def _add_product(weight, rows, first, out, into, size):
         own, next_ = out[m][into : into + size], out[m + 1][into : into + size]
         v, w = weight[m], weight[m + 1]
         for i in range(0, whole, 4):
-            r0 = rows[i][first : first + size]
-            r1 = rows[i + 1][first : first + size]
-            r2 = rows[i + 2][first : first + size]
-            r3 = rows[i + 3][first : first + size]
+            r0, r1, r2, r3 = _four(rows, i, first, size)
             v0, v1, v2, v3 = v[i], v[i + 1], v[i + 2], v[i + 3]
             w0, w1, w2, w3 = w[i], w[i + 1], w[i + 2], w[i + 3]
             for s in range(size):
@@ -44,10 +52,7 @@ def _add_product(weight, rows, first, out, into, size):
     if out.shape[0] % 2:
         own, v = out[-1][into : into + size], weight[-1]
         for i in range(0, whole, 4):
-            r0 = rows[i][first : first + size]
-            r1 = rows[i + 1][first : first + size]
-            r2 = rows[i + 2][first : first + size]
-            r3 = rows[i + 3][first : first + size]
+            r0, r1, r2, r3 = _four(rows, i, first, size)
             v0, v1, v2, v3 = v[i], v[i + 1], v[i + 2], v[i + 3]
             for s in range(size):
                 own[s] += (v0 * r0[s] + v1 * r1[s]) + (v2 * r2[s] + v3 * r3[s])
@@ -66,10 +71,7 @@ def _add_outer(left, from_left, right, from_right, out, size):
         own = left[i][from_left : from_left + size]
         next_ = left[i + 1][from_left : from_left + size]
         for j in range(0, whole, 4):
-            r0 = right[j][from_right : from_right + size]
-            r1 = right[j + 1][from_right : from_right + size]
-            r2 = right[j + 2][from_right : from_right + size]
-            r3 = right[j + 3][from_right : from_right + size]
+            r0, r1, r2, r3 = _four(right, j, from_right, size)
             t0 = t1 = t2 = t3 = np.float32(0.0)
             u0 = u1 = u2 = u3 = np.float32(0.0)
             for s in range(size):
