@@ -75,10 +75,9 @@ class Fit:
 
 def run(options: Fit) -> int:
     """Reads the capture, fits, and says where the run is and how good."""
-    minutes = 5.0 if options.minutes is None else options.minutes
-    if not minutes > 0 or (options.steps is not None and options.steps < 1):
+    settings = fit_settings(options)  # what is wrong with it is to be known before photos are read
+    if any(limit is not None and not limit > 0 for limit in (settings.minutes, settings.steps)):
         raise UserError("--minutes and --steps must be above 0; try --minutes 5")
-    fit_settings(options)  # what is wrong with them is to be known before photos are read
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
     given = options.camera_height is not None or options.metric_input or options.known_length

@@ -282,8 +282,7 @@ def in_one_row(
     per_pixel = () if channels is None else (channels,)
     starts = np.cumsum([0] + [h * w for h, w in shapes])
     count = 0
-    for index, picture in enumerate(pictures):
-        count += 1
+    for count, picture in enumerate(pictures, 1):
         if picture is None or count > len(shapes):
             continue
         if not parts:
@@ -292,9 +291,9 @@ def in_one_row(
             row.fill(empty)
             spans = zip(starts[:-1], starts[1:], shapes, strict=True)
             parts = [row[a:b].reshape(*shape, *per_pixel) for a, b, shape in spans]
-        if picture.shape != parts[index].shape:
+        if picture.shape != parts[count - 1].shape:
             raise ValueError("a picture's size differs from its camera's")
-        parts[index][:] = picture
+        parts[count - 1][:] = picture
     if count not in (0, len(shapes)):
         raise ValueError(f"{count} pictures for {len(shapes)} cameras")
     return row, parts
