@@ -15,7 +15,8 @@ from PIL import Image
 
 from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
-from climatenerf.cli.render import LAYER_NAMES
+from climatenerf.cli.render import LAYER_NAMES, appearance_of
+from climatenerf.scene import load_scene
 from climatenerf.storage import read_safetensors, write_safetensors
 from climatenerf.training.settings import PAPER, Losses
 
@@ -451,6 +452,14 @@ def test_render_mistakes(run_folder, tmp_path, capsys, words, expected):
     said = complaint(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL, *words)
     assert expected in said
     assert not (tmp_path / "out").exists(), "nothing is begun"
+
+
+def test_appearances_are_counted_among_the_training_photos(run_folder):
+    scene = load_scene(run_folder)
+    names = [view.name for view in scene.of_split("train")]
+    assert scene.views[0].name not in names, "held out, so that places differ"
+    assert [appearance_of(name, scene) for name in names] == list(range(len(names)))
+    assert appearance_of("mean", scene) is None
 
 
 @pytest.mark.parametrize("value", ["10 kg", "half a metre", "0.5"])

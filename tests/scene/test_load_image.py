@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -166,3 +167,21 @@ def test_relative_depth_that_cannot_be_used_is_one_sentence(tmp_path):
         with pytest.raises(UserError, match="relative depth") as caught:
             load_relative_depth(view, scene)
         assert "pickle" not in str(caught.value)
+
+
+def test_measured_depth_serves_as_relative_depth_unless_there_is_such(tmp_path):
+    view, scene = save(tmp_path, Image.fromarray(RGB))
+    z = np.full((24, 32), 4.0, np.float32)
+    z[:, 16:] = 2.0
+    z[0] = np.nan
+    (tmp_path / "depth").mkdir()
+    np.savez(tmp_path / "depth" / "a.npz", depth=z)
+    view = dataclasses.replace(view, depth_path=tmp_path / "depth" / "a.npz")
+    found = load_relative_depth(view, scene)
+    assert found is not None and np.isnan(found[0]).all()
+    assert (found[1:, :16] == 0.25).all() and (found[1:, 16:] == 0.5).all()
+    half = load_relative_depth(view, scene, 2)
+    assert half is not None and half.shape == (12, 16) and half[-1, 0] == 0.25
+    (tmp_path / "depth_relative").mkdir()
+    np.savez(tmp_path / "depth_relative" / "a.npz", inverse_depth=np.full((24, 32), 7.0))
+    assert (load_relative_depth(view, scene) == 7).all()

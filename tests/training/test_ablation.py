@@ -7,8 +7,11 @@ import pytest
 from toy_scene import TINY, make_scene
 
 from climatenerf.errors import UserError
-from climatenerf.field.presets import PRESETS
-from climatenerf.scene import read_scene
+from climatenerf.evaluation.reference import read_reference
+from climatenerf.evaluation.scores import Place
+from climatenerf.field.checkpoint import load_field
+from climatenerf.field.presets import PRESETS, FieldSize
+from climatenerf.scene import load_scene, read_scene
 from climatenerf.training import ablation
 from climatenerf.training import run as run_module
 from climatenerf.training.settings import PAPER, FitSettings, Losses, settings_of
@@ -61,6 +64,14 @@ def test_the_papers_weights_are_the_papers():
     assert (weights.sky, weights.opacity) == (1e-1, 2e-4)
     assert settings_of("paper") is PAPER and settings_of("cpu").losses == Losses()
     assert settings_of("gpu").preset == "gpu"
+
+
+def test_the_papers_heads_sit_on_its_appearance_grid():
+    paper = PRESETS["paper"]
+    assert paper.surface_levels == 0 and FieldSize().surface_levels > 0
+    assert (paper.geometry_levels, paper.geometry_log2_rows) == (16, 19)
+    assert (paper.appearance_levels, paper.appearance_log2_rows) == (32, 21)
+    assert PAPER.preset == "paper" and PAPER.opaque_sky
 
 
 def test_a_finished_row_is_kept_and_one_of_other_settings_refused(tmp_path):
@@ -121,7 +132,8 @@ def test_pictures_of_depth_and_normals():
 @pytest.mark.slow
 def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
     full = FitSettings(minutes=None, steps=250, samples_per_step=2**14)
-    bare = dataclasses.replace(full, losses=dataclasses.replace(full.losses, sky=0.0), carve=False)
+    bare = ablation.rows(1.0)["no sky"]
+    bare = dataclasses.replace(bare, minutes=None, steps=250, samples_per_step=2**14)
     monkeypatch.setattr(ablation, "rows", lambda minutes: {"no sky": bare, "full": full})
     monkeypatch.setattr(ablation, "WEATHERS", ("smog-mid",))
     data = ablation.ablate(
@@ -132,6 +144,23 @@ def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "ablation.json").read_text())["rows"].keys() == rows.keys()
     assert (tmp_path / "ablation.jpg").stat().st_size > 10_000
     assert "smog-mid" in (tmp_path / "ablation.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
+    """Worse than docs/reference-scene.md has after 10 minutes, and better than what is broken."""
+    monkeypatch.undo()  # the preset that users have
+    monkeypatch.setattr(ablation, "WEATHERS", ())
+    scene = read_scene(REFERENCE)
+    settings = FitSettings(minutes=None, steps=700)
+    run_module.fit_scene(scene, tmp_path, settings, 2, False, lambda _: None, lambda *_: None)
+    place = Place(load_field(tmp_path), load_scene(tmp_path), read_reference(REFERENCE))
+    found, _ = ablation.measure_row(place, settings, False)
+    assert found["psnr"] > 25 and found["depth_abs_rel"] < 0.06 and found["miou"] > 0.85
+    assert found["normal_ground_roof_median_deg"] < 8 and found["floater_mass"] < 0.12
+    # What is shown is far smoother than what the density alone would give.
+    assert found["normal_median_deg"] < 0.6 * found["slope_median_deg"] < 30
+    assert found["open_sky"] > 0.95 and found["sky_empty_fraction"] > 0.9
 
 
 def test_what_cannot_be_measured_is_refused_before_the_first_fit(tmp_path, monkeypatch):

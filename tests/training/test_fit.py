@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from toy_fit import begin, labelled, labelled_pixels
 from toy_scene import CAMERA, FIELD, TINY, make_scene, picture
 
 from climatenerf.evaluation.metrics import psnr
@@ -13,19 +14,14 @@ from climatenerf.field.colour_space import decode_srgb, encode_srgb
 from climatenerf.field.extent import find_extent
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
-from climatenerf.render.frame import render_frame
-from climatenerf.render.samples import Samples
 from climatenerf.render.view import camera_rays, render_view
-from climatenerf.render.world import World
 from climatenerf.scene import load_image
-from climatenerf.scene.classes import PERSON, ROAD, SKY, UNKNOWN, VEHICLE
+from climatenerf.scene.classes import ROAD, SKY, VEHICLE
 from climatenerf.training import fit, losses
-from climatenerf.training.carving import Carving
-from climatenerf.training.fit import Fitting, scale_gradient
-from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.fit import Fitting
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.run import load_pixels
-from climatenerf.training.settings import PAPER, FitSettings, Losses
+from climatenerf.training.settings import FitSettings, Losses
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +32,6 @@ def scene(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
     monkeypatch.setitem(PRESETS, "tiny", TINY)
-
-
-def begin(scene, **settings):
-    views = scene.of_split("train")
-    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**15, **settings}
-    extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
-    return Fitting(load_pixels(scene, 1), len(views), extent, FitSettings(**chosen))
 
 
 def heldout_psnr(scene, render):
@@ -102,17 +91,6 @@ def test_reports_count_and_rise_to_the_end(scene):
     assert np.diff(samples).max() < 2.5 * fitting.settings.samples_per_step
 
 
-class Clock:
-    """Half a second passes between two looks at it."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def perf_counter(self):
-        self.now += 0.5
-        return self.now
-
-
 def test_the_time_bound_ends_the_fit_with_the_first_step_beyond_it(scene, monkeypatch):
     monkeypatch.setattr(fit, "time", Clock())
     reports = []
@@ -152,80 +130,6 @@ def test_all_parameters_learn_and_stay_finite(scene):
         assert not torch.equal(parameter, before[name]), name
 
 
-def opacity(fitting):
-    """Mean opacity of a thousand training rays."""
-    batch = fitting.pixels.draw(1000, torch.Generator().manual_seed(0))
-    samples = fitting.field.march(
-        batch.rays_o,
-        batch.rays_d,
-        torch.full((1000,), fitting.field.near),
-        torch.full((1000,), 1e9),
-    )
-    left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)[1]
-    return float((1 - left).mean())
-
-
-def test_pixels_labelled_sky_lose_their_matter(scene):
-    fitting = begin(scene, steps=100, losses=Losses(sky=10.0))
-    fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), SKY, dtype=torch.uint8)
-    fitting = Fitting(fitting.pixels, 20, fitting.extent, fitting.settings)
-    fitting.run(lambda _: None)
-    plain = begin(scene, steps=100)
-    plain.run(lambda _: None)
-    assert opacity(fitting) < 0.2 * opacity(plain), (opacity(fitting), opacity(plain))
-
-
-def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
-    fitting = begin(scene, steps=1, losses=Losses(sky_fill=0.0))
-    fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
-    fitting.pixels.label[0] = SKY  # labels that know of sky
-    fitting = Fitting(fitting.pixels, 20, fitting.extent, fitting.settings)
-    batch = fitting.pixels.draw(200, fitting.generator)
-    batch.label[:] = ROAD
-    fitting.step(batch)
-    sky = {k: p.grad for k, p in fitting.field.named_parameters() if k.startswith("sky_net")}
-    assert all((grad == 0).all() for grad in sky.values())
-    batch.label[:] = SKY
-    fitting.step(batch)
-    assert any((p.grad != 0).any() for p in fitting.field.sky_net)
-    # Nor does haze before it take its colour.
-    assert all((p.grad == 0).all() for p in fitting.field.colour_net)
-
-
-def test_what_nobody_has_labelled_may_be_sky_too(scene):
-    fitting = begin(scene, steps=1, losses=Losses(sky_fill=0.0))
-    fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
-    fitting.pixels.label[0] = SKY
-    fitting = Fitting(fitting.pixels, 20, fitting.extent, fitting.settings)
-    batch = fitting.pixels.draw(200, fitting.generator)
-    batch.label[:] = UNKNOWN
-    fitting.step(batch)
-    assert any((p.grad != 0).any() for p in fitting.field.sky_net)
-
-
-def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
-    """Of a half-opaque pole before the open sky only what others see the sky at is sky."""
-    fitting = begin(scene, steps=1)
-    batch = fitting.pixels.draw(2, fitting.generator)
-    batch.label[:] = torch.tensor([SKY, ROAD], dtype=torch.uint8)
-    t = torch.tensor([1.0, 2.0, 3.0, 4.0, 1.0])
-    samples = Samples(torch.tensor([0, 4, 5]), t, torch.full((5,), 0.1), torch.ones(5))
-    weights = torch.tensor([0.3, 0.2, 0.2, 0.0, 0.9])
-    assert fitting.sky_samples(batch, samples, weights).tolist() == [0, 1, 2]
-
-    class Witness:
-        def agreed(self, x, radius):
-            far = (x - batch.rays_o[0]).norm(dim=-1)
-            return far > 1.5  # the nearest is seen as matter elsewhere
-
-    fitting.pixels.witness = Witness()
-    assert fitting.sky_samples(batch, samples, weights).tolist() == [1, 2]
-    x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
-    cell, _ = fitting.field._cells(fitting.field.to_grid(x[None]))
-    fitting.carving.held.view(-1)[cell] = True  # a sparse point lies by the last
-    assert fitting.sky_samples(batch, samples, weights).tolist() == [1]
-
-
 def test_space_outside_every_picture_stays_empty(scene):
     fitting = begin(scene, steps=40)
     occupancy = fitting.field.occupancy
@@ -238,45 +142,6 @@ def test_space_outside_every_picture_stays_empty(scene):
         if not again:
             occupancy.refine()
             fitting.carving.bar(everywhere=False)
-
-
-def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypatch):
-    fitting = begin(scene, steps=10)
-    fitting.steps = 9  # masks are in use
-    batch = fitting.pixels.draw(4, fitting.generator)
-    batch.label[:], batch.relative = VEHICLE, torch.ones(4)
-    mask = torch.tensor([0.9, 0.1, 0.4, 0.6])
-    monkeypatch.setattr(fitting, "masks", lambda image, place: mask)
-    _, stays = fitting.colour_loss(torch.ones(4), batch)
-    assert stays.label.tolist() == [UNKNOWN, VEHICLE, VEHICLE, UNKNOWN]
-    assert torch.isnan(stays.relative).tolist() == [True, False, False, True]
-    assert (batch.label == VEHICLE).all()
-
-
-def test_a_triple_that_is_masked_in_part_is_none(scene, monkeypatch):
-    fitting = begin(scene, steps=10)
-    fitting.steps = 9
-    batch = fitting.pixels.draw(12, fitting.generator, 3)
-    n, m = batch.rays_o.shape[0], 3
-    batch.in_line[:] = True
-    mask = torch.zeros(n)
-    mask[1], mask[n - 2 * m + 2] = 0.9, 0.9  # a middle, and a side of another
-    monkeypatch.setattr(fitting, "masks", lambda image, place: mask)
-    _, stays = fitting.colour_loss(torch.ones(n), batch)
-    assert stays.in_line.tolist() == [True, False, False]
-
-
-def test_an_opaque_sky_has_its_photos_colour(scene):
-    """The paper's sky is matter: rays labelled sky have to teach it their colour."""
-    pixels = load_pixels(scene, 1)
-    pixels.label = torch.full((len(pixels.rgb),), SKY, dtype=torch.uint8)
-    settings = dataclasses.replace(PAPER, preset="tiny", minutes=None, steps=9)
-    for opaque in (True, False):
-        chosen = dataclasses.replace(settings, opaque_sky=opaque)
-        fitting = Fitting(pixels, 20, begin(scene).extent, chosen)
-        fitting.step(fitting.pixels.draw(64, fitting.generator))
-        slopes = [p.grad.abs().sum() for p in fitting.field.colour_net]
-        assert (sum(slopes) > 0) == opaque
 
 
 def test_a_fit_that_stops_early_does_not_claim_normals(scene):
@@ -346,57 +211,6 @@ def test_rays_below_the_horizon_end_on_matter(scene):
     assert left[1.0] < 0.5 * left[0.0], left
 
 
-# --- losses ---------------------------------------------------------------------------------
-
-
-def test_colour_loss_is_the_error_of_display_values():
-    linear = torch.tensor([[0.21404114, 0.0, 1.0]])
-    assert losses.colour_error(linear, torch.tensor([[0.5, 0.0, 1.0]])) < 1e-10
-    assert losses.colour_error(linear, torch.tensor([[0.2, 0.0, 1.0]])) == pytest.approx(0.03)
-
-
-def test_distances_are_bounded_smooth_and_plain_when_near():
-    t = torch.tensor([0.0, 0.5, 1.0, 2.0, 1e9])
-    measure = losses.distance_measure(t)
-    assert torch.allclose(measure, torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0]))
-
-
-def test_distortion_of_known_weights():
-    offsets = torch.tensor([0, 1, 3])
-    t = torch.tensor([0.5, 0.2, 0.6])
-    dt = torch.tensor([0.1, 0.1, 0.1])
-    weights = torch.tensor([1.0, 0.5, 0.5])
-    one = 0.1 / 3
-    two = 2 * 0.5 * 0.5 * 0.4 + 2 * 0.25 * 0.1 / 3
-    found = losses.distortion_loss(weights, t, dt, offsets)
-    assert found == pytest.approx((one + two) / 2, rel=1e-5)
-    gathered = torch.tensor([1.0, 0.95, 0.05])
-    assert losses.distortion_loss(gathered, t, dt, offsets) < found
-
-
-def test_light_left_below_the_horizon_counts_squared_and_above_not_at_all():
-    left = torch.tensor([0.5, 0.5, 0.0, 1.0], requires_grad=True)
-    below = torch.tensor([True, False, True, True])
-    loss = losses.solid_loss(left, below)
-    assert loss.item() == pytest.approx((0.25 + 0.0 + 0.0 + 1.0) / 4)
-    (gradient,) = torch.autograd.grad(loss, left)
-    assert torch.allclose(gradient, torch.tensor([0.25, 0.0, 0.0, 0.5]))
-
-
-def test_depth_loss_is_the_mean_distance_of_weight_from_the_point():
-    weights = torch.tensor([0.25, 0.5, 0.5], requires_grad=True)
-    left = torch.tensor([0.25, 0.5])
-    t, depth = torch.tensor([0.5, 1.0, 4.0]), torch.tensor([0.75, 2.0])
-    ray = torch.tensor([0, 0, 1])
-    # Bounded: 2 -> 1.5, 4 -> 1.75, infinity -> 2.
-    first = 0.25 * 0.25 + 0.5 * 0.25 + 0.25 * 1.25
-    second = 0.5 * 0.25 + 0.5 * 0.5
-    loss = losses.depth_loss(weights, left, t, depth, ray)
-    assert loss.item() == pytest.approx((first + second) / 2)
-    (gradient,) = torch.autograd.grad(loss, weights)
-    assert torch.allclose(gradient, torch.tensor([0.25, 0.25, 0.25]) / 2)
-
-
 def test_points_put_matter_where_they_are(scene):
     """A hundred points on the box's sides, each shown by the views that look at that side."""
     rng = np.random.default_rng(0)
@@ -429,156 +243,6 @@ def test_points_put_matter_where_they_are(scene):
     assert off["with"] < 0.6 * off["without"], off
 
 
-def labelled(scene):
-    """The scene with points on its ground, and what its pixels show: terrain, building or sky."""
-    labels, ends = [], []
-    for view in scene.of_split("train"):
-        _, layers = render_frame(World(FIELD), CAMERA, scene.c2w_world(view))
-        d = CAMERA.directions() @ scene.c2w_world(view)[:3, :3].T
-        x = scene.c2w_world(view)[:3, 3] + layers["depth"][..., None] * d
-        ground = np.isfinite(layers["depth"]) & (x[..., 2] < 0.02)
-        labels.append(np.where(ground, 9, np.where(np.isfinite(layers["depth"]), 2, 10)))
-        ends.append(x[ground & (layers["depth"] < 6)][::40])
-    views = scene.of_split("train")
-    seen = np.cumsum([0] + [len(each) for each in ends])
-    known = {
-        view.name: replace(view, seen=np.arange(a, b))
-        for view, a, b in zip(views, seen, seen[1:], strict=False)
-    }
-    shown = tuple(known.get(view.name, view) for view in scene.views)
-    return replace(scene, points=np.concatenate(ends), views=shown), labels
-
-
-def labelled_pixels(scene, labels):
-    """The photos as they are now, with labels."""
-    views = scene.of_split("train")
-    return TrainingPixels(
-        [CAMERA],
-        [0] * len(views),
-        np.stack([scene.c2w_world(view) for view in views]),
-        [load_image(view, scene) for view in views],
-        [each.astype(np.uint8) for each in labels],
-    )
-
-
-@pytest.mark.parametrize(("spared", "steps"), [(False, 40), (True, 80)])
-def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spared, steps):
-    """Without points as depth, which would do the same: by the map of the ground alone.
-
-    Once where nothing is spared, and once where all is, but for what the field's own classes say
-    (`test_carving.py` is about what is spared).
-    """
-
-    def everywhere(carving):
-        return torch.full_like(carving.field.occupancy.occupied, spared, dtype=torch.bool)
-
-    monkeypatch.setattr(Carving, "shown_to_stand", everywhere)
-    known, labels = labelled(scene)
-    pixels = labelled_pixels(known, labels)
-    views = known.of_split("train")
-    extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
-    above = {}
-    for weight in (100.0, 0.0):
-        settings = FitSettings(
-            preset="tiny",
-            minutes=None,
-            steps=steps,
-            samples_per_step=2**15,
-            losses=Losses(points=0.0, ground=weight),
-        )
-        fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(known))
-        fitting.run(lambda _: None)
-        batch = pixels.draw(3000, torch.Generator().manual_seed(1))
-        d, o = batch.rays_d[batch.label == 3], batch.rays_o[batch.label == 3]
-        near, far = torch.full((len(d),), fitting.field.near), torch.full((len(d),), 1e9)
-        samples = fitting.field.march(o, d, near, far)
-        weights, _ = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-        ray = samples.ray_index()
-        height = o[ray, 2] + samples.t * d[ray, 2]
-        above[weight] = float((weights * (height > 0.15)).sum() / len(d))
-    assert above[100.0] < 0.5 * above[0.0], above
-
-
-def with_labels(scene, relabel, **settings):
-    """A fit of the labelled scene, with its labels changed, that is past a quarter."""
-    known, labels = labelled(scene)
-    views = known.of_split("train")
-    extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
-    chosen = FitSettings(preset="tiny", minutes=None, steps=1000, **settings)
-    pixels = labelled_pixels(known, [relabel(each) for each in labels])
-    fitting = Fitting(pixels, len(views), extent, chosen, find_point_rays(known))
-    fitting.reached = 0.5
-    return fitting
-
-
-def test_classes_and_normals_move_no_matter(scene, monkeypatch):
-    """Colours' errors are taken away, so that nothing else is left to learn from."""
-    monkeypatch.setattr(losses, "colour_error", lambda linear, _: 0.0 * linear.sum(-1))
-    nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
-    for bend, moves in ((0.0, False), (1.0, True)):
-        weights = Losses(**{**nothing, "classes": 1.0, "normals": 1.0, "bend": bend})
-        fitting = with_labels(scene, np.asarray, losses=weights)
-        field = fitting.field
-        before = {name: value.clone() for name, value in field.named_parameters()}
-        for _ in range(3):
-            fitting.step(fitting.pixels.draw(1024, fitting.generator))
-        moved = {n for n, value in field.named_parameters() if not torch.equal(value, before[n])}
-        assert any(name.startswith("surface_net") for name in moved)
-        assert any(name.startswith("geometry") for name in moved) == moves, moved
-
-
-@pytest.mark.parametrize(("kept", "told"), [((9,), False), ((2,), False), ((2, 9), True)])
-def test_a_single_class_is_not_learned(scene, kept, told):
-    """As the fall-back's labels are, sky and terrain: all else would be called terrain too."""
-    fitting = with_labels(scene, lambda ids: np.where(np.isin(ids, (*kept, 10)), ids, 255))
-    assert fitting.field.knows_classes == told
-
-
-def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypatch):
-    """A network calls the ground a person, but points lie on it."""
-    prices = []
-
-    def recorded(error, mask, price):
-        prices.append(price)
-        return (error + mask).mean()
-
-    monkeypatch.setattr(losses, "masked_colour_loss", recorded)
-    fitting = with_labels(scene, lambda ids: np.where(ids == 9, 11, ids))
-    batch = fitting.pixels.draw(4000, torch.Generator().manual_seed(0))
-    fitting.colour_loss(torch.zeros(4000), batch)
-    person = batch.label == PERSON
-    full = fitting.settings.losses.transient
-    assert torch.isclose(prices[0][~person], torch.tensor(full)).all()
-    still = torch.isclose(prices[0][person], torch.tensor(full))
-    suspected = torch.isclose(prices[0][person], torch.tensor(fit.SUSPECT * full))
-    assert (still | suspected).all() and still.float().mean() > 0.05 and suspected.any()
-    fitting.points = None
-    assert not fitting.cells_of_points(24).any()
-
-
-def test_the_sky_goes_on_where_no_photo_looked(scene):
-    """It begins as noise, which upwards only the fill can take away."""
-    up = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
-    up[:, 2] = 2 * up[:, 2].abs() + 1.0
-    up = torch.nn.functional.normalize(up, dim=-1)
-    off = {}
-    for weight in (Losses.sky_fill, 0.0):
-        fitting = with_labels(scene, np.asarray, losses=Losses(sky_fill=weight))
-        fitting.reached, field = 0.0, fitting.field
-        with torch.no_grad():
-            field.sky_grid.normal_(0.0, 10.0, generator=torch.Generator().manual_seed(0))
-        for _ in range(150):
-            fitting.step(fitting.pixels.draw(512, fitting.generator))
-            fitting.steps += 1
-        batch = fitting.pixels.draw(2000, fitting.generator)
-        seen = decode_srgb(batch.rgb[batch.label == SKY]).mean()
-        with torch.no_grad():
-            shown = field.sky_colour(up, field.mean_embedding.expand(500, -1))
-        ratio = shown.mean(-1) / seen
-        off[weight] = float(((ratio < 0.5) | (ratio > 2.0)).float().mean())
-    assert off[Losses.sky_fill] < 0.5 * off[0.0], off
-
-
 def test_what_rays_meet_is_occupied_from_the_first_step_on(scene, monkeypatch):
     """Nothing else has told the occupancy of density yet: `update_occupancy` is not called here."""
     monkeypatch.setattr(fit, "SEEN_WEIGHT", 1e-4)  # an untrained field is haze
@@ -586,29 +250,6 @@ def test_what_rays_meet_is_occupied_from_the_first_step_on(scene, monkeypatch):
     assert not (fitting.field.occupancy.density > 0).any()
     fitting.step(fitting.pixels.draw(1024, fitting.generator))
     assert (fitting.field.occupancy.density > 0).sum() > 100
-
-
-def test_surfaces_that_no_label_names_are_flattened_less(scene):
-    nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
-    fitting = begin(scene, steps=1000, losses=Losses(**{**nothing, "flat": 1.0}))
-    field, batch = fitting.field, fitting.pixels.draw(900, torch.Generator().manual_seed(0), 150)
-    near, far = torch.full((900,), field.near), torch.full((900,), 1e9)
-    samples = field.march(batch.rays_o, batch.rays_d, near, far)
-    dense = 100 * samples.sigma * samples.dt  # an untrained field is haze; flat is what is solid
-    weights, left = dispatch.render_weights(dense, samples.offsets)
-    t, dt = samples.t / field.unit, samples.dt / field.unit
-    found = {
-        kind: float(
-            fitting.geometry_loss(
-                replace(batch, label=torch.full_like(batch.label, kind)),
-                *(samples, weights, left, t, dt),
-            )
-        )
-        for kind in (UNKNOWN, ROAD, SKY)
-    }
-    assert found[ROAD] > 0 and found[SKY] == 0
-    assert found[UNKNOWN] == pytest.approx(fit.UNSURE_FLAT * found[ROAD], rel=1e-4)
-    assert fit.UNSURE_FLAT < 1
 
 
 def lost_before_surfaces(field, scene):
@@ -733,25 +374,3 @@ def test_switched_off_losses_have_no_part(scene):
         assert torch.equal(parameter, before[name]) == idle, name
     assert all(map(torch.equal, masks, fitting.masks.parameters()))
     assert not fitting.field.knows_normals and not fitting.field.knows_classes
-
-
-def test_opacity_is_pushed_to_none_or_all():
-    left = torch.tensor([0.0, 1.0], requires_grad=True)
-    loss = losses.opacity_loss(left)
-    assert abs(loss.item()) < 2e-5
-    loss.backward()
-    assert torch.isfinite(left.grad).all()
-    half = losses.opacity_loss(torch.tensor([0.5]))
-    assert half == pytest.approx(0.5 * math.log(2))
-
-
-def test_sky_loss_is_the_weight_in_the_sky_over_all_rays():
-    assert losses.sky_loss(torch.tensor([0.5, 0.25]), 3) == pytest.approx(0.25)
-
-
-def test_scaling_a_gradient_leaves_the_value():
-    x = torch.tensor([2.0, -3.0], requires_grad=True)
-    y = scale_gradient(x, torch.tensor([0.25, 1.0]))
-    assert torch.equal(y.detach(), x.detach())
-    y.sum().backward()
-    assert x.grad.tolist() == [0.25, 1.0]

@@ -110,6 +110,20 @@ def test_triples_lie_in_a_line_at_equal_distances_in_one_image():
     assert torch.allclose(batch.rgb[:, 0] * 255, batch.image.float(), atol=1e-3)
 
 
+def test_a_tilted_plane_does_not_bend_along_triples():
+    """By z-depth, which is the ray's length times the cosine of the batch: lengths do bend."""
+    camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
+    image = np.zeros((14, 20, 3), np.uint8)
+    pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image])
+    n, m = 900, 200
+    batch = pixels.draw(n, torch.Generator().manual_seed(0), m)
+    t = 3.0 / (batch.rays_d @ torch.tensor([0.3, -0.5, 0.8]))
+    rows = torch.arange(m) + torch.tensor([[0], [n - 2 * m], [n - m]])
+    z = (t * batch.cosine)[rows][:, batch.in_line]
+    assert losses.bending(z.T).abs().max() < 1e-4
+    assert losses.bending(t[rows][:, batch.in_line].T).abs().max() > 1e-2
+
+
 def test_sky_below_the_horizon_is_none():
     """A level camera whose whole picture is labelled sky: what sinks by 3 degrees is unknown."""
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)

@@ -70,3 +70,20 @@ def test_pictures_and_cameras_are_as_many(count):
 def test_a_picture_of_another_size_is_refused():
     with pytest.raises(ValueError, match="size differs"):
         TrainingPixels(CAMERAS, [0], np.eye(4)[None], [np.zeros((20, 14, 3), np.uint8)])
+
+
+def test_what_a_mask_hides_says_nothing_of_what_is_empty():
+    """A thumb or a mirror that a network takes for the sky: masked, it carves no more."""
+    poses = np.stack([np.eye(4)] * 6)
+    poses[:, 0, 3] = np.arange(6)  # m, side by side, looking the same way
+    images = [np.zeros((14, 20, 3), np.uint8)] * 6
+    labels = [np.full((14, 20), 10, np.uint8)] * 6  # sky, by each
+    masks = [np.ones((14, 20), bool) for _ in range(6)]
+    for mask in masks:
+        mask[:, :12] = False
+    x, radius = torch.tensor([[2.5, -1.0, 40.0]]), torch.tensor([0.01])
+    for given, carved in ((None, True), (masks, False)):
+        pixels = TrainingPixels(CAMERAS, [0] * 6, poses, images, labels, given)
+        assert pixels.witness is not None and pixels.label is not None
+        assert bool(pixels.witness.agreed(x, radius)) == carved
+        assert (pixels.label == UNKNOWN).any() == (not carved)

@@ -20,7 +20,7 @@ def tiny(monkeypatch):
 
 @pytest.mark.slow
 def test_perturbed_poses_come_back(tmp_path):
-    """Cameras turned by some four degrees: a third is found again soon, and only if asked."""
+    """Cameras turned by some four degrees: a quarter is found again soon, and only if asked."""
     scene = make_scene(tmp_path)
     views = scene.of_split("train")
     true = torch.from_numpy(np.stack([scene.c2w_world(v) for v in views])).float()

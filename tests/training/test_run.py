@@ -20,7 +20,7 @@ from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import carving as carving_module
 from climatenerf.training import run as run_module
-from climatenerf.training.run import checkpoint, fit_scene, load_pixels, restore
+from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
 from climatenerf.training.settings import PAPER, FitSettings, Losses
 from climatenerf.training.witness import Witness
 
@@ -99,6 +99,25 @@ def test_a_run_folder_has_everything(toy, tmp_path):
     truth = np.asarray(Image.open(view.path)) / 255
     found = -10 * np.log10(np.mean((picture - truth) ** 2))
     assert found == pytest.approx(on_disk["views"][view.name]["psnr"], abs=1e-3)
+
+
+def test_what_a_mask_hides_does_not_count_in_the_score(toy, tmp_path):
+    scene = toy
+    metrics = fitted(scene, tmp_path / "run", steps=2)
+    field, (view, other, *_) = load_field(tmp_path / "run"), scene.of_split("heldout")
+    truth = np.asarray(Image.open(view.path)) / 255
+    picture = render_view(field, scene.cameras[0], scene.c2w_world(view))
+    mask = np.zeros((36, 48), np.uint8)
+    mask[:, :20] = 255
+    Image.fromarray(mask).save(tmp_path / "half.png")
+    Image.fromarray(0 * mask).save(tmp_path / "none.png")
+    masks = {view.name: tmp_path / "half.png", other.name: tmp_path / "none.png"}
+    views = [dataclasses.replace(v, mask_path=masks.get(v.name)) for v in scene.views]
+    found = evaluate(field, dataclasses.replace(scene, views=tuple(views)), 1, nothing)["views"]
+    wanted = -10 * np.log10(np.mean((picture - truth)[:, :20] ** 2))
+    assert found[view.name]["psnr"] == pytest.approx(wanted, abs=1e-3)
+    assert found[view.name]["ssim"] > metrics["views"][view.name]["ssim"]
+    assert other.name not in found and len(found) == 3
 
 
 def test_nothing_held_out_means_no_quality(scene, tmp_path):

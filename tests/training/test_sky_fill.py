@@ -73,9 +73,21 @@ def test_drawn_directions_are_unseen_ones_with_their_colours():
     assert (drawn[:, None] - colour[3:6, 10:20].reshape(-1, 3)).abs().sum(-1).min(1)[0].max() == 0
 
 
-def test_photos_without_sky_give_none():
-    assert fill_sky(pixels([100, 100], label=0), torch.Generator()) is None
+def test_where_no_label_tells_sky_all_that_is_above_the_horizon_stands_for_it():
     assert MERGED[0] != MERGED[SKY_ID]
+    fill = fill_sky(pixels([100, 100], label=0), torch.Generator())
+    grey = float(decode_srgb(torch.tensor(100 / 255)))
+    assert fill is not None and fill.colour.numpy() == pytest.approx(grey, abs=1e-5)
+    assert 0.3 < fill.unseen.float().mean() < 0.98
+
+
+def test_photos_that_look_down_give_none():
+    low = pixels([100, 100], label=0)
+    low.c2w[:, 2] *= -1  # up is down: the cameras' axes sink by 30 degrees
+    low.c2w[:, :3, 3] = 0
+    batch = low.draw(1000, torch.Generator().manual_seed(0))
+    assert batch.rays_d[:, 2].max() < LOWEST
+    assert fill_sky(low, torch.Generator()) is None
 
 
 def test_spreading_keeps_an_even_sky_even():

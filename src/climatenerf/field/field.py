@@ -262,7 +262,7 @@ class Field(nn.Module):
     def sample_positions(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], samples: Samples
     ) -> Float[Tensor, "s 3"]:
-        """Unit-cube coordinates of samples."""
+        """Unit-cube coordinates of samples on rays in world m."""
         rays = (self.to_grid(rays_o), rays_d)
         return dispatch.positions(rays, samples.offsets, samples.t / self.unit)
 
@@ -316,8 +316,10 @@ class Field(nn.Module):
         samples: Samples,
         which: Bool[Tensor, "s"],
     ) -> None:
-        """Tells the occupancy of density met at some samples: a thin surface fills little of its
-        cells, and looking at random places would miss it again and again."""
+        """Tells the occupancy of density met at some samples of rays (world m).
+
+        A thin surface fills little of its cells; looks at random places miss it again and again.
+        """
         some = which.nonzero()[:, 0]
         ray = samples.ray_index()[some]
         cells, inside = self._cells(self.to_grid(rays_o[ray] + samples.t[some, None] * rays_d[ray]))
@@ -329,7 +331,7 @@ class Field(nn.Module):
     def mark_seen(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], least: float = 0.02
     ) -> None:
-        """Notes the cells that these rays (of training pixels) see: weight above `least`."""
+        """Notes the cells that rays of training pixels (world m) see: weight above `least`."""
         n = rays_o.shape[0]
         samples = self.march(rays_o, rays_d, torch.full((n,), self.near), torch.full((n,), 1e9))
         weights, _ = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)

@@ -47,8 +47,10 @@ class Occupancy(torch.nn.Module):
         """What marching reads: which cells are occupied, and which blocks of cells hold one."""
         return self.occupied, dispatch.occupied_blocks(self.occupied)
 
-    def cell_centres(self, cells: Int[Tensor, "n"]) -> tuple[Tensor, Tensor]:
-        """Centre (grid units) and side of cells given by flat index."""
+    def cell_centres(
+        self, cells: Int[Tensor, "n"]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+        """Centre and side (grid units) of cells given by flat index."""
         side = self.side
         cascade = cells // side**3
         index = torch.stack([cells // side**2 % side, cells // side % side, cells % side], dim=-1)

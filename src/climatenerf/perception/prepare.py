@@ -174,10 +174,10 @@ def _prepare(scene: Scene, source: Source, folder: Path, track: Track, say: Say)
         say(f"{theirs} files in {folder} are not by {source.model}; they stay and are used.")
     if not photos:
         return paths
-    revision, look = source.load()
     licence = None if source.model == SIMPLE else licence_of(source.model)
     if licence and not any(entry["model"] == source.model for entry in entries.values()):
-        say(f"Licence of {source.model}: {licence}")
+        say(f"Licence of {source.model}: {licence}")  # before its weights are fetched
+    revision, look = source.load()
     for view in track(source.kind, [v for v in scene.views if v.name in photos]):
         path = paths[view.name]
         data = source.encode(look(view))

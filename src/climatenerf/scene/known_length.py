@@ -59,7 +59,8 @@ def read_marks(path: Path) -> Marks:
     except FileNotFoundError:
         raise UserError(
             f"{path} does not exist; mark both ends of the length in two pictures or more (open"
-            " mark.html in the scene folder) and save the result there"
+            " mark.html in the scene folder, which capture makes, or write it by hand as"
+            " docs/formats.md says) and save the result there"
         ) from None
     except (OSError, ValueError) as error:
         raise UserError(f"the marks {path} are no readable TOML ({error}); correct them") from None
@@ -84,7 +85,7 @@ def _pixel(value: object, name: str, end: str, path: Path) -> tuple[float, float
 
 
 def measure(scene: Scene, marks: Marks, name: str, known: float) -> Measured:
-    """The marked length in the scene's present metres.
+    """The marked length in the scene's present metres, beside the `known` one in true metres.
 
     Raises:
         UserError: no such marks, a picture that the scene lacks, or rays that do not meet.

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
 from climatenerf.errors import UserError
 from climatenerf.evaluation import geometry
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import (
+    Dry,
     Place,
     Tell,
     check_views,
@@ -29,6 +31,7 @@ from climatenerf.evaluation.scores import (
     weather_views,
 )
 from climatenerf.field.checkpoint import load_field
+from climatenerf.field.field import Field
 from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
 from climatenerf.scene.classes import MERGED, ROAD, TERRAIN
@@ -48,8 +51,10 @@ MEASURED = {
     "depth_abs_rel": "depth",
     "depth_spread": "spread",
     "ground_holes": "holes",
+    "open_sky": "upwards",
     "normal_median_deg": "normals, deg",
     "normal_ground_roof_median_deg": "ground, roofs",
+    "slope_median_deg": "slope, deg",
     "floater_mass": "floaters",
     "sky_empty_fraction": "sky",
     "miou": "mIoU",
@@ -186,6 +191,8 @@ def measure_row(
     scale = frame_scores(place)["scale"]
     scores = picture_scores(clean, [display_8bit(truth.clean) for truth in truths])
     scores |= geometry_scores(place, dry, scale)
+    slopes = geometry.normal_scores([slope_normals(place.fitted, each) for each in dry], truths)
+    scores |= {"slope_median_deg": slopes["normal_median_deg"]}
     if settings.losses.classes:
         scores |= {"miou": label_scores(place)["miou"]}
     ground, holes = 0, 0
@@ -202,6 +209,19 @@ def measure_row(
             scores[kind.name] = picture_scores(seen, real)["psnr"]
             pictures.append(seen[0])
     return scores, pictures if pictured else []
+
+
+def slope_normals(field: Field, dry: Dry) -> Float[np.ndarray, "h w 3"]:
+    """Normals, in camera axes, as the density's own slope has them at the surfaces of a view.
+
+    What weather would have to do with if nothing smoothed them; 0 where there is no surface.
+    """
+    hit = np.isfinite(dry.depth)
+    x = dry.c2w[:3, 3] + dry.depth[hit][:, None] * dry.rays_d[hit]
+    normal = np.zeros(dry.normal.shape)
+    q = field.to_grid(torch.from_numpy(x.astype(np.float32)))
+    normal[hit] = field.density_normal(q).numpy()
+    return normal @ dry.c2w[:3, :3]
 
 
 def depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:

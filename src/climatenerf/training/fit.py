@@ -81,7 +81,7 @@ class Fitting:
             self.pixels = pixels = pixels.without_sky()
         self.knows_sky = pixels.knows_sky
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
-        self.fill = fill_sky(pixels, self.generator) if self.knows_sky else None
+        self.fill = fill_sky(pixels, self.generator)
         self.carving = Carving(self.field, pixels, points, settings)
         kinds = pixels.rgb[:0, 0] if pixels.label is None else pixels.label.unique()
         self.still = self.cells_of_points(images)
@@ -352,7 +352,10 @@ class Fitting:
         weights: Float[Tensor, "s"],
         t: Float[Tensor, "s"],
     ) -> Float[Tensor, ""]:
-        """How far matter on rays labelled ground is from the ground that points show."""
+        """How far matter on rays labelled ground is from the ground that points show.
+
+        `weights` and `t` (grid units) are the samples'; the result is `losses.ground_loss`'s.
+        """
         ray = samples.ray_index()
         heavy = weights.detach() > GROUND_WEIGHT
         some = (on_the_ground(batch.label)[ray] & heavy).nonzero()[:, 0]
@@ -369,7 +372,7 @@ class Fitting:
     def sky_samples(
         self, batch: Batch, samples: Samples, weights: Float[Tensor, "s"]
     ) -> Int[Tensor, "k"]:
-        """Matter on rays labelled sky, where other photos see sky too and no point is known."""
+        """Indices of samples on sky rays, where other photos see sky too and no point is known."""
         ray = samples.ray_index()
         asked = ((batch.label == SKY)[ray] & (weights > LEAST_WEIGHT)).nonzero()[:, 0]
         own = ray[asked]
@@ -385,7 +388,10 @@ class Fitting:
         samples: Samples,
         index: Int[Tensor, "k"],
     ) -> Float[Tensor, ""]:
-        """Classes and normals of some of the rays' samples (those that weigh, `index`)."""
+        """Classes and normals of some of the rays' samples (those that weigh, `index`).
+
+        `u`, `ray` and `share` are their places in the unit cube, rays and detached weights.
+        """
         weigh = self.settings.losses
         if not (weigh.classes or weigh.normals or weigh.bend):
             return u.sum() * 0.0
@@ -411,8 +417,8 @@ class Fitting:
                 loss = loss + weigh.bend * losses.normal_loss(own, bent, normal.detach(), n)
         return loss
 
-    def depth_loss(self, measured: PointRays) -> tuple[Tensor, int]:
-        """How far matter is from the sparse points on their rays; and the samples used."""
+    def depth_loss(self, measured: PointRays) -> tuple[Float[Tensor, ""], int]:
+        """`losses.depth_loss` of rays to sparse points (in grid units); and the samples used."""
         field, n = self.field, measured.depth.shape[0]
         if self.settings.refine_poses:
             rays = (measured.rays_o, measured.rays_d, measured.image)
@@ -439,8 +445,8 @@ class Fitting:
         """Ray length (m) from which matter is believed at present."""
         return max(self.field.near, self.first_near * (1 - self.stage / REFINE_AT))
 
-    def choose(self, weights: Float[Tensor, "s"]) -> tuple[Tensor, Tensor]:
-        """The samples that get colour and gradients, and the chance that each had.
+    def choose(self, weights: Float[Tensor, "s"]) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
+        """Indices of the samples that get colour and gradients, and the chance that each had.
 
         Early on rays cross haze, with hundreds of samples that hardly weigh: about `CHOSEN` a ray
         are drawn in proportion to their weights, each standing for those like it. Where surfaces
@@ -521,7 +527,7 @@ def triples(n: int, m: int) -> Int[Tensor, "3 m"]:
     return torch.stack([torch.arange(m), torch.arange(n - 2 * m, n - m), torch.arange(n - m, n)])
 
 
-def scale_gradient(value: Tensor, factor: Tensor) -> Tensor:
+def scale_gradient(value: Float[Tensor, "*n"], factor: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """The same value, its gradient multiplied by a factor."""
     return value * factor + (value * (1 - factor)).detach()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from climatenerf.errors import UserError
@@ -72,13 +72,13 @@ class TrainingPixels:
         c2w: Float[np.ndarray, "v 4 4"],
         images: Iterable[UInt8[np.ndarray, "h w 3"]],
         labels: Iterable[UInt8[np.ndarray, "h w"] | None] | None = None,
-        masks: Iterable[np.ndarray | None] | None = None,
-        relative: Iterable[np.ndarray | None] | None = None,
+        masks: Iterable[Shaped[np.ndarray, "h w"] | None] | None = None,
+        relative: Iterable[Float[np.ndarray, "h w"] | None] | None = None,
     ):
         """Takes images in the size of their (already downscaled) cameras; c2w in world metres.
 
         Images, labels, masks and depths are taken one at a time, so a generator saves memory.
-        Masks: pixels where a mask is 0 are never drawn.
+        Masks: pixels where a mask is 0 are never drawn, and their labels count as unknown.
         """
         self.c2w = placed(np.asarray(c2w, np.float32))
         self.cameras = [cameras[i] for i in camera_of]
@@ -92,12 +92,20 @@ class TrainingPixels:
         shapes = [(camera.height, camera.width) for camera in self.cameras]
         rgb, _ = in_one_row(shapes, images, np.uint8, 0, channels=3)
         self.rgb = placed(rgb)
+        self.usable, self.share = None, 1.0
+        usable = (None if mask is None else mask > 0 for mask in masks or ())
+        flat, shown = in_one_row(shapes, usable, np.bool_, True)
+        if flat.size:
+            self.usable = placed(flat)
+            self.share = int(flat.sum()) / flat.size
         self.label = None
         self.witness = None
         self.edge = torch.zeros(0, dtype=torch.long)
         known = (None if label is None else MERGED[label] for label in labels or ())
         flat, merged = in_one_row(shapes, known, np.uint8, UNKNOWN)
         for image, own in enumerate(merged):
+            if shown:  # what a mask hides says nothing of what is empty, either
+                own[~shown[image]] = UNKNOWN
             # Networks take puddles and wet walls for the sky that they mirror.
             row, column = np.nonzero(own == SKY)
             place = placed(column), placed(row)
@@ -120,13 +128,6 @@ class TrainingPixels:
         scaled = (None if depth is None else in_units(depth) for depth in relative or ())
         flat, _ = in_one_row(shapes, scaled, np.float16, np.nan)
         self.relative = placed(flat) if flat.size else None
-        self.usable, self.share = None, 1.0
-        usable = (None if mask is None else mask > 0 for mask in masks or ())
-        flat, _ = in_one_row(shapes, usable, np.bool_, True)
-        if flat.size:
-            self.usable = placed(flat)
-            self.share = int(flat.sum()) / flat.size
-            self.edge = self.edge[self.usable[self.edge]]
 
     def without_sky(self) -> "TrainingPixels":
         """The same pixels, with what is labelled sky unknown."""
@@ -262,11 +263,11 @@ class TrainingPixels:
 
 def in_one_row(
     shapes: Sequence[tuple[int, int]],
-    pictures: Iterable[np.ndarray | None],
+    pictures: Iterable[Shaped[np.ndarray, "h w *c"] | None],
     kind: type[np.generic],
     empty: float,
     channels: int | None = None,
-) -> tuple[np.ndarray, list[np.ndarray]]:
+) -> tuple[Shaped[np.ndarray, "p *c"], list[Shaped[np.ndarray, "h w *c"]]]:
     """All pixels of pictures (h, w) in one row, and each picture's part of it; nothing if all lack.
 
     Above `IN_MEMORY` bytes it is a temporary file, of which the system keeps in memory what it can.

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.ops.placing import integers, placed
@@ -29,7 +29,7 @@ class PointRays:
         """The points, world m."""
         return self.rays_o + self.depth[:, None] * self.rays_d
 
-    def some(self, which: Tensor) -> "PointRays":
+    def some(self, which: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "PointRays":
         """Those of the given rows, or of a mask."""
         return PointRays(
             self.rays_o[which], self.rays_d[which], self.depth[which], self.image[which]

@@ -28,12 +28,12 @@ class PoseCorrections(nn.Module):
         return rays_o + unit * self.shift[image], turned
 
     def loss(self) -> Float[Tensor, ""]:
-        """Squared corrections: their mean must not grow."""
+        """Squared corrections (rad, grid units), times `PULL`: their mean must not grow."""
         return PULL * (self.turn.square().sum(-1) + self.shift.square().sum(-1)).mean()
 
     @torch.no_grad()
     def corrected(self, c2w: Float[Tensor, "v 4 4"], unit: float) -> Float[Tensor, "v 4 4"]:
-        """The poses (world m) as they are believed to be."""
+        """The poses (world m) as they are believed to be; `unit`: metres per grid unit."""
         out = c2w.clone()
         out[:, :3, :3] = rotations(self.turn) @ c2w[:, :3, :3]
         out[:, :3, 3] += unit * self.shift

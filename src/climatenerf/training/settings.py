@@ -33,7 +33,8 @@ class Losses:
     normals: float = 4e-2
     """Predicted normals differ from the density's; moves no matter."""
     bend: float = 0.0
-    """The density's normals differ from the predicted ones; moves matter, costs a third more."""
+    """The density's normals differ from the predicted ones: moves matter, costs a third more, and
+    wants normals above 0."""
     transient: float = 0.04
     """Price of a pixel that is taken for transient, in squared display values; 0: none is."""
 

@@ -52,9 +52,15 @@ def direction(row: Float[Tensor, "n"], column: Float[Tensor, "n"]) -> Float[Tens
 
 
 def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | None:
-    """The sky of all photos on a map, and its gaps filled; None if hardly a photo shows sky."""
+    """The sky of all photos on a map, and its gaps filled; None if hardly a photo looks there.
+
+    Where no label tells sky, whatever photos show above the horizon stands for it: indoors, rays
+    that leave through walls that nobody photographed find a wall's light, not night.
+    """
     batch = pixels.draw(LOOKS, generator)
-    sky = (batch.label == SKY) & (batch.rays_d[:, 2] > LOWEST)
+    sky = batch.rays_d[:, 2] > LOWEST
+    if pixels.knows_sky:
+        sky &= batch.label == SKY
     if not bool(sky.any()):
         return None
     d, colour = batch.rays_d[sky], decode_srgb(batch.rgb[sky])

@@ -1,0 +1,85 @@
+"""How much cleaner the air would be if the distance of every surface were known.
+
+python benchmarks/true_depth.py --minutes 4 --downscale 2
+
+Fits the reference street twice: with the sparse points that it has, and with thousands of points a
+photo that lie exactly on what the photo shows. What the second fit still leaves in the air is not
+for want of depth: it is what the field cannot hold, or not learn in the time. Needs
+`pip install ".[street]"`.
+"""
+
+import argparse
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import common
+import numpy as np
+
+from climatenerf.evaluation.reference import read_reference
+from climatenerf.evaluation.scores import Place
+from climatenerf.field.checkpoint import load_field
+from climatenerf.scene import load_scene, read_scene
+from climatenerf.scene.scene import Scene
+from climatenerf.training.ablation import measure_row
+from climatenerf.training.run import fit_scene
+from climatenerf.training.settings import FitSettings
+
+ROOT = Path(__file__).resolve().parents[1]
+REFERENCE = ROOT / "reference" / "street"
+WIDTH, HEIGHT = 768, 432  # of the pixels whose middles are traced
+
+
+def with_true_points(capture: Scene, each: int, seed: int) -> Scene:
+    """The capture with points on the true surfaces, `each` a photo, seen by that photo."""
+    import mitsuba as mi
+
+    sys.path.insert(0, str(ROOT))
+    from street.layout import build_scene
+    from street.render import load, render_view
+    from street.truth import pixel_rays
+
+    random = np.random.default_rng(seed)
+    points, views, count = [], [], 0
+    with tempfile.TemporaryDirectory() as meshes:
+        street = load(build_scene(), Path(meshes), threads=2)
+        asked = mi.load_dict({"type": "aov", "aovs": "t:depth"})
+        for view in capture.of_split("train"):
+            t = render_view(street, view.c2w, WIDTH, HEIGHT, 1, 0, asked)[..., -1]
+            hit = np.flatnonzero(t > 0)  # 0 in the sky
+            some = random.choice(hit, min(each, len(hit)), replace=False)
+            rays = pixel_rays(view.c2w, WIDTH, HEIGHT).reshape(-1, 3)[some]
+            points.append(view.c2w[:3, 3] + t.reshape(-1)[some, None] * rays)
+            views.append(replace(view, seen=np.arange(count, count + len(some))))
+            count += len(some)
+    heldout = (replace(view, seen=None) for view in capture.of_split("heldout"))
+    return replace(capture, points=np.concatenate(points), views=(*views, *heldout))
+
+
+def main() -> None:
+    """Fits with sparse and with true points, and prints the scores of both."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=4.0)
+    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--points", type=int, default=3000, help="true points of each photo")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    settings = FitSettings(minutes=options.minutes, seed=options.seed)
+    capture = read_scene(REFERENCE)
+    truth = with_true_points(capture, options.points, options.seed)
+    found = {}
+    with tempfile.TemporaryDirectory() as work:
+        for name, scene in (("sparse points", capture), ("true points", truth)):
+            run = Path(work) / name
+            fit_scene(
+                scene, run, settings, options.downscale, False, lambda _: None, lambda *_: None
+            )
+            place = Place(load_field(run), load_scene(run), read_reference(REFERENCE))
+            found[name], _ = measure_row(place, settings, False)
+            print(name, found[name], file=sys.stderr)
+    common.report("floaters with sparse and with true points", found, options.seed)
+
+
+if __name__ == "__main__":
+    main()
