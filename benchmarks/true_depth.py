@@ -1,10 +1,10 @@
 """How much cleaner the air would be if the distance of every surface were known.
 
-python benchmarks/true_depth.py --minutes 4 --downscale 2
+python benchmarks/true_depth.py --steps 900 --downscale 2
 
 Fits the reference street twice: with the sparse points that it has, and with thousands of points a
 photo that lie exactly on what the photo shows. What the second fit still leaves in the air is not
-for want of depth: it is what the field cannot hold, or not learn in the time. Needs
+for want of depth: it is what the field cannot hold, or not learn in so many steps. Needs
 `pip install ".[street]"`.
 """
 
@@ -60,12 +60,12 @@ def with_true_points(capture: Scene, each: int, seed: int) -> Scene:
 def main() -> None:
     """Fits with sparse and with true points, and prints the scores of both."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=4.0)
+    parser.add_argument("--steps", type=int, default=900)
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--points", type=int, default=3000, help="true points of each photo")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    settings = FitSettings(minutes=options.minutes, seed=options.seed)
+    settings = FitSettings(minutes=None, steps=options.steps, seed=options.seed)
     capture = read_scene(REFERENCE)
     truth = with_true_points(capture, options.points, options.seed)
     found = {}
