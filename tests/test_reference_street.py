@@ -260,6 +260,11 @@ def test_the_turned_variant_can_be_levelled_and_measured():
     assert np.cbrt(np.linalg.det((scaled.world_from_input @ turn)[:3, :3])) == pytest.approx(
         1.0, abs=0.01
     )
+    # The datum: cameras stand as high above it as above the true ground.
+    heights = {Path(v.name).name: scaled.c2w_world(v)[2, 3] - scaled.ground_z for v in scaled.views}
+    true = {name: pose[2, 3] - ground_datum()[0] for name, pose in camera_poses()}
+    assert len(true) == 64
+    assert max(abs(heights[name] - true[name]) for name in true) < 0.05
 
 
 # From here on with the path tracer.
@@ -430,8 +435,3 @@ def test_the_mirror_shows_what_a_mirrored_camera_sees():
     red_there = (wanted[..., 0] > 1.2 * wanted[..., 2]) & beside
     assert red_there.mean() > 0.02, "the mirrored ball is in the picture"
     assert np.abs(seen - wanted).max(-1)[red_there].mean() < 0.05
-    # The datum: cameras stand as high above it as above the true ground.
-    heights = {Path(v.name).name: scaled.c2w_world(v)[2, 3] - scaled.ground_z for v in scaled.views}
-    true = {name: pose[2, 3] - ground_datum()[0] for name, pose in camera_poses()}
-    assert len(true) == 64
-    assert max(abs(heights[name] - true[name]) for name in true) < 0.05
