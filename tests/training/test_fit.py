@@ -91,6 +91,17 @@ def test_reports_count_and_rise_to_the_end(scene):
     assert np.diff(samples).max() < 2.5 * fitting.settings.samples_per_step
 
 
+class Clock:
+    """Half a second passes between two looks at it."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def perf_counter(self):
+        self.now += 0.5
+        return self.now
+
+
 def test_the_time_bound_ends_the_fit_with_the_first_step_beyond_it(scene, monkeypatch):
     monkeypatch.setattr(fit, "time", Clock())
     reports = []
