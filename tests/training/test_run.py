@@ -10,6 +10,7 @@ from PIL import Image
 from toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf.errors import UserError
+from climatenerf.evaluation.metrics import psnr_cc
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
@@ -116,6 +117,8 @@ def test_what_a_mask_hides_does_not_count_in_the_score(toy, tmp_path):
     found = evaluate(field, dataclasses.replace(scene, views=tuple(views)), 1, nothing)["views"]
     wanted = -10 * np.log10(np.mean((picture - truth)[:, :20] ** 2))
     assert found[view.name]["psnr"] == pytest.approx(wanted, abs=1e-3)
+    corrected = psnr_cc(picture[:, :20], truth[:, :20].astype(np.float32))
+    assert found[view.name]["psnr_cc"] == pytest.approx(corrected, abs=1e-3)
     assert found[view.name]["ssim"] > metrics["views"][view.name]["ssim"]
     assert other.name not in found and len(found) == 3
 

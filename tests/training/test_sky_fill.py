@@ -81,6 +81,16 @@ def test_where_no_label_tells_sky_all_that_is_above_the_horizon_stands_for_it():
     assert 0.3 < fill.unseen.float().mean() < 0.98
 
 
+def test_where_labels_tell_sky_a_house_above_the_horizon_is_none():
+    dark_sky_beside_a_bright_house = [60, 200]
+    labelled = pixels(dark_sky_beside_a_bright_house)
+    own = (labelled.pixel_start[:-1], labelled.pixel_start[1:])
+    labelled.label[own[0][1] : own[1][1]] = MERGED[2]
+    fill = fill_sky(labelled, torch.Generator().manual_seed(0))
+    dark = float(decode_srgb(torch.tensor(60 / 255)))
+    assert fill is not None and fill.colour.numpy() == pytest.approx(dark, abs=1e-5)
+
+
 def test_photos_that_look_down_give_none():
     low = pixels([100, 100], label=0)
     low.c2w[:, 2] *= -1  # up is down: the cameras' axes sink by 30 degrees

@@ -18,7 +18,7 @@ from climatenerf.training.pixels import TrainingPixels
 
 ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of its sine, azimuth
 LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
-LOOKS = 400_000  # pixels that are looked at
+LOOKS = 400_000  # pixels that are looked at, or four times all there are
 LEAST_LOOKS = 3  # of them for a cell to be seen: a single one may be labelled wrongly
 SPREADS = 400  # rounds of spreading, over some 20 cells; what lies farther stays near the mean
 
@@ -57,7 +57,7 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | No
     Where no label tells sky, whatever photos show above the horizon stands for it: indoors, rays
     that leave through walls that nobody photographed find a wall's light, not night.
     """
-    batch = pixels.draw(LOOKS, generator)
+    batch = pixels.draw(min(LOOKS, 4 * pixels.rgb.shape[0]), generator)
     sky = batch.rays_d[:, 2] > LOWEST
     if pixels.knows_sky:
         sky &= batch.label == SKY
