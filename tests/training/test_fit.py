@@ -7,12 +7,11 @@ import pytest
 import torch
 from PIL import Image
 from toy_fit import begin, labelled, labelled_pixels
-from toy_scene import CAMERA, FIELD, TINY, make_scene, picture
+from toy_scene import CAMERA, FIELD, make_scene, picture
 
 from climatenerf.evaluation.metrics import psnr
 from climatenerf.field.colour_space import decode_srgb, encode_srgb
 from climatenerf.field.extent import find_extent
-from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
 from climatenerf.render.view import camera_rays, render_view
 from climatenerf.scene import load_image
@@ -22,16 +21,6 @@ from climatenerf.training.fit import Fitting
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings, Losses
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return make_scene(tmp_path_factory.mktemp("toy"))
-
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
 
 
 def heldout_psnr(scene, render):

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 import torch
 from toy_fit import begin, labelled, labelled_pixels, with_labels
-from toy_scene import TINY, make_scene
 
 from climatenerf.field.colour_space import decode_srgb
 from climatenerf.field.extent import find_extent
-from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
 from climatenerf.render.samples import Samples
 from climatenerf.scene.classes import PERSON, ROAD, SKY, UNKNOWN, VEHICLE
@@ -20,16 +18,6 @@ from climatenerf.training.fit import Fitting
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import PAPER, FitSettings, Losses
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return make_scene(tmp_path_factory.mktemp("toy"))
-
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
 
 
 def opacity(fitting):

@@ -7,24 +7,12 @@ from dataclasses import replace
 import pytest
 import torch
 from toy_fit import begin
-from toy_scene import TINY, make_scene
 
-from climatenerf.field.presets import PRESETS
 from climatenerf.ops import dispatch
 from climatenerf.scene.classes import ROAD, SKY, UNKNOWN
 from climatenerf.training import fit, losses
 from climatenerf.training.fit import scale_gradient
 from climatenerf.training.settings import Losses
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return make_scene(tmp_path_factory.mktemp("toy"))
-
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
 
 
 def test_colour_loss_is_the_error_of_display_values():
