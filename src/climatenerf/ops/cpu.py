@@ -8,6 +8,9 @@ in grid units (see `reference.contract`); rays are packed: the samples of ray r 
 import numpy as np
 from numba import njit, prange
 
+from climatenerf.ops import lanes
+from climatenerf.ops.lanes import LANES
+
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)
 BLOCK = 256  # points per block: a level's working set for them stays in the first-level cache
@@ -41,37 +44,6 @@ def _cell(ux, uy, uz, resolution):
 
 
 @njit(cache=True, fastmath=True, inline="always")
-def _lookup(ux, uy, uz, level, resolution, dense, mask):
-    """Trilinear interpolation of one level's two features at a point of the unit cube."""
-    ix, iy, iz, fx, fy, fz = _cell(ux, uy, uz, resolution)
-    one = np.uint32(1)
-    jx, jy, jz = np.uint32(ix + one), np.uint32(iy + one), np.uint32(iz + one)
-    gx, gy, gz = np.float32(1.0) - fx, np.float32(1.0) - fy, np.float32(1.0) - fz
-    a = _corner(ix, iy, iz, resolution, dense, mask)
-    b = _corner(jx, iy, iz, resolution, dense, mask)
-    c = _corner(ix, jy, iz, resolution, dense, mask)
-    d = _corner(jx, jy, iz, resolution, dense, mask)
-    e = _corner(ix, iy, jz, resolution, dense, mask)
-    f = _corner(jx, iy, jz, resolution, dense, mask)
-    g = _corner(ix, jy, jz, resolution, dense, mask)
-    h = _corner(jx, jy, jz, resolution, dense, mask)
-    w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
-    first = (
-        w00 * (gx * level[a, 0] + fx * level[b, 0])
-        + w10 * (gx * level[c, 0] + fx * level[d, 0])
-        + w01 * (gx * level[e, 0] + fx * level[f, 0])
-        + w11 * (gx * level[g, 0] + fx * level[h, 0])
-    )
-    second = (
-        w00 * (gx * level[a, 1] + fx * level[b, 1])
-        + w10 * (gx * level[c, 1] + fx * level[d, 1])
-        + w01 * (gx * level[e, 1] + fx * level[f, 1])
-        + w11 * (gx * level[g, 1] + fx * level[h, 1])
-    )
-    return first, second
-
-
-@njit(cache=True, fastmath=True, inline="always")
 def _is_dense(resolution, table_size):
     return (resolution + 1) ** 3 <= table_size
 
@@ -80,19 +52,19 @@ def _is_dense(resolution, table_size):
 def hash_encode(u, table, resolutions, out):
     """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n] (feature-major)."""
     n = u.shape[0]
-    levels, size = table.shape[0], table.shape[1]
-    mask = np.uint32(size - 1)
     for block in prange((n + BLOCK - 1) // BLOCK):
-        start = block * BLOCK
-        stop = min(n, start + BLOCK)
-        for level in range(levels):
-            resolution = resolutions[level]
-            dense = _is_dense(resolution, size)
-            rows = table[level]
-            for p in range(start, stop):
-                a, b = _lookup(u[p, 0], u[p, 1], u[p, 2], rows, resolution, dense, mask)
-                out[2 * level, p] = a
-                out[2 * level + 1, p] = b
+        places = np.zeros((3, LANES), np.float32)
+        features = np.empty((2, LANES), np.float32)
+        for level in range(table.shape[0]):
+            for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
+                count = min(LANES, n - start)
+                for k in range(count):
+                    for axis in range(3):
+                        places[axis, k] = u[start + k, axis]
+                lanes.look_up(places, table, level, resolutions[level], features, 0)
+                for k in range(count):
+                    out[2 * level, start + k] = features[0, k]
+                    out[2 * level + 1, start + k] = features[1, k]
 
 
 @njit(cache=True, fastmath=True, parallel=True)
@@ -177,29 +149,26 @@ def hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
 
 
 @njit(cache=True, fastmath=True, inline="always")
-def _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden):
-    """Density (1/grid unit) at one point: contraction, encoding, one hidden layer, exp."""
+def _place(places, thin, k, qx, qy, qz):
+    """Puts a point in grid units into lane k: its place in the unit cube, and what thins it."""
     m = np.sqrt(qx * qx + qy * qy + qz * qz)
     s = np.float32(_contract_scale(m)) * np.float32(0.25)
-    ux = min(max(qx * s + np.float32(0.5), np.float32(0.0)), np.float32(0.999999))
-    uy = min(max(qy * s + np.float32(0.5), np.float32(0.0)), np.float32(0.999999))
-    uz = min(max(qz * s + np.float32(0.5), np.float32(0.0)), np.float32(0.999999))
-    size = table.shape[1]
-    mask = np.uint32(size - 1)
-    width = w1.shape[1]
-    for j in range(width):
-        hidden[j] = b1[j]
-    for level in range(table.shape[0]):
-        resolution = resolutions[level]
-        a, b = _lookup(ux, uy, uz, table[level], resolution, _is_dense(resolution, size), mask)
-        for j in range(width):
-            hidden[j] += a * w1[2 * level, j] + b * w1[2 * level + 1, j]
-    raw = b2
-    for j in range(width):
-        raw += max(hidden[j], np.float32(0.0)) * w2[j]
+    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
+    places[0, k] = min(max(qx * s + half, low), high)
+    places[1, k] = min(max(qy * s + half, low), high)
+    places[2, k] = min(max(qz * s + half, low), high)
     # Per contracted length: distance squared thins it, so far space starts out nearly empty.
-    thin = np.float32(1.0) / max(m * m, np.float32(1.0))
-    return np.exp(min(raw, np.float32(15.0))) * thin
+    thin[k] = np.float32(1.0) / max(m * m, np.float32(1.0))
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma):
+    """Density (1/grid unit) in all lanes: encoding, one hidden layer, exp → sigma [1, LANES]."""
+    for level in range(table.shape[0]):
+        lanes.look_up(places, table, level, resolutions[level], features, 2 * level)
+    lanes.network(features, w1, b1, w2, b2, sigma)
+    for k in range(LANES):
+        sigma[0, k] = np.exp(min(sigma[0, k], np.float32(15.0))) * thin[k]
 
 
 @njit(cache=True, fastmath=True, parallel=True)
@@ -208,9 +177,16 @@ def density_at(q, net, out):
     table, resolutions, w1, b1, w2, b2 = net
     n = q.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
-        hidden = np.empty(w1.shape[1], np.float32)
-        for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
-            out[p] = _density(q[p, 0], q[p, 1], q[p, 2], table, resolutions, w1, b1, w2, b2, hidden)
+        places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        features = np.empty((2 * table.shape[0], LANES), np.float32)
+        sigma = np.empty((1, LANES), np.float32)
+        for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
+            count = min(LANES, n - start)
+            for k in range(count):
+                _place(places, thin, k, q[start + k, 0], q[start + k, 1], q[start + k, 2])
+            _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
+            for k in range(count):
+                out[start + k] = sigma[0, k]
 
 
 @njit(cache=True, parallel=True)
@@ -246,7 +222,8 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
     cells = (occupied [K,G,G,G] uint8, the same for blocks of 2^n cells a side), cascade k covers
     the cube of half side 2^k; steps = (smallest step, step per length);
-    stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
+    stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2), w1
+    [hidden, inputs] (see `lanes.network`).
     rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
     samples one after the other, to be packed. counts [n] receive the samples written per ray.
     """
@@ -261,7 +238,10 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     log_stop = np.float32(-np.log(stop))
     cells_across, block_across = np.float32(side), np.float32(1 << shift)
     for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
-        hidden = np.empty(w1.shape[1], np.float32)
+        places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        features = np.empty((2 * table.shape[0], LANES), np.float32)
+        sigma = np.empty((1, LANES), np.float32)
+        middles, lengths = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
         k = 0
         for r in range(block * RAY_BLOCK, min(n, block * RAY_BLOCK + RAY_BLOCK)):
             ox, oy, oz = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
@@ -283,42 +263,54 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
             tau = np.float32(0.0)
             first = k
             t += spans[r, 2] * max(dt_min, cone * t)
-            while t < end and k - first < capacity and tau < log_stop:
-                dt = min(max(dt_min, cone * t), end - t)
-                tm = t + np.float32(0.5) * dt
-                qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz
-                m = max(abs(qx), abs(qy), abs(qz))
-                cascade = 0
-                half = np.float32(1.0)
-                while m > half and cascade < cascades - 1:
-                    half *= np.float32(2.0)
-                    cascade += 1
-                cell = np.float32(2.0) * half / cells_across
-                ix = min(max(np.int64((qx + half) / cell), 0), side - 1)
-                iy = min(max(np.int64((qy + half) / cell), 0), side - 1)
-                iz = min(max(np.int64((qz + half) / cell), 0), side - 1)
-                # Blocks fit into the nearest cache, cells do not: those are asked first.
-                if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
-                    cell *= block_across
-                    ix, iy, iz = ix >> shift, iy >> shift, iz >> shift
-                elif occupied[cascade, ix, iy, iz]:
-                    sigma = _density(qx, qy, qz, table, resolutions, w1, b1, w2, b2, hidden)
-                    if sigma * dt > np.float32(1e-3):
-                        rows[0, block, k] = tm
-                        rows[1, block, k] = dt
-                        rows[2, block, k] = sigma
-                        tau += sigma * dt
+            while t < end:
+                # The next steps in occupied cells, as many as there are lanes; the ray may end on
+                # the first of them, but together they cost little more than one.
+                count = 0
+                while t < end and count < LANES:
+                    dt = min(max(dt_min, cone * t), end - t)
+                    tm = t + np.float32(0.5) * dt
+                    qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz
+                    m = max(abs(qx), abs(qy), abs(qz))
+                    cascade = 0
+                    half = np.float32(1.0)
+                    while m > half and cascade < cascades - 1:
+                        half *= np.float32(2.0)
+                        cascade += 1
+                    cell = np.float32(2.0) * half / cells_across
+                    ix = min(max(np.int64((qx + half) / cell), 0), side - 1)
+                    iy = min(max(np.int64((qy + half) / cell), 0), side - 1)
+                    iz = min(max(np.int64((qz + half) / cell), 0), side - 1)
+                    # Blocks fit into the nearest cache, cells do not: those are asked first.
+                    if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
+                        cell *= block_across
+                        ix, iy, iz = ix >> shift, iy >> shift, iz >> shift
+                    elif occupied[cascade, ix, iy, iz]:
+                        _place(places, thin, count, qx, qy, qz)
+                        middles[count], lengths[count] = tm, dt
+                        count += 1
+                        t += dt
+                        continue
+                    leave = min(
+                        _cell_exit(ox, ivx, ix, cell, half),
+                        _cell_exit(oy, ivy, iy, cell, half),
+                        _cell_exit(oz, ivz, iz, cell, half),
+                    )
+                    # Whole steps, so that the sampling comb does not depend on the cells crossed.
+                    skip = np.ceil((leave - tm) / dt)
+                    t += dt * max(skip, np.float32(1.0))
+                if count:
+                    _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
+                for i in range(count):
+                    if sigma[0, i] * lengths[i] > np.float32(1e-3):
+                        rows[0, block, k] = middles[i]
+                        rows[1, block, k] = lengths[i]
+                        rows[2, block, k] = sigma[0, i]
+                        tau += sigma[0, i] * lengths[i]
                         k += 1
-                    t += dt
-                    continue
-                leave = min(
-                    _cell_exit(ox, ivx, ix, cell, half),
-                    _cell_exit(oy, ivy, iy, cell, half),
-                    _cell_exit(oz, ivz, iz, cell, half),
-                )
-                # Whole steps, so that the sampling comb does not depend on the cells crossed.
-                skip = np.ceil((leave - tm) / dt)
-                t += dt * max(skip, np.float32(1.0))
+                        if tau >= log_stop or k - first == capacity:
+                            end = np.float32(-1.0)
+                            break
             counts[r] = k - first
 
 

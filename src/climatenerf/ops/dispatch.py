@@ -14,6 +14,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.ops import cpu, cpu_network, reference
+from climatenerf.ops.lanes import UNITS
 
 
 def _kernels(*tensors: Tensor) -> ModuleType | None:
@@ -260,8 +261,12 @@ Cells = tuple[UInt8[Tensor, "k g g g"], UInt8[Tensor, "k b b b"]]
 
 
 def _cpu_net(net: Net) -> tuple:
-    *rest, w2, b2 = net
-    return *map(_array, rest), _array(w2[:, 0]), np.float32(b2[0].item())
+    """The weights turned as `lanes.network` takes them; more hidden units that are 0 if need be."""
+    table, resolutions, w1, b1, w2, b2 = net
+    more = -w1.shape[1] % UNITS
+    units = [torch.nn.functional.pad(w, (0, more)) for w in (w1, b1, w2[:, 0])]
+    first, bias, second = _array(units[0].T), _array(units[1]), _array(units[2])
+    return _array(table), _array(resolutions), first, bias, second, np.float32(b2[0].item())
 
 
 @torch.no_grad()
