@@ -14,6 +14,7 @@ from climatenerf.ops.lanes import LANES
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)
 BLOCK = 256  # points per block: a level's working set for them stays in the first-level cache
+GROUP = 64  # entries of a table that the optimiser looks at together
 RAY_BLOCK = 32  # rays that one thread marches in turn
 
 
@@ -423,19 +424,33 @@ def distortion_backward(weights, s, ds, offsets, grad_out, grad_w):
 
 @njit(cache=True, fastmath=True, parallel=True)
 def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correction1, correction2):
-    """One Adam step over flat arrays that leaves entries without gradient untouched."""
+    """One Adam step over flat arrays that leaves entries without gradient untouched.
+
+    Groups without any are passed over; in the others all entries are computed, without a branch,
+    which vectorises, and those without gradient keep what they had.
+    """
     n = parameter.shape[0]
-    block = 4096
-    for b in prange((n + block - 1) // block):
-        for i in range(b * block, min(n, b * block + block)):
-            g = gradient[i]
-            if g != 0.0:
-                m = beta1 * first[i] + (1.0 - beta1) * g
-                v = beta2 * second[i] + (1.0 - beta2) * g * g
-                first[i] = m
-                second[i] = v
-                parameter[i] -= rate * (m / correction1) / (np.sqrt(v / correction2) + epsilon)
-                gradient[i] = 0.0
+    zero, one = np.float32(0.0), np.float32(1.0)
+    grow1, grow2 = one / correction1, one / correction2
+    for block in prange((n + 4095) // 4096):
+        for start in range(block * 4096, min(n, block * 4096 + 4096), GROUP):
+            stop = min(n, start + GROUP)
+            g = gradient[start:stop]
+            some = zero
+            for i in range(g.shape[0]):
+                some += abs(g[i])
+            if some == zero:
+                continue
+            p, m, v = parameter[start:stop], first[start:stop], second[start:stop]
+            for i in range(g.shape[0]):
+                mean = beta1 * m[i] + (one - beta1) * g[i]
+                square = beta2 * v[i] + (one - beta2) * g[i] * g[i]
+                step = rate * (mean * grow1) / (np.sqrt(square * grow2) + epsilon)
+                given = g[i] != zero
+                m[i] = mean if given else m[i]
+                v[i] = square if given else v[i]
+                p[i] -= step if given else zero
+                g[i] = zero
 
 
 @njit(cache=True, parallel=True)

@@ -56,13 +56,12 @@ class GroundMap:
 
     def over(self, q: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
         """Height of positions over the map, and whether the map is known there."""
-        corner, share = _cells(q)
-        nearest = corner + (share > 0.5)
-        inside = (q[:, :2].abs() < HALF_SIDE).all(-1)
-        height = torch.zeros(q.shape[0])
-        for x, y, weight in _corners(corner, share):
-            height += weight * self.height[y, x]
-        return q[:, 2] - height, inside & self.known[nearest[:, 1], nearest[:, 0]]
+        place = q[:, :2] / HALF_SIDE
+        height = torch.nn.functional.grid_sample(
+            self.height[None, None], place[None, None], padding_mode="border", align_corners=True
+        )[0, 0, 0]
+        x, y = ((place + 1) * ((CELLS - 1) / 2)).round().long().clamp(0, CELLS - 1).unbind(-1)
+        return q[:, 2] - height, (place.abs() < 1).all(-1) & self.known[y, x]
 
 
 def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:

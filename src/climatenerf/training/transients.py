@@ -9,6 +9,7 @@ mask M in [0,1] over it; where M is 1 its colours do not count, at a price. Mini
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 CELLS = (6, 12, 24, 48)  # along each side of an image, of the mask's levels
 HIDDEN = 16
@@ -55,14 +56,17 @@ class TransientMasks(nn.Module):
     ) -> Float[Tensor, "n features"]:
         """Bilinear lookups of every level, side by side."""
         found = []
+        images = self.levels[0].shape[0]
         for level in self.levels:
             side = level.shape[1]
-            p = (place * side - 0.5).clamp(0, side - 1)
-            low = p.long().clamp_max(side - 2)
-            (fx, fy), (x, y) = (p - low).unbind(-1), low.unbind(-1)
-            flat = level.view(-1, FEATURES)
-            at = (image * side + y) * side + x
-            top = flat[at] * (1 - fx)[:, None] + flat[at + 1] * fx[:, None]
-            bottom = flat[at + side] * (1 - fx)[:, None] + flat[at + side + 1] * fx[:, None]
-            found.append(top * (1 - fy)[:, None] + bottom * fy[:, None])
+            x, y = (place * side - 0.5).clamp(0, side - 1).unbind(-1)
+            # All images' cells as one tall picture, one under the other: a place that is kept off
+            # its own image's border takes nothing from the next.
+            picture = level.reshape(images * side, side, FEATURES).permute(2, 0, 1)
+            middle = torch.stack([x + 0.5, y + 0.5 + image * side], dim=-1)
+            size = torch.tensor([side / 2, images * side / 2])
+            looked = F.grid_sample(
+                picture[None], (middle / size - 1)[None, None], align_corners=False
+            )
+            found.append(looked[0, :, 0].T)
         return torch.cat(found, dim=-1)
