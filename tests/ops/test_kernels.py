@@ -108,15 +108,19 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
     assert torch.isfinite(out).all()
 
 
-@pytest.mark.parametrize(("side", "skip", "share"), [(8, 1, 0.3), (32, 8, 0.002), (32, 8, 0.0)])
-def test_marching_matches_the_twin(generator, monkeypatch, side, skip, share):
+@pytest.mark.parametrize(
+    ("side", "skips", "share"),
+    [(8, (1,), 0.3), (32, (8, 4, 1), 0.01), (32, (8, 4, 1), 0.002), (32, (8, 4, 1), 0.0)],
+)
+def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share):
     table, resolutions = grid(generator)
     layers, plain = network(generator, 8, 16)
     occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
+    skip = skips[0]
     occupied[0, -skip:] = 1  # the finest cells at one side, whatever the share
     blocks = occupied.unfold(1, skip, skip).unfold(2, skip, skip).unfold(3, skip, skip)
-    blocks = blocks.amax((-3, -2, -1))
-    assert torch.equal(dispatch.occupied_blocks(occupied), blocks)
+    cells = dispatch.cells_of(occupied)
+    assert torch.equal(cells[1], blocks.amax((-3, -2, -1)))
     n = 60
     o = torch.randn(n, 3, generator=generator)
     d = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
@@ -130,7 +134,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skip, share):
     offsets, found = dispatch.march(
         (o, d),
         torch.stack([near, far, jitter], dim=-1),
-        (occupied, blocks),
+        cells,
         steps,
         1e-3,
         (table, resolutions, *plain),
@@ -146,7 +150,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skip, share):
             steps,
             1e-3,
             lambda q: reference.density(q, table, resolutions, layers),
-            skip,
+            skips,
         )
         own = packed_samples[:, counts[:r].sum() : counts[: r + 1].sum()]
         same = counts[r] == len(twin) and np.allclose(
@@ -167,7 +171,7 @@ def test_a_ray_ends_where_it_is_opaque_and_cells_that_are_empty_give_no_samples(
         occupied = torch.full((2, 8, 8, 8), fill, dtype=torch.uint8)
         span = torch.tensor([[0.0, 1e9, 0.0]])
         offsets, (_, dt, sigma) = dispatch.march(
-            rays, span, (occupied, occupied), (0.01, 0.0), 1e-3, net
+            rays, span, dispatch.cells_of(occupied), (0.01, 0.0), 1e-3, net
         )
         if fill:
             tau = dt * sigma

@@ -37,6 +37,7 @@ class Occupancy(torch.nn.Module):
         # from the photos, so it is not stored.
         barred = torch.zeros(cascades, side, side, side, dtype=torch.bool)
         self.register_buffer("barred", barred, persistent=False)
+        self.packed: tuple[Tensor, int, dispatch.Cells] | None = None
 
     @property
     def side(self) -> int:
@@ -44,8 +45,11 @@ class Occupancy(torch.nn.Module):
         return self.density.shape[1]
 
     def cells(self) -> dispatch.Cells:
-        """What marching reads: which cells are occupied, and which blocks of cells hold one."""
-        return self.occupied, dispatch.occupied_blocks(self.occupied)
+        """What marching reads: `dispatch.cells_of` the occupied ones, anew if they have changed."""
+        state = self.occupied, self.occupied._version
+        if self.packed is None or self.packed[0] is not state[0] or self.packed[1] != state[1]:
+            self.packed = *state, dispatch.cells_of(self.occupied)
+        return self.packed[2]
 
     def cell_centres(
         self, cells: Int[Tensor, "n"]

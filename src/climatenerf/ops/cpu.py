@@ -191,19 +191,31 @@ def density_at(q, net, out):
 
 
 @njit(cache=True, parallel=True)
-def occupied_blocks(words, out):
-    """Whether each block of 8³ cells holds an occupied one: words [K,G,G,G/8] → out [K,B,B,B].
+def pack_cells(occupied, words):
+    """Cells [K,G,G,G] as bits, 4³ of them a word of 64 bits, x fastest: → words [K,W,W,W]."""
+    for slab in prange(words.shape[0] * words.shape[1]):
+        cascade, wx = slab // words.shape[1], slab % words.shape[1]
+        for wy in range(words.shape[2]):
+            words[cascade, wx, wy] = 0
+        for x in range(4 * wx, min(4 * wx + 4, occupied.shape[1])):
+            for y in range(occupied.shape[2]):
+                row, own = words[cascade, wx, y >> 2], occupied[cascade, x, y]
+                bit = np.int64((x & 3) | (y & 3) << 2)
+                for z in range(occupied.shape[3]):
+                    row[z >> 2] |= np.int64(own[z] != 0) << (bit | np.int64((z & 3) << 4))
 
-    A word is eight cells' bytes, as uint64: the occupancy is read before every march.
-    """
+
+@njit(cache=True, parallel=True)
+def occupied_blocks(words, out):
+    """Whether each block of 8³ cells, 2³ words, holds an occupied one: → out [K,B,B,B]."""
     for slab in prange(out.shape[0] * out.shape[1]):
         cascade, x = slab // out.shape[1], slab % out.shape[1]
         for y in range(out.shape[2]):
             for z in range(out.shape[3]):
-                some = np.uint64(0)
-                for ix in range(8 * x, 8 * x + 8):
-                    for iy in range(8 * y, 8 * y + 8):
-                        some |= words[cascade, ix, iy, z]
+                some = np.int64(0)
+                for ix in range(2 * x, 2 * x + 2):
+                    for iy in range(2 * y, 2 * y + 2):
+                        some |= words[cascade, ix, iy, 2 * z] | words[cascade, ix, iy, 2 * z + 1]
                 out[cascade, x, y, z] = some != 0
 
 
@@ -221,23 +233,25 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     """Marches rays front to back through occupied space, evaluating density on the way.
 
     Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
-    cells = (occupied [K,G,G,G] uint8, the same for blocks of 2^n cells a side), cascade k covers
-    the cube of half side 2^k; steps = (smallest step, step per length);
-    stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2), w1
-    [hidden, inputs] (see `lanes.network`).
+    cells = (words [K,W,W,W] of `pack_cells`, whether blocks of 8³ cells hold an occupied one, or of
+    one cell each), cascade k covers the cube of half side 2^k;
+    steps = (smallest step, step per length); stop = transmittance at which a ray ends;
+    net = (table, resolutions, w1, b1, w2, b2), w1 [hidden, inputs] (see `lanes.network`).
     rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
     samples one after the other, to be packed. counts [n] receive the samples written per ray.
     """
     table, resolutions, w1, b1, w2, b2 = net
-    occupied, blocks = cells
+    words, blocks = cells
     n = rays_o.shape[0]
-    cascades, side = occupied.shape[0], occupied.shape[1]
-    shift = int(np.log2(side // blocks.shape[1]))  # >> is quicker than //
+    # In cells; shifts are quicker than divisions. Where blocks are cells words are not skipped.
+    cascades, side = words.shape[0], words.shape[1] << 2
+    shift, word_shift = (3, 2) if blocks.shape[1] == side >> 3 else (0, 0)
+    side = blocks.shape[1] << shift
     capacity = rows.shape[2] // RAY_BLOCK
     far = np.float32(2.0 ** (cascades - 1))
     dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
     log_stop = np.float32(-np.log(stop))
-    cells_across, block_across = np.float32(side), np.float32(1 << shift)
+    half_cells = np.float32(0.5) * np.float32(side)
     for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
         places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
         features = np.empty((2 * table.shape[0], LANES), np.float32)
@@ -274,24 +288,29 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
                     qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz
                     m = max(abs(qx), abs(qy), abs(qz))
                     cascade = 0
-                    half = np.float32(1.0)
+                    half, per_cell = np.float32(1.0), half_cells
                     while m > half and cascade < cascades - 1:
                         half *= np.float32(2.0)
+                        per_cell *= np.float32(0.5)
                         cascade += 1
-                    cell = np.float32(2.0) * half / cells_across
-                    ix = min(max(np.int64((qx + half) / cell), 0), side - 1)
-                    iy = min(max(np.int64((qy + half) / cell), 0), side - 1)
-                    iz = min(max(np.int64((qz + half) / cell), 0), side - 1)
-                    # Blocks fit into the nearest cache, cells do not: those are asked first.
+                    ix = min(max(np.int64((qx + half) * per_cell), 0), side - 1)
+                    iy = min(max(np.int64((qy + half) * per_cell), 0), side - 1)
+                    iz = min(max(np.int64((qz + half) * per_cell), 0), side - 1)
+                    empty = 0  # so many cells along each side, as a power of two
                     if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
-                        cell *= block_across
-                        ix, iy, iz = ix >> shift, iy >> shift, iz >> shift
-                    elif occupied[cascade, ix, iy, iz]:
-                        _place(places, thin, count, qx, qy, qz)
-                        middles[count], lengths[count] = tm, dt
-                        count += 1
-                        t += dt
-                        continue
+                        empty = shift
+                    else:
+                        word = words[cascade, ix >> 2, iy >> 2, iz >> 2]
+                        if word == 0:
+                            empty = word_shift
+                        elif word >> ((ix & 3) | (iy & 3) << 2 | (iz & 3) << 4) & 1:
+                            _place(places, thin, count, qx, qy, qz)
+                            middles[count], lengths[count] = tm, dt
+                            count += 1
+                            t += dt
+                            continue
+                    cell = np.float32(1 << empty) / per_cell
+                    ix, iy, iz = ix >> empty, iy >> empty, iz >> empty
                     leave = min(
                         _cell_exit(ox, ivx, ix, cell, half),
                         _cell_exit(oy, ivy, iy, cell, half),

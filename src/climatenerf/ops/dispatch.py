@@ -19,7 +19,7 @@ from climatenerf.ops.lanes import UNITS
 
 def _kernels(*tensors: Tensor) -> ModuleType | None:
     """The module with the kernels for these tensors; None: the reference takes them."""
-    if not all(t.dtype in (torch.float32, torch.int64) for t in tensors):
+    if not all(t.dtype in (torch.float32, torch.int64, torch.uint8) for t in tensors):
         return None
     devices = {t.device.type for t in tensors}
     if devices == {"cpu"}:
@@ -257,7 +257,8 @@ def merge_order(
 
 Net = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """Table and resolutions of an encoding; w1, b1, w2, b2 of the network of one hidden layer on it."""
-Cells = tuple[UInt8[Tensor, "k g g g"], UInt8[Tensor, "k b b b"]]
+Cells = tuple[Tensor, UInt8[Tensor, "k b b b"]]
+"""What `cells_of` gives."""
 
 
 def _cpu_net(net: Net) -> tuple:
@@ -300,17 +301,26 @@ def positions(
     return u
 
 
-def occupied_blocks(occupied: UInt8[Tensor, "k g g g"]) -> UInt8[Tensor, "k b b b"]:
-    """Whether each block of 8 cells a side holds an occupied one."""
+def cells_of(occupied: UInt8[Tensor, "k g g g"]) -> Cells:
+    """What `march` reads of an occupancy: its cells, and which blocks of 8³ cells hold one.
+
+    On a CPU cells are bits, 4³ of them a number, so that they stay in the nearer caches. Where the
+    side does not allow for blocks (they would reach into the cube of the next finer cascade), they
+    are the cells themselves.
+    """
     cascades, side = occupied.shape[:2]
-    if side % 32:  # a block would reach into the cube of the next finer cascade
-        return occupied
-    blocks = occupied.new_empty(cascades, *3 * (side // 8,))
-    if occupied.is_cuda:
-        split = occupied.view(cascades, side // 8, 8, side // 8, 8, side // 8, 8)
-        return torch.amax(split, dim=(2, 4, 6), out=blocks)
-    cpu.occupied_blocks(_array(occupied).view(np.uint64), _array(blocks))
-    return blocks
+    whole = side % 32 == 0
+    blocks = occupied.new_empty(cascades, *3 * (side // 8,)) if whole else occupied
+    if _kernels(occupied) is not cpu:
+        if whole:
+            split = occupied.view(cascades, side // 8, 8, side // 8, 8, side // 8, 8)
+            torch.amax(split, dim=(2, 4, 6), out=blocks)
+        return occupied, blocks
+    words = occupied.new_empty(cascades, *3 * (-(-side // 4),), dtype=torch.int64)
+    cpu.pack_cells(_array(occupied), _array(words))
+    if whole:
+        cpu.occupied_blocks(_array(words), _array(blocks))
+    return words, blocks
 
 
 @torch.no_grad()
@@ -349,7 +359,7 @@ def march(
     Args:
         rays: origins and unit directions, grid units.
         spans: first and last length of each ray, share of the first step that it begins after.
-        cells: which cells are occupied, and which blocks of cells hold one.
+        cells: which are occupied, by `cells_of`.
         steps: the smallest step and the step per length.
         stop: transmittance at which a ray ends.
         net: of the density.

@@ -132,14 +132,14 @@ def march(
     steps: tuple[float, float],
     stop: float,
     density_at,
-    skip: int = 1,
+    skips: tuple[int, ...] = (1,),
 ) -> list[tuple[float, float, float]]:
     """One ray through occupied space: its samples (t, dt, sigma), front to back.
 
     span = (t_min, t_max, jitter of the first step in [0,1)). A step is max(steps[0], steps[1]·t)
     long; in an empty cell whole steps are skipped until the ray has left it, or has left the
-    block of skip³ cells about it if all of these are empty. Ends where the
-    transmittance falls below `stop`. Cascade k covers the cube of half side 2^k.
+    block of skip³ cells about it if all of these are empty, for the first such of `skips`. Ends
+    where the transmittance falls below `stop`. Cascade k covers the cube of half side 2^k.
     """
     cascades, side = occupied.shape[:2]
     far = 2.0 ** (cascades - 1)
@@ -170,9 +170,11 @@ def march(
                 tau += sigma * dt
             t += dt
         else:
-            x, y, z = (index // skip * skip).tolist()
-            if not occupied[cascade, x : x + skip, y : y + skip, z : z + skip].any():
-                cell, index = cell * skip, index // skip
+            for skip in skips:
+                x, y, z = (index // skip * skip).tolist()
+                if not occupied[cascade, x : x + skip, y : y + skip, z : z + skip].any():
+                    cell, index = cell * skip, index // skip
+                    break
             edge = (index + (ray_d > 0)) * cell - half
             leave = torch.where(ray_d != 0, (edge - ray_o) / ray_d, torch.inf).min().item()
             t += dt * max(-((middle - leave) // dt), 1.0)
