@@ -20,6 +20,7 @@ from climatenerf.field.directions import spherical_harmonics
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops import dispatch, reference
+from climatenerf.ops.vectors import length, unit
 from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import SOLID
 
@@ -276,7 +277,7 @@ class Field(nn.Module):
         raw = self.raw_density(u)
         # 1/|q|^2 outside the core (see `reference.density`), from the contracted radius 2 - 1/|q|.
         # 1e-4: the outermost shell, where rounding could make it negative.
-        shell = (2.0 - (4.0 * u - 2.0).norm(dim=-1)).clamp(1e-4, 1.0)
+        shell = (2.0 - length(4.0 * u - 2.0)).clamp(1e-4, 1.0)
         return raw.clamp_max(15.0).exp() * shell.square()
 
     def density_normal(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -284,16 +285,7 @@ class Field(nn.Module):
 
         Analytic, from the encoding's slopes; 0 where the density does not change.
         """
-        with torch.enable_grad():
-            q = q.detach().requires_grad_()
-            grid = self.geometry_grid.detach()
-            layers = [(w.detach(), b.detach()) for w, b in _pairs(self.geometry_net)]
-            u = reference.contract(q)
-            raw = dispatch.mlp(dispatch.hash_encode(u, grid, self.geometry_resolutions), layers)
-            # Of the density's logarithm: same direction, and no overflow.
-            log_density = raw[:, 0] - q.square().sum(-1).clamp_min(1.0).log()
-            (slope,) = torch.autograd.grad(log_density.sum(), q)
-        return -nn.functional.normalize(slope, dim=-1)
+        return -unit(dispatch.density_slopes(q, self._net()))
 
     def sloped_normal(
         self, q: Float[Tensor, "n 3"], step: Float[Tensor, "n"]
@@ -306,7 +298,7 @@ class Field(nn.Module):
         thinned = flat.square().sum(-1).clamp_min(1.0).log()
         raw = (self.raw_density(reference.contract(flat)) - thinned).view(-1, 4, 1)
         # 1e-6: where the density is even its direction's gradient would be NaN.
-        return -nn.functional.normalize((raw * corners).sum(1), dim=-1, eps=1e-6)
+        return -unit((raw * corners).sum(1), 1e-6)
 
     @torch.no_grad()
     def keep_occupied(
@@ -400,7 +392,7 @@ class Field(nn.Module):
             grid, resolutions = self.appearance_grid, self.appearance_resolutions
         raw = dispatch.mlp(dispatch.hash_encode(u, grid, resolutions), _pairs(self.surface_net))
         # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
-        return nn.functional.normalize(raw[:, :3], dim=-1, eps=1e-6), raw[:, 3:]
+        return unit(raw[:, :3], 1e-6), raw[:, 3:]
 
     def sky_colour(
         self, d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]

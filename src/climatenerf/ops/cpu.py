@@ -112,41 +112,21 @@ def hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
     A trilinear cell's slope along an axis is the difference of its two faces.
     """
     n = u.shape[0]
-    levels, size = table.shape[0], table.shape[1]
-    mask = np.uint32(size - 1)
-    one = np.float32(1.0)
     for block in prange((n + BLOCK - 1) // BLOCK):
-        for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
-            for axis in range(3):
-                grad_u[p, axis] = 0.0
-        for level in range(levels):
-            resolution = resolutions[level]
-            dense = _is_dense(resolution, size)
-            rows = table[level]
-            for p in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
-                ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
-                ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
-                sx, sy, sz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-                for corner in range(8):
-                    dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                    row = _corner(
-                        np.uint32(ix + np.uint32(dx)),
-                        np.uint32(iy + np.uint32(dy)),
-                        np.uint32(iz + np.uint32(dz)),
-                        resolution,
-                        dense,
-                        mask,
-                    )
-                    value = ga * rows[row, 0] + gb * rows[row, 1]
-                    wx = fx if dx else one - fx
-                    wy = fy if dy else one - fy
-                    wz = fz if dz else one - fz
-                    sx += value * wy * wz * (one if dx else -one)
-                    sy += value * wx * wz * (one if dy else -one)
-                    sz += value * wx * wy * (one if dz else -one)
-                grad_u[p, 0] += np.float32(resolution) * sx
-                grad_u[p, 1] += np.float32(resolution) * sy
-                grad_u[p, 2] += np.float32(resolution) * sz
+        places, found = np.zeros((3, LANES), np.float32), np.empty((8, LANES), np.float32)
+        first, last = block * BLOCK, min(n, block * BLOCK + BLOCK)
+        grad_u[first:last] = 0.0
+        for level in range(table.shape[0]):
+            for start in range(first, last, LANES):
+                count = min(LANES, n - start)
+                for k in range(count):
+                    for axis in range(3):
+                        places[axis, k] = u[start + k, axis]
+                lanes.look_up_slopes(places, table, level, resolutions[level], found, 0, 2)
+                for k in range(count):
+                    ga, gb = grad_out[2 * level, start + k], grad_out[2 * level + 1, start + k]
+                    for axis in range(3):
+                        grad_u[start + k, axis] += ga * found[2 + axis, k] + gb * found[5 + axis, k]
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -163,11 +143,24 @@ def _place(places, thin, k, qx, qy, qz):
 
 
 @njit(cache=True, fastmath=True, inline="always")
-def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma):
+def _hidden(features, w1, b1, hidden):
+    """The density's hidden layer before its ReLU: w1 [hidden, features] → hidden [*, LANES]."""
+    for m in range(hidden.shape[0]):
+        hidden[m] = b1[m]
+    lanes.add_product(w1, features, hidden, 1)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, hidden, sigma):
     """Density (1/grid unit) in all lanes: encoding, one hidden layer, exp → sigma [1, LANES]."""
     for level in range(table.shape[0]):
         lanes.look_up(places, table, level, resolutions[level], features, 2 * level)
-    lanes.network(features, w1, b1, w2, b2, sigma)
+    _hidden(features, w1, b1, hidden)
+    for m in range(hidden.shape[0]):
+        for k in range(LANES):
+            hidden[m, k] = max(hidden[m, k], np.float32(0.0))
+    sigma[0] = b2
+    lanes.add_product(w2, hidden, sigma, 1)
     for k in range(LANES):
         sigma[0, k] = np.exp(min(sigma[0, k], np.float32(15.0))) * thin[k]
 
@@ -180,14 +173,63 @@ def density_at(q, net, out):
     for block in prange((n + BLOCK - 1) // BLOCK):
         places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
         features = np.empty((2 * table.shape[0], LANES), np.float32)
-        sigma = np.empty((1, LANES), np.float32)
+        hidden, sigma = np.empty((w1.shape[0], LANES), np.float32), np.empty((1, LANES), np.float32)
         for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
             count = min(LANES, n - start)
             for k in range(count):
                 _place(places, thin, k, q[start + k, 0], q[start + k, 1], q[start + k, 2])
-            _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
+            _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, hidden, sigma)
             for k in range(count):
                 out[start + k] = sigma[0, k]
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def density_slopes(q, net, turned, out):
+    """Gradient of the density's logarithm at q [n,3] in grid units → out [n,3].
+
+    `turned` is w1 the other way round, [features, hidden].
+    """
+    table, resolutions, w1, b1, w2, _ = net
+    n, levels = q.shape[0], table.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        found = np.empty((8 * levels, LANES), np.float32)  # features, and their slopes
+        hidden = np.empty((w1.shape[0], LANES), np.float32)
+        pull, slope = np.empty((2 * levels, LANES), np.float32), np.empty((3, LANES), np.float32)
+        for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
+            count = min(LANES, n - start)
+            for k in range(count):
+                _place(places, thin, k, q[start + k, 0], q[start + k, 1], q[start + k, 2])
+            for level in range(levels):
+                first = 2 * levels + 6 * level
+                resolution = resolutions[level]
+                lanes.look_up_slopes(places, table, level, resolution, found, 2 * level, first)
+            _hidden(found, w1, b1, hidden)
+            for m in range(hidden.shape[0]):
+                for k in range(LANES):
+                    hidden[m, k] = w2[0, m] if hidden[m, k] > 0 else np.float32(0.0)
+            pull[:] = 0.0
+            lanes.add_product(turned, hidden, pull, 1)
+            slope[:] = 0.0
+            for feature in range(2 * levels):
+                first = 2 * levels + 3 * feature
+                for axis in range(3):
+                    for k in range(LANES):
+                        slope[axis, k] += pull[feature, k] * found[first + axis, k]
+            for k in range(count):
+                x, y, z = q[start + k, 0], q[start + k, 1], q[start + k, 2]
+                m2 = x * x + y * y + z * z
+                # The contraction's u = 1/2 + s·q/4; its slope outside the core: s·I + s'/m·q·qᵀ.
+                s, bend, fall = np.float32(1.0), np.float32(0.0), np.float32(0.0)
+                if m2 > 1.0:
+                    m = np.sqrt(m2)
+                    s = np.float32(_contract_scale(m))
+                    bend = np.float32(2.0) * (np.float32(1.0) - m) / (m2 * m2)
+                    fall = np.float32(2.0) / m2  # of the logarithm of 1/m², too
+                along = bend * (slope[0, k] * x + slope[1, k] * y + slope[2, k] * z)
+                out[start + k, 0] = np.float32(0.25) * (s * slope[0, k] + along * x) - fall * x
+                out[start + k, 1] = np.float32(0.25) * (s * slope[1, k] + along * y) - fall * y
+                out[start + k, 2] = np.float32(0.25) * (s * slope[2, k] + along * z) - fall * z
 
 
 @njit(cache=True, parallel=True)
@@ -236,7 +278,7 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     cells = (words [K,W,W,W] of `pack_cells`, whether blocks of 8³ cells hold an occupied one, or of
     one cell each), cascade k covers the cube of half side 2^k;
     steps = (smallest step, step per length); stop = transmittance at which a ray ends;
-    net = (table, resolutions, w1, b1, w2, b2), w1 [hidden, inputs] (see `lanes.network`).
+    net = (table, resolutions, w1 [hidden, features], b1, w2 [1, hidden], b2).
     rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
     samples one after the other, to be packed. counts [n] receive the samples written per ray.
     """
@@ -255,7 +297,7 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
         places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
         features = np.empty((2 * table.shape[0], LANES), np.float32)
-        sigma = np.empty((1, LANES), np.float32)
+        hidden, sigma = np.empty((w1.shape[0], LANES), np.float32), np.empty((1, LANES), np.float32)
         middles, lengths = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
         k = 0
         for r in range(block * RAY_BLOCK, min(n, block * RAY_BLOCK + RAY_BLOCK)):
@@ -320,7 +362,9 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
                     skip = np.ceil((leave - tm) / dt)
                     t += dt * max(skip, np.float32(1.0))
                 if count:
-                    _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
+                    _densities(
+                        places, thin, table, resolutions, w1, b1, w2, b2, features, hidden, sigma
+                    )
                 for i in range(count):
                     if sigma[0, i] * lengths[i] > np.float32(1e-3):
                         rows[0, block, k] = middles[i]

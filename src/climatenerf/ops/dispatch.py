@@ -14,7 +14,6 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.ops import cpu, cpu_network, reference
-from climatenerf.ops.lanes import UNITS
 
 
 def _kernels(*tensors: Tensor) -> ModuleType | None:
@@ -262,12 +261,9 @@ Cells = tuple[Tensor, UInt8[Tensor, "k b b b"]]
 
 
 def _cpu_net(net: Net) -> tuple:
-    """The weights turned as `lanes.network` takes them; more hidden units that are 0 if need be."""
+    """With the weights turned: a unit's lie side by side."""
     table, resolutions, w1, b1, w2, b2 = net
-    more = -w1.shape[1] % UNITS
-    units = [torch.nn.functional.pad(w, (0, more)) for w in (w1, b1, w2[:, 0])]
-    first, bias, second = _array(units[0].T), _array(units[1]), _array(units[2])
-    return _array(table), _array(resolutions), first, bias, second, np.float32(b2[0].item())
+    return *map(_array, (table, resolutions, w1.T, b1, w2.T)), np.float32(b2[0].item())
 
 
 @torch.no_grad()
@@ -283,6 +279,18 @@ def density(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n"]:
     else:
         kernels.density_at(_array(q), tuple(map(_array, net)), _array(out))
     return out
+
+
+def density_slopes(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n 3"]:
+    """See `reference.density_slopes`; q in grid units, no gradient."""
+    kernels = _kernels(q, *net)
+    table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
+    if kernels is cpu:
+        out = torch.empty_like(q, memory_format=torch.contiguous_format)
+        cpu.density_slopes(_array(q), _cpu_net(net), _array(w1), _array(out))
+        return out
+    encode = reference.hash_encode if kernels is None else hash_encode
+    return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)], encode)
 
 
 @torch.no_grad()

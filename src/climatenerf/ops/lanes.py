@@ -1,8 +1,9 @@
-"""Hash lookups and the density's network for `LANES` points at once, in vector registers.
+"""Hash lookups and matrix products for `LANES` points at once, in vector registers.
 
-Numba's compiler does not make vectors of loops that read a table at computed places. So these few
-steps are spelled out in LLVM's vector instructions, which it translates for whatever processor it
-runs on (AVX-512, AVX2, Neon). Values in lanes lie in rows, [what, LANES].
+Numba's compiler does not make vectors of loops that read a table at computed places, and makes
+short ones of products. So these few steps are spelled out in LLVM's vector instructions, which it
+translates for whatever processor it runs on (AVX-512, AVX2, Neon). Values of points lie in rows,
+[what, points], and rows are whole lanes long.
 """
 
 # Numba's stubs do not know what an intrinsic's generator is given.
@@ -10,7 +11,7 @@ runs on (AVX-512, AVX2, Neon). Values in lanes lie in rows, [what, LANES].
 
 from typing import Any
 
-from llvmlite import ir
+from llvmlite import binding, ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -18,11 +19,19 @@ from numba.extending import intrinsic
 LANES = 16
 PRIME_Y = 2654435761
 PRIME_Z = 805459861
-UNITS = 4  # hidden units of the network computed together: a multiple of it is wanted
+UNITS, VECTORS = 4, 2  # rows and vectors of a product that are held in registers
 
 _F, _I, _L = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _FLOATS, _INTS, _LONGS = (ir.VectorType(kind, LANES) for kind in (_F, _I, _L))
 _FAST = ("fast",)  # sums may be reordered and products fused, as in the other kernels
+
+
+def _arrays(context: Any, b: Any, signature: Any, arguments: Any, which: tuple) -> list[Any]:
+    return [context.make_array(signature.args[i])(context, b, arguments[i]) for i in which]
+
+
+def _sides(b: Any, array: Any) -> list[Any]:
+    return cgutils.unpack_tuple(b, array.shape)
 
 
 def _all(b: Any, scalar: Any) -> Any:
@@ -37,18 +46,16 @@ def _same(kind: ir.VectorType, value: float) -> Any:
     return ir.Constant(kind, [value] * LANES)
 
 
-def _row(b: Any, array: Any, row: Any) -> Any:
-    """Address of a row of lanes."""
-    start = b.gep(array, [b.mul(row, _L(LANES))])
-    return b.bitcast(start, _FLOATS.as_pointer())
-
-
-def _load(b: Any, array: Any, row: Any) -> Any:
-    return b.load(_row(b, array, row), align=4)
+def _at(b: Any, data: Any, place: Any) -> Any:
+    """Address of the lanes that begin at a place of an array."""
+    return b.bitcast(b.gep(data, [place]), _FLOATS.as_pointer())
 
 
 def _multiply_add(b: Any, x: Any, y: Any, z: Any) -> Any:
     return b.fadd(b.fmul(x, y, flags=_FAST), z, flags=_FAST)
+
+
+# --- lookups -------------------------------------------------------------------------------------
 
 
 def _pairs(b: Any, table: Any, index: Any) -> tuple[Any, Any]:
@@ -57,35 +64,41 @@ def _pairs(b: Any, table: Any, index: Any) -> tuple[Any, Any]:
     yes = ir.VectorType(ir.IntType(1), LANES)
     start = _all(b, b.ptrtoint(table, _L))
     places = b.inttoptr(b.add(start, b.shl(b.zext(index, _LONGS), _same(_LONGS, 3))), where)
+    given = {where: places, yes: _same(yes, 1), _LONGS: ir.Constant(_LONGS, ir.Undefined)}
+    if binding.llvm_version_info[0] < 22:  # there the alignment is an argument
+        given = {where: places, _I: _I(4), **given}
     gather = cgutils.get_or_insert_function(
         b.module,
-        ir.FunctionType(_LONGS, [where, yes, _LONGS]),
+        ir.FunctionType(_LONGS, list(given)),
         f"llvm.masked.gather.v{LANES}i64.v{LANES}p0",
     )
-    both = b.call(gather, [places, _same(yes, 1), ir.Constant(_LONGS, ir.Undefined)])
+    both = b.call(gather, list(given.values()))
     low, high = b.trunc(both, _INTS), b.trunc(b.lshr(both, _same(_LONGS, 32)), _INTS)
     return b.bitcast(low, _FLOATS), b.bitcast(high, _FLOATS)
 
 
-def _lookup(hashed: bool) -> Any:
-    """Generates the trilinear lookup of a level that is hashed, or fits its table."""
+def _lookup(hashed: bool, sloped: bool) -> Any:
+    """Generates the trilinear lookup of a level that is hashed, or fits its table.
+
+    With `sloped` the first feature's slopes along x, y and z and then the second's go to rows from
+    `slopes` on.
+    """
 
     @intrinsic
-    def lookup(typing_context, places, table, level, resolution, out, row):
-        kinds = (places, table, types.int64, types.int64, out, types.int64)
+    def lookup(typing_context, places, table, level, resolution, out, row, slopes):
+        kinds = (places, table, types.int64, types.int64, out, types.int64, types.int64)
 
         def generate(context, b, signature, arguments):
-            at, table, result = (
-                context.make_array(signature.args[i])(context, b, arguments[i]) for i in (0, 1, 4)
-            )
-            at, result = at.data, result.data
-            size = cgutils.unpack_tuple(b, table.shape, 3)[1]
-            rows = b.gep(table.data, [b.mul(b.mul(arguments[2], size), _L(2))])
-            across, side = arguments[3], b.add(b.trunc(arguments[3], _I), _I(1))
-            scale = _all(b, b.sitofp(across, _F))
+            at, tables, result = _arrays(context, b, signature, arguments, (0, 1, 4))
+            level, resolution, row, slopes = (arguments[i] for i in (2, 3, 5, 6))
+            size = _sides(b, tables)[1]
+            rows = b.gep(tables.data, [b.mul(b.mul(level, size), _L(2))])
+            side = b.add(b.trunc(resolution, _I), _I(1))
+            scale = _all(b, b.sitofp(resolution, _F))
             low, inside = [], []
             for axis in range(3):
-                p = b.fmul(_load(b, at, _L(axis)), scale, flags=_FAST)
+                p = b.load(_at(b, at.data, _L(axis * LANES)), align=4)
+                p = b.fmul(p, scale, flags=_FAST)
                 low.append(b.fptosi(p, _INTS))
                 inside.append(b.fsub(p, b.sitofp(low[-1], _FLOATS), flags=_FAST))
             if hashed:
@@ -97,16 +110,32 @@ def _lookup(hashed: bool) -> Any:
             starts = [b.mul(p, stride) for p, stride in zip(low, strides, strict=True)]
             index = [(s, b.add(s, stride)) for s, stride in zip(starts, strides, strict=True)]
             weight = [(b.fsub(_same(_FLOATS, 1.0), f, flags=_FAST), f) for f in inside]
+            # The slope of the weight along an axis: of the far corner's, and against it.
+            change = b.fneg(scale), scale
             limit = _all(b, b.sub(b.trunc(size, _I), _I(1)))
-            totals = [_same(_FLOATS, 0.0)] * 2
+            totals = [_same(_FLOATS, 0.0)] * (8 if sloped else 2)
             for corner in range(8):
                 x, y, z = corner & 1, corner >> 1 & 1, corner >> 2
                 where = combine(combine(index[1][y], index[2][z]), index[0][x])
-                features = _pairs(b, rows, b.and_(where, limit) if hashed else where)
-                w = b.fmul(b.fmul(weight[1][y], weight[2][z], flags=_FAST), weight[0][x], _FAST)
-                totals = [_multiply_add(b, w, f, t) for f, t in zip(features, totals, strict=True)]
+                pair = _pairs(b, rows, b.and_(where, limit) if hashed else where)
+                own = [weight[0][x], weight[1][y], weight[2][z]]
+                yz = b.fmul(own[1], own[2], flags=_FAST)
+                shares = [b.fmul(yz, own[0], flags=_FAST)]
+                if sloped:
+                    xz = b.fmul(own[0], own[2], flags=_FAST)
+                    xy = b.fmul(own[0], own[1], flags=_FAST)
+                    for rest, far in ((yz, x), (xz, y), (xy, z)):
+                        shares.append(b.fmul(rest, change[far], flags=_FAST))
+                products = [(shares[0], f) for f in pair]
+                products += [(share, f) for f in pair for share in shares[1:]]
+                totals = [
+                    _multiply_add(b, share, f, total)
+                    for (share, f), total in zip(products, totals, strict=True)
+                ]
             for k, total in enumerate(totals):
-                b.store(total, _row(b, result, b.add(arguments[5], _L(k))), align=4)
+                at_row = b.add(row, _L(k)) if k < 2 else b.add(slopes, _L(k - 2))
+                place = b.mul(at_row, _L(LANES))
+                b.store(total, _at(b, result.data, place), align=4)
             return context.get_dummy_value()
 
         return types.void(*kinds), generate
@@ -114,61 +143,155 @@ def _lookup(hashed: bool) -> Any:
     return lookup
 
 
-_lookup_hashed, _lookup_dense = _lookup(True), _lookup(False)
+_hashed, _dense = _lookup(True, False), _lookup(False, False)
+_hashed_sloped, _dense_sloped = _lookup(True, True), _lookup(False, True)
 
 
 @njit(cache=True, fastmath=True, inline="always")
 def look_up(places, table, level, resolution, out, row):
-    """One level's features at places [3, LANES] in the unit cube: table [L, T, 2] → rows of out."""
+    """One level's features: places [3, LANES] in the unit cube, table [L, T, 2] → 2 rows of out."""
     side = resolution + 1
     if side * side * side <= table.shape[1]:
-        _lookup_dense(places, table, level, resolution, out, row)
+        _dense(places, table, level, resolution, out, row, 0)
     else:
-        _lookup_hashed(places, table, level, resolution, out, row)
+        _hashed(places, table, level, resolution, out, row, 0)
 
 
-def _network() -> Any:
-    """Generates `network`, the density's: one hidden layer with ReLU and one output.
+@njit(cache=True, fastmath=True, inline="always")
+def look_up_slopes(places, table, level, resolution, out, row, slopes):
+    """The same; slopes along x, y, z of the first feature, then of the second → 6 rows of out."""
+    side = resolution + 1
+    if side * side * side <= table.shape[1]:
+        _dense_sloped(places, table, level, resolution, out, row, slopes)
+    else:
+        _hashed_sloped(places, table, level, resolution, out, row, slopes)
 
-    features [inputs, LANES], w1 [hidden, inputs], b1 and w2 [hidden], b2 → the first row of out.
-    `hidden` is a multiple of `UNITS`, so that a row of features is loaded once for so many.
+
+# --- products ------------------------------------------------------------------------------------
+
+
+def _blocks(b: Any, count: Any, sizes: tuple[int, ...]) -> Any:
+    """Loops that go through 0..count in steps of the first size, then of the next, for the rest."""
+    start = _L(0)
+    for size in sizes:
+        stop = b.mul(b.udiv(count, _L(size)), _L(size))
+        with cgutils.for_range_slice(b, start, stop, _L(size), intp=_L) as (index, _):
+            yield index, size
+        start = stop
+
+
+def _sums(b: Any, vectors: list[Any]) -> Any:
+    """The sum of each of some vectors, 1, 2 or 4, as a short vector.
+
+    Halves of two vectors are added side by side, so that all sums take little more than one.
     """
+    group, length = LANES, LANES  # lanes that belong to one sum, and in all
+    while len(vectors) > 1:
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors, group = [_folded(b, pair, length, group) for pair in pairs], group // 2
+    own = vectors[0]
+    while group > 1:
+        own, length, group = _folded(b, (own,), length, group), length // 2, group // 2
+    return own
+
+
+def _folded(b: Any, vectors: tuple, length: int, group: int) -> Any:
+    """The first halves of all groups of lanes plus the second, of one or two vectors in a row."""
+    first = [i for i in range(len(vectors) * length) if i % group < group // 2]
+    kind = ir.VectorType(_I, len(first))
+    halves = (
+        b.shuffle_vector(vectors[0], vectors[-1], ir.Constant(kind, [i + shift for i in first]))
+        for shift in (0, group // 2)
+    )
+    return b.fadd(*halves, flags=_FAST)
+
+
+def _add_product() -> Any:
+    """Generates `add_product`: out [m, *] += weight [m, k] @ rows [k, *], for `count` lanes."""
 
     @intrinsic
-    def network(typing_context, features, w1, b1, w2, b2, out):
-
+    def add_product(typing_context, weight, rows, out, count):
         def generate(context, b, signature, arguments):
-            x, first, bias, second, result = (
-                context.make_array(signature.args[i])(context, b, arguments[i]).data
-                for i in (0, 1, 2, 3, 5)
-            )
-            shape = context.make_array(signature.args[1])(context, b, arguments[1]).shape
-            hidden, inputs = cgutils.unpack_tuple(b, shape, 2)
-
-            def number(array: Any, place: Any) -> Any:
-                return _all(b, b.load(b.gep(array, [place])))
-
-            total = cgutils.alloca_once_value(b, _all(b, arguments[4]))
-            units = [cgutils.alloca_once(b, _FLOATS) for _ in range(UNITS)]
-            with cgutils.for_range_slice(b, _L(0), hidden, _L(UNITS), intp=_L) as (unit, _):
-                places = [b.add(unit, _L(k)) for k in range(UNITS)]
-                for own, place in zip(units, places, strict=True):
-                    b.store(number(bias, place), own)
-                with cgutils.for_range(b, inputs, intp=_L) as loop:
-                    row = _load(b, x, loop.index)
-                    for own, place in zip(units, places, strict=True):
-                        w = number(first, b.add(b.mul(place, inputs), loop.index))
-                        b.store(_multiply_add(b, w, row, b.load(own)), own)
-                for own, place in zip(units, places, strict=True):
-                    value, zero = b.load(own), _same(_FLOATS, 0.0)
-                    lit = b.select(b.fcmp_ordered(">", value, zero), value, zero)
-                    b.store(_multiply_add(b, number(second, place), lit, b.load(total)), total)
-            b.store(b.load(total), _row(b, result, _L(0)), align=4)
+            weight, rows, out = _arrays(context, b, signature, arguments, (0, 1, 2))
+            m, k = _sides(b, weight)
+            across, along = _sides(b, rows)[1], _sides(b, out)[1]
+            for unit, units in _blocks(b, m, (UNITS, 1)):
+                for vector, vectors in _blocks(b, arguments[3], (VECTORS, 1)):
+                    block = [(u, v) for u in range(units) for v in range(vectors)]
+                    place = b.mul(vector, _L(LANES))
+                    results, totals = {}, {}
+                    for u, v in block:
+                        start = b.add(b.mul(b.add(unit, _L(u)), along), place)
+                        results[u, v] = _at(b, out.data, b.add(start, _L(v * LANES)))
+                        totals[u, v] = cgutils.alloca_once(b, _FLOATS)
+                        b.store(b.load(results[u, v], align=4), totals[u, v])
+                    with cgutils.for_range(b, k, intp=_L) as loop:
+                        start = b.add(b.mul(loop.index, across), place)
+                        values = [
+                            b.load(_at(b, rows.data, b.add(start, _L(v * LANES))), align=4)
+                            for v in range(vectors)
+                        ]
+                        for u in range(units):
+                            at = b.add(b.mul(b.add(unit, _L(u)), k), loop.index)
+                            w = _all(b, b.load(b.gep(weight.data, [at])))
+                            for v in range(vectors):
+                                total = b.load(totals[u, v])
+                                b.store(_multiply_add(b, w, values[v], total), totals[u, v])
+                    for each in block:
+                        b.store(b.load(totals[each]), results[each], align=4)
             return context.get_dummy_value()
 
-        return types.void(features, w1, b1, w2, types.float32, out), generate
+        return types.void(weight, rows, out, types.int64), generate
 
-    return network
+    return add_product
 
 
-network = _network()
+def _add_outer() -> Any:
+    """Generates `add_outer`: out [a, b] += left [a, *] @ right [b, *]ᵀ, for `count` lanes."""
+
+    @intrinsic
+    def add_outer(typing_context, left, right, out, count):
+        def generate(context, b, signature, arguments):
+            left, right, out = _arrays(context, b, signature, arguments, (0, 1, 2))
+            (m, across), (n, along) = _sides(b, left), _sides(b, right)
+            width = _sides(b, out)[1]
+            for i, rows in _blocks(b, m, (UNITS, 1)):
+                for j, columns in _blocks(b, n, (UNITS, 1)):
+                    block = [(r, c) for r in range(rows) for c in range(columns)]
+                    totals = {}
+                    for each in block:
+                        totals[each] = cgutils.alloca_once(b, _FLOATS)
+                        b.store(_same(_FLOATS, 0.0), totals[each])
+                    with cgutils.for_range(b, arguments[3], intp=_L) as loop:
+                        place = b.mul(loop.index, _L(LANES))
+                        ours, theirs = (
+                            [
+                                b.load(
+                                    _at(b, of.data, b.add(b.mul(b.add(at, _L(r)), long), place)),
+                                    align=4,
+                                )
+                                for r in range(several)
+                            ]
+                            for of, at, long, several in (
+                                (left, i, across, rows),
+                                (right, j, along, columns),
+                            )
+                        )
+                        for r, c in block:
+                            total = b.load(totals[r, c])
+                            b.store(_multiply_add(b, ours[r], theirs[c], total), totals[r, c])
+                    for r in range(rows):
+                        at = b.add(b.mul(b.add(i, _L(r)), width), j)
+                        own = [b.load(totals[r, c]) for c in range(columns)]
+                        sums = _sums(b, own)
+                        place = b.bitcast(b.gep(out.data, [at]), sums.type.as_pointer())
+                        known = b.load(place, align=4)
+                        b.store(b.fadd(known, sums, flags=_FAST), place, align=4)
+            return context.get_dummy_value()
+
+        return types.void(left, right, out, types.int64), generate
+
+    return add_outer
+
+
+add_product, add_outer = _add_product(), _add_outer()

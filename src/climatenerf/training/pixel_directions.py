@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.ops.placing import placed
+from climatenerf.ops.vectors import unit
 from climatenerf.scene.cameras import Camera
 
 SPACING = 4  # pixels
@@ -47,7 +48,7 @@ class Directions:
         upper = (1 - u) * self.lattice[corner] + u * self.lattice[corner + 1]
         below = corner + across
         lower = (1 - u) * self.lattice[below] + u * self.lattice[below + 1]
-        return torch.nn.functional.normalize((1 - v) * upper + v * lower, dim=-1)
+        return unit((1 - v) * upper + v * lower)
 
 
 def _lattice(camera: Camera) -> tuple[Float[np.ndarray, "h w 3"], int]:
