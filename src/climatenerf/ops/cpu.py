@@ -11,9 +11,8 @@ from numba import njit, prange
 from climatenerf.ops import lanes
 from climatenerf.ops.lanes import LANES
 
-PRIME_Y = np.uint32(2654435761)
-PRIME_Z = np.uint32(805459861)
-BLOCK = 256  # points per block: a level's working set for them stays in the first-level cache
+BLOCK = 256  # points that one thread takes at once
+ENCODED = 8192  # the same where it goes level by level: a level's table stays in the nearer caches
 GROUP = 64  # entries of a table that the optimiser looks at together
 RAY_BLOCK = 32  # rays that one thread marches in turn
 
@@ -24,40 +23,15 @@ def _contract_scale(m):
     return 1.0 if m <= 1.0 else (2.0 - 1.0 / m) / m
 
 
-@njit(cache=True, fastmath=True, inline="always")
-def _corner(x, y, z, resolution, dense, mask):
-    """Table row of a lattice corner: direct where the level fits its table, else hashed."""
-    # An unsigned index spares the test whether it counts from the end.
-    if dense:
-        side = np.uint32(resolution + 1)
-        return np.uintp(np.uint32(np.uint32(x + np.uint32(side * y)) + np.uint32(side * side * z)))
-    hashed = np.uint32(x ^ np.uint32(y * PRIME_Y)) ^ np.uint32(z * PRIME_Z)
-    return np.uintp(np.uint32(hashed) & mask)
-
-
-@njit(cache=True, fastmath=True, inline="always")
-def _cell(ux, uy, uz, resolution):
-    """Lattice cell of a point and the place in it; in single precision, unlike int64 * float32."""
-    scale = np.float32(resolution)
-    px, py, pz = ux * scale, uy * scale, uz * scale
-    ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-    return ix, iy, iz, px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
-
-
-@njit(cache=True, fastmath=True, inline="always")
-def _is_dense(resolution, table_size):
-    return (resolution + 1) ** 3 <= table_size
-
-
 @njit(cache=True, fastmath=True, parallel=True)
 def hash_encode(u, table, resolutions, out):
     """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n] (feature-major)."""
     n = u.shape[0]
-    for block in prange((n + BLOCK - 1) // BLOCK):
+    for block in prange((n + ENCODED - 1) // ENCODED):
         places = np.zeros((3, LANES), np.float32)
         features = np.empty((2, LANES), np.float32)
         for level in range(table.shape[0]):
-            for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
+            for start in range(block * ENCODED, min(n, block * ENCODED + ENCODED), LANES):
                 count = min(LANES, n - start)
                 for k in range(count):
                     for axis in range(3):
@@ -75,34 +49,20 @@ def hash_encode_backward(u, grad_out, resolutions, grad_table):
     One thread owns a level, so no two threads write to one row and the sum's order is fixed.
     """
     n = u.shape[0]
-    levels, size = grad_table.shape[0], grad_table.shape[1]
-    mask = np.uint32(size - 1)
-    one = np.uint32(1)
-    for level in prange(levels):
-        resolution = resolutions[level]
-        dense = _is_dense(resolution, size)
-        rows = grad_table[level]
-        for p in range(n):
-            ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
-            if ga == 0.0 and gb == 0.0:
-                continue
-            ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
-            for corner in range(8):
-                dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                wx = fx if dx else np.float32(1.0) - fx
-                wy = fy if dy else np.float32(1.0) - fy
-                wz = fz if dz else np.float32(1.0) - fz
-                row = _corner(
-                    np.uint32(ix + one) if dx else ix,
-                    np.uint32(iy + one) if dy else iy,
-                    np.uint32(iz + one) if dz else iz,
-                    resolution,
-                    dense,
-                    mask,
-                )
-                w = wx * wy * wz
-                rows[row, 0] += w * ga
-                rows[row, 1] += w * gb
+    for level in prange(grad_table.shape[0]):
+        places, grad = np.zeros((3, LANES), np.float32), np.zeros((2, LANES), np.float32)
+        for start in range(0, n, LANES):
+            count = min(LANES, n - start)
+            some = np.float32(0.0)
+            grad[:] = 0.0
+            for k in range(count):
+                for axis in range(3):
+                    places[axis, k] = u[start + k, axis]
+                for feature in range(2):
+                    grad[feature, k] = grad_out[2 * level + feature, start + k]
+                    some += abs(grad[feature, k])
+            if some != np.float32(0.0):
+                lanes.spread(places, grad, grad_table, level, resolutions[level])
 
 
 @njit(cache=True, fastmath=True, parallel=True)
@@ -143,24 +103,11 @@ def _place(places, thin, k, qx, qy, qz):
 
 
 @njit(cache=True, fastmath=True, inline="always")
-def _hidden(features, w1, b1, hidden):
-    """The density's hidden layer before its ReLU: w1 [hidden, features] → hidden [*, LANES]."""
-    for m in range(hidden.shape[0]):
-        hidden[m] = b1[m]
-    lanes.add_product(w1, features, hidden, 1)
-
-
-@njit(cache=True, fastmath=True, inline="always")
-def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, hidden, sigma):
+def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma):
     """Density (1/grid unit) in all lanes: encoding, one hidden layer, exp → sigma [1, LANES]."""
     for level in range(table.shape[0]):
         lanes.look_up(places, table, level, resolutions[level], features, 2 * level)
-    _hidden(features, w1, b1, hidden)
-    for m in range(hidden.shape[0]):
-        for k in range(LANES):
-            hidden[m, k] = max(hidden[m, k], np.float32(0.0))
-    sigma[0] = b2
-    lanes.add_product(w2, hidden, sigma, 1)
+    lanes.network(features, w1, b1, w2, b2, sigma)
     for k in range(LANES):
         sigma[0, k] = np.exp(min(sigma[0, k], np.float32(15.0))) * thin[k]
 
@@ -173,12 +120,12 @@ def density_at(q, net, out):
     for block in prange((n + BLOCK - 1) // BLOCK):
         places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
         features = np.empty((2 * table.shape[0], LANES), np.float32)
-        hidden, sigma = np.empty((w1.shape[0], LANES), np.float32), np.empty((1, LANES), np.float32)
+        sigma = np.empty((1, LANES), np.float32)
         for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
             count = min(LANES, n - start)
             for k in range(count):
                 _place(places, thin, k, q[start + k, 0], q[start + k, 1], q[start + k, 2])
-            _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, hidden, sigma)
+            _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
             for k in range(count):
                 out[start + k] = sigma[0, k]
 
@@ -204,7 +151,9 @@ def density_slopes(q, net, turned, out):
                 first = 2 * levels + 6 * level
                 resolution = resolutions[level]
                 lanes.look_up_slopes(places, table, level, resolution, found, 2 * level, first)
-            _hidden(found, w1, b1, hidden)
+            for m in range(hidden.shape[0]):
+                hidden[m] = b1[m]
+            lanes.add_product(w1, found, hidden, 1)
             for m in range(hidden.shape[0]):
                 for k in range(LANES):
                     hidden[m, k] = w2[0, m] if hidden[m, k] > 0 else np.float32(0.0)
@@ -297,7 +246,7 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
         places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
         features = np.empty((2 * table.shape[0], LANES), np.float32)
-        hidden, sigma = np.empty((w1.shape[0], LANES), np.float32), np.empty((1, LANES), np.float32)
+        sigma = np.empty((1, LANES), np.float32)
         middles, lengths = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
         k = 0
         for r in range(block * RAY_BLOCK, min(n, block * RAY_BLOCK + RAY_BLOCK)):
@@ -362,9 +311,7 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
                     skip = np.ceil((leave - tm) / dt)
                     t += dt * max(skip, np.float32(1.0))
                 if count:
-                    _densities(
-                        places, thin, table, resolutions, w1, b1, w2, b2, features, hidden, sigma
-                    )
+                    _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
                 for i in range(count):
                     if sigma[0, i] * lengths[i] > np.float32(1e-3):
                         rows[0, block, k] = middles[i]

@@ -77,6 +77,40 @@ def _pairs(b: Any, table: Any, index: Any) -> tuple[Any, Any]:
     return b.bitcast(low, _FLOATS), b.bitcast(high, _FLOATS)
 
 
+class _Cells:
+    """The lattice cells of one level in which points lie: code that computes them."""
+
+    def __init__(self, b: Any, places: Any, table: Any, level: Any, resolution: Any, hashed: bool):
+        size = _sides(b, table)[1]
+        self.rows = b.gep(table.data, [b.mul(b.mul(level, size), _L(2))])
+        side = b.add(b.trunc(resolution, _I), _I(1))
+        self.scale = _all(b, b.sitofp(resolution, _F))
+        low, inside = [], []
+        for axis in range(3):
+            p = b.load(_at(b, places.data, _L(axis * LANES)), align=4)
+            p = b.fmul(p, self.scale, flags=_FAST)
+            low.append(b.fptosi(p, _INTS))
+            inside.append(b.fsub(p, b.sitofp(low[-1], _FLOATS), flags=_FAST))
+        if hashed:
+            strides = [_same(_INTS, 1), _same(_INTS, PRIME_Y), _same(_INTS, PRIME_Z)]
+        else:
+            strides = [_same(_INTS, 1), _all(b, side), _all(b, b.mul(side, side))]
+        starts = [b.mul(p, stride) for p, stride in zip(low, strides, strict=True)]
+        self.index = [(s, b.add(s, stride)) for s, stride in zip(starts, strides, strict=True)]
+        self.weight = [(b.fsub(_same(_FLOATS, 1.0), f, flags=_FAST), f) for f in inside]
+        self.limit = _all(b, b.sub(b.trunc(size, _I), _I(1)))
+        self.combine = b.xor if hashed else b.add
+        self.hashed = hashed
+
+    def row(self, b: Any, x: int, y: int, z: int) -> Any:
+        """The table's row of the corner on the far (1) or near (0) side along each axis."""
+        row = self.combine(self.combine(self.index[1][y], self.index[2][z]), self.index[0][x])
+        return b.and_(row, self.limit) if self.hashed else row
+
+
+CORNERS = [(corner & 1, corner >> 1 & 1, corner >> 2) for corner in range(8)]
+
+
 def _lookup(hashed: bool, sloped: bool) -> Any:
     """Generates the trilinear lookup of a level that is hashed, or fits its table.
 
@@ -91,34 +125,13 @@ def _lookup(hashed: bool, sloped: bool) -> Any:
         def generate(context, b, signature, arguments):
             at, tables, result = _arrays(context, b, signature, arguments, (0, 1, 4))
             level, resolution, row, slopes = (arguments[i] for i in (2, 3, 5, 6))
-            size = _sides(b, tables)[1]
-            rows = b.gep(tables.data, [b.mul(b.mul(level, size), _L(2))])
-            side = b.add(b.trunc(resolution, _I), _I(1))
-            scale = _all(b, b.sitofp(resolution, _F))
-            low, inside = [], []
-            for axis in range(3):
-                p = b.load(_at(b, at.data, _L(axis * LANES)), align=4)
-                p = b.fmul(p, scale, flags=_FAST)
-                low.append(b.fptosi(p, _INTS))
-                inside.append(b.fsub(p, b.sitofp(low[-1], _FLOATS), flags=_FAST))
-            if hashed:
-                strides = [_same(_INTS, 1), _same(_INTS, PRIME_Y), _same(_INTS, PRIME_Z)]
-                combine = b.xor
-            else:
-                strides = [_same(_INTS, 1), _all(b, side), _all(b, b.mul(side, side))]
-                combine = b.add
-            starts = [b.mul(p, stride) for p, stride in zip(low, strides, strict=True)]
-            index = [(s, b.add(s, stride)) for s, stride in zip(starts, strides, strict=True)]
-            weight = [(b.fsub(_same(_FLOATS, 1.0), f, flags=_FAST), f) for f in inside]
+            cells = _Cells(b, at, tables, level, resolution, hashed)
             # The slope of the weight along an axis: of the far corner's, and against it.
-            change = b.fneg(scale), scale
-            limit = _all(b, b.sub(b.trunc(size, _I), _I(1)))
+            change = b.fneg(cells.scale), cells.scale
             totals = [_same(_FLOATS, 0.0)] * (8 if sloped else 2)
-            for corner in range(8):
-                x, y, z = corner & 1, corner >> 1 & 1, corner >> 2
-                where = combine(combine(index[1][y], index[2][z]), index[0][x])
-                pair = _pairs(b, rows, b.and_(where, limit) if hashed else where)
-                own = [weight[0][x], weight[1][y], weight[2][z]]
+            for x, y, z in CORNERS:
+                pair = _pairs(b, cells.rows, cells.row(b, x, y, z))
+                own = [cells.weight[0][x], cells.weight[1][y], cells.weight[2][z]]
                 yz = b.fmul(own[1], own[2], flags=_FAST)
                 shares = [b.fmul(yz, own[0], flags=_FAST)]
                 if sloped:
@@ -143,8 +156,44 @@ def _lookup(hashed: bool, sloped: bool) -> Any:
     return lookup
 
 
+def _spreading(hashed: bool) -> Any:
+    """Generates what adds a gradient to the rows that a lookup has read."""
+    pair = ir.VectorType(_F, 2)
+
+    @intrinsic
+    def spread(typing_context, places, grad, table, level, resolution):
+        def generate(context, b, signature, arguments):
+            at, given, tables = _arrays(context, b, signature, arguments, (0, 1, 2))
+            cells = _Cells(b, at, tables, arguments[3], arguments[4], hashed)
+            ours = [b.load(_at(b, given.data, _L(k * LANES)), align=4) for k in (0, 1)]
+            # Lanes may share a row, so they add one after the other, from a list.
+            rows = cgutils.alloca_once(b, _INTS, size=8)
+            sums = cgutils.alloca_once(b, _FLOATS, size=16)
+            for corner, (x, y, z) in enumerate(CORNERS):
+                yz = b.fmul(cells.weight[1][y], cells.weight[2][z], flags=_FAST)
+                share = b.fmul(yz, cells.weight[0][x], flags=_FAST)
+                first, second = (b.fmul(share, g, flags=_FAST) for g in ours)
+                b.store(cells.row(b, x, y, z), b.gep(rows, [_L(corner)]))
+                for half in (0, 1):
+                    mixed = [i // 2 + i % 2 * LANES + half * LANES // 2 for i in range(LANES)]
+                    both = b.shuffle_vector(first, second, ir.Constant(_INTS, mixed))
+                    b.store(both, b.gep(sums, [_L(2 * corner + half)]))
+            rows, sums = b.bitcast(rows, _I.as_pointer()), b.bitcast(sums, pair.as_pointer())
+            with cgutils.for_range(b, _L(8 * LANES), intp=_L) as loop:
+                row = b.zext(b.load(b.gep(rows, [loop.index])), _L)
+                place = b.bitcast(b.gep(cells.rows, [b.shl(row, _L(1))]), pair.as_pointer())
+                own = b.load(b.gep(sums, [loop.index]))
+                b.store(b.fadd(b.load(place, align=4), own), place, align=4)
+            return context.get_dummy_value()
+
+        return types.void(places, grad, table, types.int64, types.int64), generate
+
+    return spread
+
+
 _hashed, _dense = _lookup(True, False), _lookup(False, False)
 _hashed_sloped, _dense_sloped = _lookup(True, True), _lookup(False, True)
+_spread_hashed, _spread_dense = _spreading(True), _spreading(False)
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -165,6 +214,16 @@ def look_up_slopes(places, table, level, resolution, out, row, slopes):
         _dense_sloped(places, table, level, resolution, out, row, slopes)
     else:
         _hashed_sloped(places, table, level, resolution, out, row, slopes)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def spread(places, grad, table, level, resolution):
+    """Adds grad [2, LANES] of one level's features to the rows of table that they come from."""
+    side = resolution + 1
+    if side * side * side <= table.shape[1]:
+        _spread_dense(places, grad, table, level, resolution)
+    else:
+        _spread_hashed(places, grad, table, level, resolution)
 
 
 # --- products ------------------------------------------------------------------------------------
@@ -294,4 +353,42 @@ def _add_outer() -> Any:
     return add_outer
 
 
-add_product, add_outer = _add_product(), _add_outer()
+def _network() -> Any:
+    """Generates `network`, the density's, for LANES points: one hidden layer with ReLU, one output.
+
+    features [inputs, LANES], w1 [hidden, inputs], b1 [hidden], w2 [1, hidden], b2 → out [1, LANES].
+    The hidden layer never leaves the registers.
+    """
+
+    @intrinsic
+    def network(typing_context, features, w1, b1, w2, b2, out):
+        def generate(context, b, signature, arguments):
+            given = _arrays(context, b, signature, arguments, (0, 1, 2, 3, 5))
+            hidden, inputs = _sides(b, given[1])
+            x, first, bias, second, out = (each.data for each in given)
+            total = cgutils.alloca_once_value(b, _all(b, arguments[4]))
+
+            def number(data: Any, place: Any) -> Any:
+                return _all(b, b.load(b.gep(data, [place])))
+
+            for unit, units in _blocks(b, hidden, (UNITS, 1)):
+                places = [b.add(unit, _L(u)) for u in range(units)]
+                sums = [cgutils.alloca_once_value(b, number(bias, place)) for place in places]
+                with cgutils.for_range(b, inputs, intp=_L) as loop:
+                    row = b.load(_at(b, x, b.mul(loop.index, _L(LANES))), align=4)
+                    for own, place in zip(sums, places, strict=True):
+                        w = number(first, b.add(b.mul(place, inputs), loop.index))
+                        b.store(_multiply_add(b, w, row, b.load(own)), own)
+                for own, place in zip(sums, places, strict=True):
+                    value, zero = b.load(own), _same(_FLOATS, 0.0)
+                    lit = b.select(b.fcmp_ordered(">", value, zero), value, zero)
+                    b.store(_multiply_add(b, number(second, place), lit, b.load(total)), total)
+            b.store(b.load(total), _at(b, out, _L(0)), align=4)
+            return context.get_dummy_value()
+
+        return types.void(features, w1, b1, w2, types.float32, out), generate
+
+    return network
+
+
+add_product, add_outer, network = _add_product(), _add_outer(), _network()
