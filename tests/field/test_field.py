@@ -18,7 +18,8 @@ def test_density_is_zero_where_unoccupied_and_the_networks_elsewhere():
     assert 0.1 < occupied.float().mean() < 0.5
     assert (density[~occupied] == 0).all()
     expected = field.grid_density(field.to_grid(x[occupied])) / field.unit
-    assert torch.equal(density[occupied], expected) and (density[occupied] > 0).all()
+    # Other neighbours in a vector may be rounded in another order.
+    assert torch.allclose(density[occupied], expected, rtol=1e-5) and (density[occupied] > 0).all()
     lower, upper = field.bounds
     outside = torch.stack([upper + 0.01, lower - 0.01, field.centre + torch.tensor([0, 0, 11.0])])
     field.occupancy.occupied.fill_(1)

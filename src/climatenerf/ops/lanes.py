@@ -23,6 +23,7 @@ UNITS, VECTORS = 4, 2  # rows and vectors of a product that are held in register
 
 _F, _I, _L = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _FLOATS, _INTS, _LONGS = (ir.VectorType(kind, LANES) for kind in (_F, _I, _L))
+_WHERE = ir.VectorType(ir.PointerType(), LANES)
 _FAST = ("fast",)  # sums may be reordered and products fused, as in the other kernels
 
 
@@ -60,13 +61,12 @@ def _multiply_add(b: Any, x: Any, y: Any, z: Any) -> Any:
 
 def _pairs(b: Any, table: Any, index: Any) -> tuple[Any, Any]:
     """Both features of some rows of a table [rows, 2]: read as one number of 64 bits each."""
-    where = ir.VectorType(ir.PointerType(), LANES)
     yes = ir.VectorType(ir.IntType(1), LANES)
     start = _all(b, b.ptrtoint(table, _L))
-    places = b.inttoptr(b.add(start, b.shl(b.zext(index, _LONGS), _same(_LONGS, 3))), where)
-    given = {where: places, yes: _same(yes, 1), _LONGS: ir.Constant(_LONGS, ir.Undefined)}
+    places = b.inttoptr(b.add(start, b.shl(b.zext(index, _LONGS), _same(_LONGS, 3))), _WHERE)
+    given = {_WHERE: places, yes: _same(yes, 1), _LONGS: ir.Constant(_LONGS, ir.Undefined)}
     if binding.llvm_version_info[0] < 22:  # there the alignment is an argument
-        given = {where: places, _I: _I(4), **given}
+        given = {_WHERE: places, _I: _I(4), **given}
     gather = cgutils.get_or_insert_function(
         b.module,
         ir.FunctionType(_LONGS, list(given)),

@@ -1,0 +1,117 @@
+"""Vector instructions against plain NumPy, and the density's slope against autograd."""
+
+import numpy as np
+import pytest
+import torch
+from numba import njit
+
+from climatenerf.ops import cpu, dispatch, lanes, reference
+from climatenerf.ops.lanes import LANES
+from climatenerf.ops.vectors import length, unit
+
+
+@njit
+def product(weight, rows, out, count):
+    lanes.add_product(weight, rows, out, count)
+
+
+@njit
+def outer(left, right, out, count):
+    lanes.add_outer(left, right, out, count)
+
+
+@njit
+def network(features, w1, b1, w2, b2, out):
+    lanes.network(features, w1, b1, w2, b2, out)
+
+
+@pytest.mark.parametrize(("m", "k", "vectors"), [(64, 24, 8), (3, 7, 3), (1, 32, 1), (5, 1, 2)])
+def test_products_of_blocks(m, k, vectors):
+    """Whatever is left of rows and vectors after whole registers is computed, and no more."""
+    random = np.random.default_rng(0)
+    weight = random.standard_normal((m, k)).astype(np.float32)
+    rows = random.standard_normal((k + 1, (vectors + 1) * LANES)).astype(np.float32)
+    out = random.standard_normal((m + 1, (vectors + 2) * LANES)).astype(np.float32)
+    expected, end = out.copy(), vectors * LANES
+    expected[:m, :end] += weight @ rows[:k, :end]
+    product(weight, rows, out, vectors)
+    assert np.allclose(out, expected, atol=1e-4)
+    left = random.standard_normal((m, (vectors + 1) * LANES)).astype(np.float32)
+    sums = random.standard_normal((m, k + 1)).astype(np.float32)
+    expected = sums + left[:, :end] @ rows[:, :end].T
+    outer(left, rows, sums, vectors)
+    assert np.allclose(sums, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("hidden", [32, 6])
+def test_the_density_network(hidden):
+    random = np.random.default_rng(1)
+    features = random.standard_normal((10, LANES)).astype(np.float32)
+    w1 = random.standard_normal((hidden, 10)).astype(np.float32)
+    b1, w2 = (random.standard_normal(s).astype(np.float32) for s in (hidden, (1, hidden)))
+    out = np.zeros((1, LANES), np.float32)
+    network(features, w1, b1, w2, np.float32(0.7), out)
+    expected = w2 @ np.maximum(w1 @ features + b1[:, None], 0) + 0.7
+    assert np.allclose(out, expected, atol=1e-4)
+
+
+def test_slopes_of_the_density_match_autograd():
+    """Inside the core, in the shell and at the middle; as many points as do not fill the lanes."""
+    generator = torch.Generator().manual_seed(2)
+    table = torch.rand(4, 512, 2, generator=generator) - 0.5
+    resolutions = torch.tensor([4, 7, 16, 40])
+    w1, w2 = (torch.randn(shape, generator=generator) * 0.4 for shape in ((8, 18), (18, 1)))
+    b1, b2 = torch.randn(18, generator=generator) * 0.2, torch.zeros(1)
+    q = torch.randn(301, 3, generator=generator)
+    q[0] = 0.0
+    assert (q.norm(dim=-1) < 1).sum() > 20 and (q.norm(dim=-1) > 1.5).sum() > 20
+    found = dispatch.density_slopes(q, (table, resolutions, w1, b1, w2, b2))
+    layers = [(w1.double(), b1.double()), (w2.double(), b2.double())]
+    expected = reference.density_slopes(q.double(), table.double(), resolutions, layers)
+    off = (found - expected).norm(dim=-1) / expected.norm(dim=-1).clamp_min(1e-3)
+    # Where a hidden unit or a cell's face is met within rounding, either side is right.
+    assert (off > 1e-3).sum() <= 2, off.topk(4)
+    assert torch.isfinite(found).all()
+
+
+@pytest.mark.parametrize("side", [32, 8])
+def test_every_cell_has_its_bit(side):
+    generator = torch.Generator().manual_seed(3)
+    occupied = (torch.rand(2, side, side, side, generator=generator) < 0.3).to(torch.uint8)
+    words, blocks = dispatch.cells_of(occupied)
+    k, x, y, z = np.indices(occupied.shape)
+    word = words.numpy()[k, x >> 2, y >> 2, z >> 2].view(np.uint64)
+    bit = ((x & 3) | (y & 3) << 2 | (z & 3) << 4).astype(np.uint64)
+    assert np.array_equal((word >> bit & np.uint64(1)).astype(np.uint8), occupied.numpy())
+    assert blocks.shape[1] == (side // 8 if side == 32 else side)
+
+
+def test_adam_leaves_alone_what_has_no_gradient():
+    """Against PyTorch's own, over groups that are empty, full and cut off at the end."""
+    n = 3 * cpu.GROUP + 5
+    parameter, first = torch.randn(n), torch.zeros(n)
+    second, gradient = torch.zeros(n), torch.randn(n)
+    gradient[cpu.GROUP : 2 * cpu.GROUP] = 0.0
+    gradient[::3] = 0.0
+    own = parameter.clone()
+    other = torch.nn.Parameter(parameter.clone())
+    adam = torch.optim.Adam([other], lr=0.1, betas=(0.9, 0.99), eps=1e-15)
+    other.grad = gradient.clone()
+    adam.step()
+    moved = gradient != 0
+    dispatch.adam(own, gradient, (first, second), 0.1, (0.9, 0.99), 1e-15, 1)
+    assert torch.allclose(own[moved], other[moved], atol=1e-6) and moved.sum() > n // 3
+    assert torch.equal(own[~moved], parameter[~moved])
+    assert (first[~moved] == 0).all() and (second[~moved] == 0).all()
+    assert (gradient == 0).all()
+
+
+def test_lengths_and_their_gradients():
+    v = torch.randn(20, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.allclose(length(v), v.norm(dim=-1))
+    assert torch.allclose(unit(v), torch.nn.functional.normalize(v, dim=-1))
+    assert torch.autograd.gradcheck(unit, v)
+    zero = torch.zeros(2, 3, requires_grad=True)
+    (length(zero).sum() + unit(zero, 1e-6).sum()).backward()
+    assert zero.grad is not None and torch.isfinite(zero.grad).all()
+    assert (unit(zero) == 0).all()
