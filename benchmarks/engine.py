@@ -264,7 +264,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--samples", type=int, default=2**16)
-    parser.add_argument("--twin-samples", type=int, default=2**14)
+    parser.add_argument("--twin-samples", type=int, default=2**16)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--size", default="480x270")
     parser.add_argument("--path", default="still")

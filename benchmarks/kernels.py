@@ -5,19 +5,72 @@ python benchmarks/kernels.py --samples 131072 --repeats 7
 
 Million samples a second, forward and with backward. Twins that loop over rays in Python get fewer
 samples and fewer repeats; the rate is what counts.
+
+`floor`: what the machine could do at best. Reads of 64 bits at random places of one level's table
+and multiply-adds on numbers in the nearest cache are measured in the same run; a kernel needs so
+many of each a sample (`NEEDS`), and the slower of the two bounds it.
 """
 
 import argparse
 from collections.abc import Callable
 
 import common
+import numpy as np
 import torch
+from numba import njit, prange
 
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
-from climatenerf.ops import cpu, dispatch, reference
+from climatenerf.ops import cpu, dispatch, lanes, reference
 
 SAMPLES_PER_RAY = 32
+
+SIZE = PRESETS["cpu"]
+COLOURED = 2 * SIZE.appearance_levels * SIZE.colour_hidden, 3 * SIZE.colour_hidden
+DENSE = (2 * SIZE.geometry_levels + 1) * SIZE.geometry_hidden
+NEEDS = {  # a sample: reads of a table's rows, multiply-adds
+    "hash encode": (8 * SIZE.appearance_levels, 16 * SIZE.appearance_levels),
+    # Every row is read once forward, and read and written backward.
+    "hash encode + backward": (24 * SIZE.appearance_levels, 32 * SIZE.appearance_levels),
+    "density": (8 * SIZE.geometry_levels, 16 * SIZE.geometry_levels + DENSE),
+    "density slopes": (8 * SIZE.geometry_levels, 112 * SIZE.geometry_levels + 2 * DENSE),
+    "network": (0, sum(COLOURED)),
+    # Forward; the hidden layer again, and three products for the gradients of the first layer's
+    # weights and inputs and the second's weights, one for the hidden layer's.
+    "network + backward": (0, 4 * COLOURED[0] + 3 * COLOURED[1]),
+}
+
+
+@njit(parallel=True, fastmath=True)
+def read_rows(table, index, out):
+    for part in prange(out.shape[0]):
+        total = np.int64(0)
+        for i in range(index.shape[1]):
+            total ^= table[index[part, i]]
+        out[part] = total
+
+
+@njit(parallel=True, fastmath=True)
+def multiply_add(weight, rows, out, times):
+    for part in prange(out.shape[0]):
+        for _ in range(times):
+            lanes.add_product(weight, rows, out[part], rows.shape[1] // lanes.LANES)
+
+
+def floors(repeats: int) -> dict[str, float]:
+    """Reads of table rows and multiply-adds a second, all cores."""
+    random, parts = np.random.default_rng(0), torch.get_num_threads()
+    table = random.integers(0, 2**40, 2**SIZE.appearance_log2_rows)
+    index = random.integers(0, table.shape[0], (parts, 2**20))
+    reads = common.measure(lambda: read_rows(table, index, np.empty(parts, np.int64)), repeats)
+    weight = random.random((64, 64), np.float32)
+    rows = random.random((64, 64), np.float32)
+    out = np.zeros((parts, 64, 64), np.float32)
+    products = common.measure(lambda: multiply_add(weight, rows, out, 500), repeats)
+    return {
+        "Mreads/s": index.size / reads["median"] / 1e6,
+        "Gmultiply-adds/s": parts * 500 * 64**3 / products["median"] / 1e9,
+    }
 
 
 def packed(n: int) -> torch.Tensor:
@@ -31,7 +84,7 @@ def backward(*outputs: torch.Tensor) -> None:
 def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
     """Each operation on n samples, by the fast kernels (`dispatch`) or the twins (`reference`)."""
     torch.manual_seed(0)
-    size = PRESETS["cpu"]
+    size = SIZE
     field = Field(size, 10, torch.zeros(3).numpy(), 1.0)
     table, resolutions = field.appearance_grid, field.appearance_resolutions
     table.grad_buffer = torch.zeros_like(table)  # as the optimiser gives it: spares a copy
@@ -53,10 +106,18 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
         with torch.no_grad():
             return reference.density(q, field.geometry_grid, field.geometry_resolutions, geometry)
 
+    def slopes(field: Field, q: torch.Tensor) -> torch.Tensor:
+        if ops is dispatch:
+            return dispatch.density_slopes(q, field._net())
+        layers = [(w.detach(), b.detach()) for w, b in geometry]
+        grid = field.geometry_grid.detach()
+        return reference.density_slopes(q, grid, field.geometry_resolutions, layers)
+
     return {
         "hash encode": lambda: ops.hash_encode(u, table.detach(), resolutions),
         "hash encode + backward": lambda: backward(ops.hash_encode(u, table, resolutions)),
         "density": density,
+        "density slopes": lambda: slopes(field, q),
         "network": lambda: ops.mlp(x.detach(), [(w.detach(), b.detach()) for w, b in layers],
                                    shared.detach(), row),
         "network + backward": lambda: backward(ops.mlp(x, layers, shared, row)),
@@ -75,13 +136,19 @@ def main() -> None:
     options = parser.parse_args()
     few = min(options.twin_samples, options.samples)
     fast, slow = jobs(options.samples, dispatch), jobs(few, reference)
-    rows = {}
+    best = floors(options.repeats)
+    rows: dict[str, dict] = {"floors": best}
     for name in fast:
         a = common.measure(fast[name], options.repeats)
         b = common.measure(slow[name], max(2, options.repeats // 2))
         rate, twin = options.samples / a["median"] / 1e6, few / b["median"] / 1e6
         rows[name] = {"Msamples/s": rate, "twin Msamples/s": twin, "times": rate / twin,
                       "seconds": a}  # fmt: skip
+        if name in NEEDS:
+            reads, adds = NEEDS[name]
+            each = max(reads / best["Mreads/s"], adds / best["Gmultiply-adds/s"] / 1e3)
+            rows[name]["floor Msamples/s"] = 1 / each
+            rows[name]["share of floor"] = rate * each
     table = torch.randn(2**22)
     gradient = torch.randn(2**22) * (torch.rand(2**22) < 0.1)
     moments = [torch.zeros(2**22).numpy() for _ in range(2)]

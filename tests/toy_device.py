@@ -106,7 +106,7 @@ def kernels_for_toys():
     """Within it the CPU's kernels compute for the device."""
 
     def kernels(*tensors):
-        if any(t.dtype not in (torch.float32, torch.int64) for t in tensors):
+        if any(t.dtype not in (torch.float32, torch.int64, torch.uint8) for t in tensors):
             return None
         (kind,) = {t.device.type for t in tensors}
         assert kind in ("toy", "cpu")
