@@ -77,12 +77,18 @@ def eager_distortion(weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor) ->
     return each.new_zeros(offsets.shape[0] - 1).index_add(0, ray_of(offsets), each)
 
 
+def eager_slopes(q: Float[Tensor, "n 3"], net: dispatch.Net) -> Float[Tensor, "n 3"]:
+    table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
+    return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)])
+
+
 def plain_pytorch():
     """Within it the program computes with PyTorch alone."""
     return mock.patch.multiple(
         dispatch,
         hash_encode=reference.hash_encode,
         mlp=reference.mlp,
+        density_slopes=eager_slopes,
         render_weights=eager_weights,
         accumulate=eager_accumulate,
         distortion=eager_distortion,

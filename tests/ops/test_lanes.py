@@ -1,11 +1,16 @@
 """Vector instructions against plain NumPy, and the density's slope against autograd."""
 
+import copy
+import hashlib
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from numba import njit
 
-from climatenerf.ops import cpu, dispatch, lanes, reference
+from climatenerf.field.occupancy import Occupancy
+from climatenerf.ops import cpu, cpu_network, dispatch, lanes, reference
 from climatenerf.ops.lanes import LANES
 from climatenerf.ops.vectors import length, unit
 
@@ -23,6 +28,13 @@ def outer(left, right, out, count):
 @njit
 def network(features, w1, b1, w2, b2, out):
     lanes.network(features, w1, b1, w2, b2, out)
+
+
+def test_kernels_are_compiled_anew_when_their_instructions_change():
+    """Numba looks at a kernel's own file alone; its text has to change with `lanes.py`'s."""
+    digest = hashlib.sha256(Path(lanes.__file__).read_bytes()).hexdigest()[:12]
+    for module in (cpu, cpu_network):
+        assert digest == module.LANES_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
 
 
 @pytest.mark.parametrize(("m", "k", "vectors"), [(64, 24, 8), (3, 7, 3), (1, 32, 1), (5, 1, 2)])
@@ -74,7 +86,39 @@ def test_slopes_of_the_density_match_autograd():
     assert torch.isfinite(found).all()
 
 
-@pytest.mark.parametrize("side", [32, 8])
+def test_many_points_are_encoded_as_few_are():
+    """In several blocks, the last one short, and none at all."""
+    generator = torch.Generator().manual_seed(5)
+    table = torch.rand(3, 512, 2, generator=generator) - 0.5
+    resolutions = torch.tensor([4, 16, 40])
+    u = torch.rand(2 * cpu.ENCODED + 37, 3, generator=generator)
+    out = dispatch.hash_encode(u, table, resolutions)
+    parts = [dispatch.hash_encode(part, table, resolutions) for part in u.split(1000)]
+    assert torch.allclose(out, torch.cat(parts), atol=1e-6)
+    assert dispatch.hash_encode(u[:0], table, resolutions).shape == (0, 6)
+
+
+def test_places_that_are_no_numbers_stay_in_the_table():
+    """They would be read two billion rows on: features that mean nothing, but no crash."""
+    table, resolutions = torch.ones(2, 512, 2), torch.tensor([4, 40])
+    u = torch.full((20, 3), torch.nan)
+    assert dispatch.hash_encode(u, table, resolutions).shape == (20, 4)
+
+
+def test_slopes_in_double_precision_and_of_nothing():
+    generator = torch.Generator().manual_seed(6)
+    table, resolutions = torch.rand(2, 512, 2, generator=generator), torch.tensor([4, 16])
+    w1, w2 = (torch.randn(shape, generator=generator) for shape in ((4, 8), (8, 1)))
+    net = (table, resolutions, w1, torch.zeros(8), w2, torch.zeros(1))
+    q = torch.randn(9, 3, generator=generator)
+    wide = tuple(each.double() if each.is_floating_point() else each for each in net)
+    twin = dispatch.density_slopes(q.double(), wide)
+    assert twin.dtype == torch.float64
+    assert torch.allclose(dispatch.density_slopes(q, net).double(), twin, atol=1e-3)
+    assert dispatch.density_slopes(q[:0], net).shape == (0, 3)
+
+
+@pytest.mark.parametrize("side", [32, 8, 6])
 def test_every_cell_has_its_bit(side):
     generator = torch.Generator().manual_seed(3)
     occupied = (torch.rand(2, side, side, side, generator=generator) < 0.3).to(torch.uint8)
@@ -86,9 +130,27 @@ def test_every_cell_has_its_bit(side):
     assert blocks.shape[1] == (side // 8 if side == 32 else side)
 
 
+def test_cells_are_packed_anew_when_they_change():
+    """Written in place, replaced, and in a copy that goes its own way."""
+    occupancy = Occupancy(cascades=2, side=32)
+    assert (occupancy.cells()[0] == -1).all()
+    same = occupancy.cells()
+    assert occupancy.cells()[0] is same[0]
+    occupancy.occupied.view(-1)[:] = 0
+    assert (occupancy.cells()[0] == 0).all()
+    occupancy.occupied = torch.ones_like(occupancy.occupied)
+    assert (occupancy.cells()[0] == -1).all()
+    twin = copy.deepcopy(occupancy)
+    twin.occupied.zero_()
+    assert (twin.cells()[0] == 0).all() and (occupancy.cells()[0] == -1).all()
+    with torch.inference_mode():
+        occupancy.occupied = torch.zeros_like(occupancy.occupied)
+        assert (occupancy.cells()[0] == 0).all()
+
+
 def test_adam_leaves_alone_what_has_no_gradient():
     """Against PyTorch's own, over groups that are empty, full and cut off at the end."""
-    n = 3 * cpu.GROUP + 5
+    n = 4096 + 3 * cpu.GROUP + 5
     parameter, first = torch.randn(n), torch.zeros(n)
     second, gradient = torch.zeros(n), torch.randn(n)
     gradient[cpu.GROUP : 2 * cpu.GROUP] = 0.0

@@ -55,8 +55,9 @@ def test_a_plane_is_exact_far_from_points_too_and_known_near_them_only():
     assert over.abs().max() < 1e-3
     near = torch.cdist(asked, xy).amin(-1)
     assert known[near < 0.2].all() and not known[near > 0.8].any()
-    outside = torch.tensor([[4.5, 0.0, 0.0]])
-    assert not ground.over(outside)[1]
+    outside = torch.tensor([[4.5, 0.0, 0.0], [4.0, 0.0, 0.0]])  # there as at the map's border
+    above, known = ground.over(outside)
+    assert not known.any() and torch.allclose(above, torch.full((2,), -1.5), atol=1e-3)
 
 
 def test_points_in_a_line_or_in_one_place_give_numbers():

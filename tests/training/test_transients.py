@@ -58,11 +58,24 @@ def test_masked_loss_is_lowest_at_the_price():
         assert (found[1] < found[0]) == (best == 1.0)
 
 
-def test_features_are_bilinear_and_finite_at_the_border():
-    masks = TransientMasks(3)
-    place = torch.tensor([[0.0, 0.0], [1.0, 1.0], [0.5, 0.999999]])
-    out = masks.features(torch.tensor([0, 2, 1]), place)
-    assert torch.isfinite(out).all()
-    level = masks.levels[0]
-    assert torch.allclose(out[0, :2], level[0, 0, 0])
-    assert torch.allclose(out[1, :2], level[2, -1, -1])
+def test_features_are_bilinear_and_each_images_own():
+    """Against bilinear lookups in the image alone, at its borders and inside, of many images."""
+    masks = TransientMasks(300)
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 300, (500,), generator=generator)
+    place = torch.rand(500, 2, generator=generator)
+    place[:100, 1], place[100:200, 1], place[200:250, 0] = 0.0, 1.0, 1.0
+    place[0], image[0], place[1], image[1] = 1.0, 299, 0.0, 0
+    found = masks.features(image, place)
+    expected = []
+    for level in masks.levels:
+        pictures = level[image].permute(0, 3, 1, 2)
+        at = (2 * place - 1)[:, None, None]
+        bilinear = torch.nn.functional.grid_sample(
+            pictures, at, padding_mode="border", align_corners=False
+        )
+        expected.append(bilinear[:, :, 0, 0])
+    assert torch.allclose(found, torch.cat(expected, dim=-1), atol=2e-4)
+    image[1:] = 150
+    (gradient,) = torch.autograd.grad(masks.features(image[1:], place[1:]).sum(), masks.levels[3])
+    assert (gradient[150] != 0).any() and (gradient[torch.arange(300) != 150] == 0).all()

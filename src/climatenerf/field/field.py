@@ -20,7 +20,8 @@ from climatenerf.field.directions import spherical_harmonics
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops import dispatch, reference
-from climatenerf.ops.vectors import length, unit
+from climatenerf.ops.vectors import length
+from climatenerf.ops.vectors import unit as unit_vector
 from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import SOLID
 
@@ -285,7 +286,7 @@ class Field(nn.Module):
 
         Analytic, from the encoding's slopes; 0 where the density does not change.
         """
-        return -unit(dispatch.density_slopes(q, self._net()))
+        return -unit_vector(dispatch.density_slopes(q, self._net()))
 
     def sloped_normal(
         self, q: Float[Tensor, "n 3"], step: Float[Tensor, "n"]
@@ -298,7 +299,7 @@ class Field(nn.Module):
         thinned = flat.square().sum(-1).clamp_min(1.0).log()
         raw = (self.raw_density(reference.contract(flat)) - thinned).view(-1, 4, 1)
         # 1e-6: where the density is even its direction's gradient would be NaN.
-        return -unit((raw * corners).sum(1), 1e-6)
+        return -unit_vector((raw * corners).sum(1), 1e-6)
 
     @torch.no_grad()
     def keep_occupied(
@@ -392,7 +393,7 @@ class Field(nn.Module):
             grid, resolutions = self.appearance_grid, self.appearance_resolutions
         raw = dispatch.mlp(dispatch.hash_encode(u, grid, resolutions), _pairs(self.surface_net))
         # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
-        return unit(raw[:, :3], 1e-6), raw[:, 3:]
+        return unit_vector(raw[:, :3], 1e-6), raw[:, 3:]
 
     def sky_colour(
         self, d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]

@@ -19,7 +19,7 @@ DensityAt = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 
 
 class Occupancy(torch.nn.Module):
-    """Running maximum of density per cell, and the bytes that marching reads."""
+    """Running maximum of density per cell, and which cells marching looks into."""
 
     density: Tensor
     occupied: Tensor
@@ -46,10 +46,16 @@ class Occupancy(torch.nn.Module):
 
     def cells(self) -> dispatch.Cells:
         """What marching reads: `dispatch.cells_of` the occupied ones, anew if they have changed."""
+        if self.occupied.is_inference():  # those count no changes
+            return dispatch.cells_of(self.occupied)
         state = self.occupied, self.occupied._version
         if self.packed is None or self.packed[0] is not state[0] or self.packed[1] != state[1]:
             self.packed = *state, dispatch.cells_of(self.occupied)
         return self.packed[2]
+
+    def __getstate__(self) -> dict:
+        """A copy counts its own changes, so it packs its own cells."""
+        return {**self.__dict__, "packed": None}
 
     def cell_centres(
         self, cells: Int[Tensor, "n"]

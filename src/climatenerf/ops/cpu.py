@@ -11,8 +11,11 @@ from numba import njit, prange
 from climatenerf.ops import lanes
 from climatenerf.ops.lanes import LANES
 
+LANES_DIGEST = "47cf08f40320"  # of `lanes.py`, which says why
+
 BLOCK = 256  # points that one thread takes at once
-ENCODED = 8192  # the same where it goes level by level: a level's table stays in the nearer caches
+ENCODED = 8192  # the same, at most, where levels come one by one: their tables stay in the caches
+PARTS = 16  # at least so many blocks, so that all cores have some
 GROUP = 64  # entries of a table that the optimiser looks at together
 RAY_BLOCK = 32  # rays that one thread marches in turn
 
@@ -27,11 +30,12 @@ def _contract_scale(m):
 def hash_encode(u, table, resolutions, out):
     """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n] (feature-major)."""
     n = u.shape[0]
-    for block in prange((n + ENCODED - 1) // ENCODED):
+    size = max(LANES, min(ENCODED, n // PARTS // LANES * LANES))
+    for block in prange((n + size - 1) // size):
         places = np.zeros((3, LANES), np.float32)
         features = np.empty((2, LANES), np.float32)
         for level in range(table.shape[0]):
-            for start in range(block * ENCODED, min(n, block * ENCODED + ENCODED), LANES):
+            for start in range(block * size, min(n, block * size + size), LANES):
                 count = min(LANES, n - start)
                 for k in range(count):
                     for axis in range(3):
@@ -91,7 +95,8 @@ def hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
 
 @njit(cache=True, fastmath=True, inline="always")
 def _place(places, thin, k, qx, qy, qz):
-    """Puts a point in grid units into lane k: its place in the unit cube, and what thins it."""
+    """Puts a point in grid units into lane k: its place in the unit cube → places [3, LANES], and
+    what thins it → thin [LANES]."""
     m = np.sqrt(qx * qx + qy * qy + qz * qz)
     s = np.float32(_contract_scale(m)) * np.float32(0.25)
     half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
@@ -104,7 +109,10 @@ def _place(places, thin, k, qx, qy, qz):
 
 @njit(cache=True, fastmath=True, inline="always")
 def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma):
-    """Density (1/grid unit) in all lanes: encoding, one hidden layer, exp → sigma [1, LANES]."""
+    """Density (1/grid unit) in all lanes: encoding, one hidden layer, exp → sigma [1, LANES].
+
+    places and thin by `_place`; features [2 levels, LANES] is room for the encoding.
+    """
     for level in range(table.shape[0]):
         lanes.look_up(places, table, level, resolutions[level], features, 2 * level)
     lanes.network(features, w1, b1, w2, b2, sigma)

@@ -12,6 +12,8 @@ from numba import njit, prange
 from climatenerf.ops import lanes
 from climatenerf.ops.lanes import LANES
 
+LANES_DIGEST = "47cf08f40320"  # of `lanes.py`, which says why
+
 BLOCK = 128  # samples at a time, some whole lanes: 64 hidden rows of them are 32 kB
 CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients over
 
@@ -30,7 +32,7 @@ def _hidden(x, shared, row, w1, b1, start, size, hidden):
     """The first layer after its ReLU of a block x [inputs, BLOCK] → first rows of hidden."""
     units = w1.shape[0]
     for m in range(units):
-        hidden[m] = b1[m]
+        hidden[m] = b1[m]  # behind the block's end, too: what is there meets zeros
     if shared.shape[0]:
         # Samples of a ray lie side by side: each run of them is filled at once.
         begin = start

@@ -231,7 +231,8 @@ def mlp(
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
     """See `reference.mlp`, which deeper networks than those of one hidden layer go to."""
-    if _kernels(x) is cpu and len(layers) == 2:  # a GPU's own matrix products are fast
+    given = [x, *(each for pair in layers for each in pair), *([] if shared is None else [shared])]
+    if _kernels(*given) is cpu and len(layers) == 2:  # a GPU's own matrix products are fast
         return _Network.apply(x, shared, row, *layers[0], *layers[1])
     return reference.mlp(x, layers, shared, row)
 
@@ -256,8 +257,8 @@ def merge_order(
 
 Net = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """Table and resolutions of an encoding; w1, b1, w2, b2 of the network of one hidden layer on it."""
-Cells = tuple[Tensor, UInt8[Tensor, "k b b b"]]
-"""What `cells_of` gives."""
+Cells = tuple[Int[Tensor, "k w w w"] | UInt8[Tensor, "k g g g"], UInt8[Tensor, "k b b b"]]
+"""What `cells_of` gives: words of 4³ cells on a CPU, cells elsewhere; and blocks."""
 
 
 def _cpu_net(net: Net) -> tuple:

@@ -3,7 +3,11 @@
 Numba's compiler does not make vectors of loops that read a table at computed places, and makes
 short ones of products. So these few steps are spelled out in LLVM's vector instructions, which it
 translates for whatever processor it runs on (AVX-512, AVX2, Neon). Values of points lie in rows,
-[what, points], and rows are whole lanes long.
+[what, points], and rows are whole vectors long. All arrays are float32, C-contiguous, as everywhere
+in the kernels.
+
+Numba keeps compiled kernels until their own file changes, and knows nothing of this one. So files
+with kernels that use it carry its digest, which a test compares: a change here changes them.
 """
 
 # Numba's stubs do not know what an intrinsic's generator is given.
@@ -98,14 +102,17 @@ class _Cells:
         starts = [b.mul(p, stride) for p, stride in zip(low, strides, strict=True)]
         self.index = [(s, b.add(s, stride)) for s, stride in zip(starts, strides, strict=True)]
         self.weight = [(b.fsub(_same(_FLOATS, 1.0), f, flags=_FAST), f) for f in inside]
-        self.limit = _all(b, b.sub(b.trunc(size, _I), _I(1)))
+        self.last = _all(b, b.sub(b.trunc(size, _I), _I(1)))
         self.combine = b.xor if hashed else b.add
         self.hashed = hashed
 
     def row(self, b: Any, x: int, y: int, z: int) -> Any:
         """The table's row of the corner on the far (1) or near (0) side along each axis."""
         row = self.combine(self.combine(self.index[1][y], self.index[2][z]), self.index[0][x])
-        return b.and_(row, self.limit) if self.hashed else row
+        if self.hashed:
+            return b.and_(row, self.last)
+        # A place that is no number must not lead out of the table.
+        return b.select(b.icmp_unsigned("<", row, self.last), row, self.last)
 
 
 CORNERS = [(corner & 1, corner >> 1 & 1, corner >> 2) for corner in range(8)]
@@ -266,17 +273,20 @@ def _folded(b: Any, vectors: tuple, length: int, group: int) -> Any:
 
 
 def _add_product() -> Any:
-    """Generates `add_product`: out [m, *] += weight [m, k] @ rows [k, *], for `count` lanes."""
+    """Generates `add_product`: out [m, *] += weight [m, k] @ rows [k, *].
+
+    For the first `vectors` vectors of LANES points; rows are at least as long.
+    """
 
     @intrinsic
-    def add_product(typing_context, weight, rows, out, count):
+    def add_product(typing_context, weight, rows, out, vectors):
         def generate(context, b, signature, arguments):
             weight, rows, out = _arrays(context, b, signature, arguments, (0, 1, 2))
             m, k = _sides(b, weight)
             across, along = _sides(b, rows)[1], _sides(b, out)[1]
             for unit, units in _blocks(b, m, (UNITS, 1)):
-                for vector, vectors in _blocks(b, arguments[3], (VECTORS, 1)):
-                    block = [(u, v) for u in range(units) for v in range(vectors)]
+                for vector, several in _blocks(b, arguments[3], (VECTORS, 1)):
+                    block = [(u, v) for u in range(units) for v in range(several)]
                     place = b.mul(vector, _L(LANES))
                     results, totals = {}, {}
                     for u, v in block:
@@ -288,12 +298,12 @@ def _add_product() -> Any:
                         start = b.add(b.mul(loop.index, across), place)
                         values = [
                             b.load(_at(b, rows.data, b.add(start, _L(v * LANES))), align=4)
-                            for v in range(vectors)
+                            for v in range(several)
                         ]
                         for u in range(units):
                             at = b.add(b.mul(b.add(unit, _L(u)), k), loop.index)
                             w = _all(b, b.load(b.gep(weight.data, [at])))
-                            for v in range(vectors):
+                            for v in range(several):
                                 total = b.load(totals[u, v])
                                 b.store(_multiply_add(b, w, values[v], total), totals[u, v])
                     for each in block:
@@ -306,10 +316,13 @@ def _add_product() -> Any:
 
 
 def _add_outer() -> Any:
-    """Generates `add_outer`: out [a, b] += left [a, *] @ right [b, *]ᵀ, for `count` lanes."""
+    """Generates `add_outer`: out [a, b] += left [a, *] @ right [b, *]ᵀ.
+
+    Over the first `vectors` vectors of LANES points; rows are at least as long.
+    """
 
     @intrinsic
-    def add_outer(typing_context, left, right, out, count):
+    def add_outer(typing_context, left, right, out, vectors):
         def generate(context, b, signature, arguments):
             left, right, out = _arrays(context, b, signature, arguments, (0, 1, 2))
             (m, across), (n, along) = _sides(b, left), _sides(b, right)

@@ -59,14 +59,19 @@ class TransientMasks(nn.Module):
         images = self.levels[0].shape[0]
         for level in self.levels:
             side = level.shape[1]
+            # All images' cells as one tall picture, one under the other, so that one operation
+            # looks at all. Places in it are rounded; no closer to the next image than by that.
+            rounding = 3e-7 * images * side
             x, y = (place * side - 0.5).clamp(0, side - 1).unbind(-1)
-            # All images' cells as one tall picture, one under the other: a place that is kept off
-            # its own image's border takes nothing from the next.
+            y = y.clamp(rounding, side - 1 - rounding)
             picture = level.reshape(images * side, side, FEATURES).permute(2, 0, 1)
             middle = torch.stack([x + 0.5, y + 0.5 + image * side], dim=-1)
             size = torch.tensor([side / 2, images * side / 2])
             looked = F.grid_sample(
-                picture[None], (middle / size - 1)[None, None], align_corners=False
+                picture[None],
+                (middle / size - 1)[None, None],
+                padding_mode="border",
+                align_corners=False,
             )
             found.append(looked[0, :, 0].T)
         return torch.cat(found, dim=-1)
