@@ -1,6 +1,7 @@
 """GPU kernels in Numba-CUDA, one thread a ray or a sample; `reference.py` specifies them.
 
-Function by function the interface of `cpu.py`, on arrays of the device. Nothing is compiled before
+Function by function the interface of `cpu.py`, on arrays of the device, but for what is packed or
+turned for a CPU (`dispatch.cells_of`, `_cpu_net`). Nothing is compiled before
 the first launch, and no compiler is needed on the machine. Launches go to the default stream, as
 PyTorch's own do, so neither waits for the other. Numba's simulator runs the same code on the CPU
 (NUMBA_ENABLE_CUDASIM=1), which is how it is tested without a GPU.
