@@ -81,7 +81,7 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
     table.grad_buffer = torch.zeros_like(table)  # as the optimiser gives it: spares a copy
     u, offsets = torch.rand(n, 3), packed(n)
     row = torch.arange(n) // SAMPLES_PER_RAY
-    x = torch.rand(n, 2 * size.appearance_levels, requires_grad=True)
+    x = torch.rand(2 * size.appearance_levels, n).T.requires_grad_()  # as the encoding leaves it
     shared = torch.rand(n // SAMPLES_PER_RAY, size.colour_hidden, requires_grad=True)
     layers = list(zip(field.colour_net[::2], field.colour_net[1::2], strict=True))
     geometry = list(zip(field.geometry_net[::2], field.geometry_net[1::2], strict=True))
