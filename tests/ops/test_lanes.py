@@ -138,7 +138,8 @@ def test_cells_are_packed_anew_when_they_change():
     assert occupancy.cells()[0] is same[0]
     occupancy.occupied.view(-1)[:] = 0
     assert (occupancy.cells()[0] == 0).all()
-    occupancy.occupied = torch.ones_like(occupancy.occupied)
+    occupancy.occupied = torch.zeros_like(occupancy.occupied)
+    occupancy.occupied.fill_(1)  # one change, as the copy will have had one
     assert (occupancy.cells()[0] == -1).all()
     twin = copy.deepcopy(occupancy)
     twin.occupied.zero_()
@@ -151,21 +152,25 @@ def test_cells_are_packed_anew_when_they_change():
 def test_adam_leaves_alone_what_has_no_gradient():
     """Against PyTorch's own, over groups that are empty, full and cut off at the end."""
     n = 4096 + 3 * cpu.GROUP + 5
-    parameter, first = torch.randn(n), torch.zeros(n)
-    second, gradient = torch.zeros(n), torch.randn(n)
-    gradient[cpu.GROUP : 2 * cpu.GROUP] = 0.0
-    gradient[::3] = 0.0
-    own = parameter.clone()
-    other = torch.nn.Parameter(parameter.clone())
+    own, gradients = torch.randn(n), torch.randn(2, n)
+    gradients[:, cpu.GROUP : 2 * cpu.GROUP] = 0.0
+    gradients[:, ::3] = 0.0
+    gradients[1, 1::3] = 0.0  # moved by the first step, left alone by the second
+    first, second = torch.zeros(n), torch.zeros(n)
+    other = torch.nn.Parameter(own.clone())
     adam = torch.optim.Adam([other], lr=0.1, betas=(0.9, 0.99), eps=1e-15)
-    other.grad = gradient.clone()
-    adam.step()
-    moved = gradient != 0
-    dispatch.adam(own, gradient, (first, second), 0.1, (0.9, 0.99), 1e-15, 1)
-    assert torch.allclose(own[moved], other[moved], atol=1e-6) and moved.sum() > n // 3
-    assert torch.equal(own[~moved], parameter[~moved])
-    assert (first[~moved] == 0).all() and (second[~moved] == 0).all()
-    assert (gradient == 0).all()
+    for step, gradient in enumerate(gradients, start=1):
+        before = own.clone(), first.clone(), second.clone()
+        other.grad = gradient.clone()
+        adam.step()
+        moved = gradient != 0
+        dispatch.adam(own, gradient.clone(), (first, second), 0.1, (0.9, 0.99), 1e-15, step)
+        assert torch.allclose(own[moved], other[moved], atol=1e-6) and moved.sum() > n // 4
+        for now, then in zip((own, first, second), before, strict=True):
+            assert torch.equal(now[~moved], then[~moved])
+    cleared = gradients[0].clone()
+    dispatch.adam(own, cleared, (first, second), 0.1, (0.9, 0.99), 1e-15, 3)
+    assert (cleared == 0).all()
 
 
 def test_lengths_and_their_gradients():
