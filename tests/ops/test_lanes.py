@@ -138,10 +138,10 @@ def test_cells_are_packed_anew_when_they_change():
     assert occupancy.cells()[0] is same[0]
     occupancy.occupied.view(-1)[:] = 0
     assert (occupancy.cells()[0] == 0).all()
-    occupancy.occupied = torch.zeros_like(occupancy.occupied)
-    occupancy.occupied.fill_(1)  # one change, as the copy will have had one
+    occupancy.occupied = torch.ones_like(occupancy.occupied)
     assert (occupancy.cells()[0] == -1).all()
     twin = copy.deepcopy(occupancy)
+    assert twin.packed is None, "its changes are counted from another start"
     twin.occupied.zero_()
     assert (twin.cells()[0] == 0).all() and (occupancy.cells()[0] == -1).all()
     with torch.inference_mode():
