@@ -50,6 +50,16 @@ def test_what_a_picture_lacks_is_unknown_there_alone():
     assert pixels.usable[n:].all() and pixels.share == pytest.approx(1 - 94 / (4 * n))
 
 
+def test_the_kinds_of_labels_are_counted_piece_by_piece(monkeypatch):
+    pixels = made()
+    assert pixels.label is not None
+    pixels.label[5], pixels.label[700] = 3, 4
+    monkeypatch.setattr(module, "AT_MOST", 100)
+    assert torch.equal(pixels.kinds(), pixels.label.unique()) and pixels.kinds().numel() == 4
+    pixels.label = None
+    assert pixels.kinds().numel() == 0
+
+
 def test_a_full_disk_is_a_sentence(monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")

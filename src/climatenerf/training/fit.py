@@ -83,7 +83,7 @@ class Fitting:
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
         self.fill = fill_sky(pixels, self.generator)
         self.carving = Carving(self.field, pixels, points, settings)
-        kinds = pixels.rgb[:0, 0] if pixels.label is None else pixels.label.unique()
+        kinds = pixels.kinds()
         self.still = self.cells_of_points(images)
         self.solid_of = placed(SOLID_OF.astype(np.int64))
         kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]

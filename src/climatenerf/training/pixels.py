@@ -174,6 +174,14 @@ class TrainingPixels:
         """Whether any pixel is labelled sky."""
         return self.label is not None and bool((self.label == SKY).any())
 
+    def kinds(self) -> UInt8[Tensor, "k"]:
+        """Merged classes that any pixel is labelled as, with unknown if some are; none without."""
+        if self.label is None:
+            return torch.zeros(0, dtype=torch.uint8)
+        # Piece by piece: to sort all labels would take twenty times their room.
+        pieces = [torch.bincount(each.long(), minlength=256) for each in self.label.split(AT_MOST)]
+        return torch.stack(pieces).sum(0).nonzero()[:, 0].to(torch.uint8)
+
     def draw(
         self, n: int, generator: torch.Generator, triples: int = 0, edges: float = 0.0
     ) -> Batch:
