@@ -15,17 +15,29 @@ import functools
 import json
 import math
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import torch
-from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
-from nerfstudio.configs.method_configs import method_configs
-from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import Optimizers
-from torch.amp import GradScaler
+
+# The package index has torchvision for CUDA alone. Its operators do not load beside PyTorch for a
+# CPU; nothing here calls them, but it will not be imported without knowing of these two.
+OPERATORS = torch.library.Library("torchvision", "DEF")
+OPERATORS.define("nms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+OPERATORS.define("qnms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig  # noqa: E402
+from nerfstudio.configs.method_configs import method_configs  # noqa: E402
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig  # noqa: E402
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig  # noqa: E402
+from nerfstudio.engine.callbacks import (  # noqa: E402
+    TrainingCallbackAttributes,
+    TrainingCallbackLocation,
+)
+from nerfstudio.engine.optimizers import Optimizers  # noqa: E402
+from torch.amp import GradScaler  # noqa: E402
+from torchmetrics.image import lpip  # noqa: E402
 
 LOOKS = 4096  # held-out pixels
 
@@ -39,13 +51,35 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     out, sys.stdout = sys.stdout, sys.stderr  # it prints much
+    with tempfile.TemporaryDirectory() as folder:
+        answer = fitted(present(options.capture, Path(folder)), options)
+    print(json.dumps(answer), file=out)
+
+
+def present(capture: Path, folder: Path) -> Path:
+    """The capture's poses without those of pictures that are not on disk."""
+    poses = json.loads((capture / "transforms.json").read_text())
+    for frame in poses["frames"]:
+        name = Path(frame["file_path"])
+        found = [name, *(name.with_name(name.name + end) for end in (".jpg", ".png"))]
+        there = [path for each in found if (path := capture.resolve() / each).is_file()]
+        frame["file_path"] = str(there[0]) if there else ""
+    poses["frames"] = [frame for frame in poses["frames"] if frame["file_path"]]
+    (folder / "transforms.json").write_text(json.dumps(poses))
+    return folder / "transforms.json"
+
+
+def fitted(poses: Path, options: argparse.Namespace) -> dict:
+    """Steps, seconds and the curve of PSNR over them."""
     torch.manual_seed(options.seed)
+    # A score that is not asked for here; making it fetches a network's weights.
+    lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: torch.nn.Identity()
     config = method_configs["nerfacto"]
     model = config.pipeline.model
     model.implementation = "torch"
     model.camera_optimizer = CameraOptimizerConfig(mode="off")
     parsing = NerfstudioDataParserConfig(
-        data=options.capture, downscale_factor=1, eval_mode="interval", eval_interval=8
+        data=poses, downscale_factor=1, eval_mode="interval", eval_interval=8
     )
     config.pipeline.datamanager = VanillaDataManagerConfig(
         dataparser=parsing,
@@ -59,7 +93,9 @@ def main() -> None:
     optimizers = Optimizers(named, {name: groups[name] for name in named})
     scaler = GradScaler(enabled=False)
     callbacks = pipeline.get_training_callbacks(
-        TrainingCallbackAttributes(optimizers=optimizers, grad_scaler=scaler, pipeline=pipeline)
+        TrainingCallbackAttributes(
+            optimizers=optimizers, grad_scaler=scaler, pipeline=pipeline, trainer=None
+        )
     )
     shown, truth = pipeline.datamanager.next_eval(0)
 
@@ -85,8 +121,7 @@ def main() -> None:
             error = float((rgb - truth["image"][..., :3]).square().mean())
             curve.append({"seconds": seconds, "steps": step, "psnr": -10 * math.log10(error)})
             print(curve[-1], file=sys.stderr, flush=True)
-    answer = {"steps": step, "seconds": seconds, "rays": options.rays, "curve": curve}
-    print(json.dumps(answer), file=out)
+    return {"steps": step, "seconds": seconds, "rays": options.rays, "curve": curve}
 
 
 if __name__ == "__main__":
