@@ -13,6 +13,7 @@ each size, clean and with water on about 40 % of it. Memory is each part's peak 
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import on
 from climatenerf.scene import load_scene
-from climatenerf.training.settings import FitSettings
+from climatenerf.training.settings import FitSettings, settings_of
 
 GOALS = (20, 22, 24, 25)  # dB
 WEATHERS = ("clean", "flood")
@@ -105,7 +106,7 @@ def main() -> None:
         "step": lambda: steps(options.run, options.samples, options.repeats, device, seed),
     }
     if options.capture:
-        settings = FitSettings(options.preset, options.minutes, seed=seed)
+        settings = replace(settings_of(options.preset), minutes=options.minutes, seed=seed)
         parts["fit"] = lambda: time_to_psnr(
             options.capture, settings, options.downscale, options.every, GOALS
         )

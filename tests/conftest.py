@@ -11,9 +11,9 @@ from climatenerf.cli import THREADING
 # Before any test imports torch: without it two OpenMP run times spin against each other.
 for variable, value in THREADING.items():
     os.environ.setdefault(variable, value)
-# GPU kernels run in Numba's simulator where there is no NVIDIA GPU.
+# GPU kernels run in Triton's interpreter where there is no NVIDIA GPU.
 if shutil.which("nvidia-smi") is None:
-    os.environ.setdefault("NUMBA_ENABLE_CUDASIM", "1")
+    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 

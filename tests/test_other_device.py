@@ -10,7 +10,9 @@ from toy_device import TOY, kernels_for_toys
 from training.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
+from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
+from climatenerf.field.device import on
 from climatenerf.field.extent import find_extent
 from climatenerf.field.presets import PRESETS
 from climatenerf.render.frame import render_frame
@@ -146,3 +148,13 @@ def test_a_gpu_that_is_not_there_is_refused(tmp_path, capsys):
         assert cli.main([*words, "--device", "cuda"]) == 2
         said = capsys.readouterr().err
         assert "NVIDIA GPU" in said and "Traceback" not in said
+
+
+def test_what_a_gpu_needs_beside_it_is_asked_for(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(UserError, match="C compiler"), on("cuda"):
+        pass
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UserError, match="needs Triton"), on("cuda"):
+        pass

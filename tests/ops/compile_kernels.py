@@ -1,57 +1,94 @@
-"""Compiles every GPU kernel for CUDA, without a GPU: prints their names, or fails.
+"""Compiles every GPU kernel for CUDA, without a GPU: prints its name and registers, or fails.
 
-The simulator runs kernels as Python; what Numba's CUDA target refuses shows here alone. Run in a
-process of its own, by `test_gpu_kernels.py`: it must not be in the simulator.
+The interpreter runs kernels as NumPy; what Triton's compiler refuses shows here alone. Run in a
+process of its own, by `test_gpu_kernels.py`: it must not be in the interpreter. An argument is the
+card's compute capability, such as 80 or 90.
 """
 
-import types
-import warnings
+import functools
+import sys
 from unittest import mock
 
-from numba import cuda
-from numba import types as t
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.runtime import JITFunction
 
-from climatenerf.ops import gpu, gpu_render
+from climatenerf.ops import gpu, gpu_network, gpu_render
 
-F1, F2, F3 = t.float32[::1], t.float32[:, ::1], t.float32[:, :, ::1]
-I1, REAL = t.int64[::1], t.float64
-NET = t.Tuple((F3, I1, F2, F1, F2, F1))
-RAYS, CELLS = t.UniTuple(F2, 2), t.UniTuple(t.Array(t.uint8, 4, "C"), 2)
-PAIR = t.UniTuple(REAL, 2)
-ARGUMENTS = {
-    "_hash_encode": (F2, F3, I1, F2),
-    "_hash_encode_backward": (F2, F2, I1, F3),
-    "_hash_encode_slopes": (F2, F2, F3, I1, F2),
-    "_density_at": (F2, NET, F1),
-    "_march": (RAYS, F2, CELLS, PAIR, REAL, NET, F3, I1),
-    "_pack": (F3, I1, F2),
-    "_grid_positions": (F2, F2, I1, F1, F2),
-    "_weights_forward": (F1, I1, F1, F1),
-    "_weights_backward": (F1, I1, F1, F1, F1),
-    "_accumulate_forward": (F1, F2, I1, F2),
-    "_accumulate_backward": (F1, F2, I1, F2, F1, F2),
-    "_distortion_forward": (F1, F1, F1, I1, F1),
-    "_distortion_backward": (F1, F1, F1, I1, F1, F1),
-    "_merge_order": (F1, I1, F1, I1, I1, I1),
-    "_adam": (F1, F1, F1, F1, t.UniTuple(t.float32, 6)),
-    "_composite": (RAYS, F2, CELLS, PAIR, PAIR, NET, NET, F2, F2),
-}
+CARD = GPUTarget("cuda", int(sys.argv[1]) if len(sys.argv) > 1 else 80, 32)
+
+
+class NoCard:
+    """A driver that knows for which card to compile."""
+
+    def get_current_target(self):
+        return CARD
+
+    def get_current_device(self):
+        return 0
+
+    def get_current_stream(self, device):
+        return 0
+
+    def get_active_torch_device(self):
+        return torch.device("cpu")
+
+
+def net(levels: int, rows: int, hidden: int, outputs: int) -> tuple[torch.Tensor, ...]:
+    grid = torch.zeros(levels, 2**rows, 2), torch.full((levels,), 16)
+    w1, w2 = torch.zeros(2 * levels, hidden), torch.zeros(hidden, outputs)
+    return *grid, w1, torch.zeros(hidden), w2, torch.zeros(outputs)
+
+
+def compile_all() -> None:
+    n, s = 8, 40
+    real, whole, some = torch.zeros(n, 3), torch.zeros(n + 1, dtype=torch.long), torch.zeros(s)
+    u, order = torch.zeros(s, 3), torch.zeros(s, dtype=torch.long)
+    cells = torch.ones(2, 32, 32, 32, dtype=torch.uint8), torch.ones(2, 4, 4, 4, dtype=torch.uint8)
+    density, colour = net(12, 19, 64, 1), net(16, 19, 64, 3)
+    steps, room = (1 / 256, 1 / 160), torch.zeros(3, 1024, n)
+    table, resolutions = density[:2]
+    features = torch.zeros(24, s)
+    gpu.hash_encode(u, table, resolutions, features)
+    gpu.hash_encode_backward(u, features, resolutions, table)
+    gpu.hash_encode_slopes(u, features, table, resolutions, u)
+    gpu.density_at(u, density, some)
+    gpu.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
+    gpu.pack(room, whole, torch.zeros(3, s))
+    gpu.grid_positions(real, real, whole, some, u)
+    gpu.weights_forward(some, whole, some, real[:, 0])
+    gpu.weights_backward(some, whole, some, real[:, 0], some)
+    gpu.accumulate_forward(some, u, whole, real)
+    gpu.accumulate_backward(some, u, whole, real, some, u)
+    gpu.distortion_forward(some, some, some, whole, real[:, 0])
+    gpu.distortion_backward(some, some, some, whole, real[:, 0], some)
+    gpu.merge_order(some, whole, some, whole, whole, order)
+    gpu.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
+    gpu_network.density_slopes(u, density, u)
+    rays = torch.zeros(n, 64), order
+    for layers, shared in ((density, None), (colour, rays), (net(8, 17, 32, 12), None)):
+        out = torch.zeros(s, layers[-1].shape[0])
+        gpu_network.network_forward(u, layers[:2], layers[2:], shared, out)
+        grads = layers[0], None if shared is None else shared[0], u if shared is None else None
+        gpu_network.network_backward(u, layers[:2], layers[2:], shared, out, grads)
+    gpu_render.composite((real, real), real, cells, steps, (1e-3, 1e-4), density, colour,
+                         rays[0], torch.zeros(n, 5))  # fmt: skip
 
 
 def main() -> None:
-    warnings.simplefilter("ignore")
-    kernels = {
-        name: each
-        for module in (gpu, gpu_render)
-        for name, each in vars(module).items()
-        if hasattr(each, "targetoptions") and not each.targetoptions.get("device")
-    }
-    card = types.SimpleNamespace(compute_capability=(8, 0))
-    with mock.patch("numba.cuda.dispatcher.get_current_device", return_value=card):
-        for name, kernel in kernels.items():
-            text, _ = cuda.compile_ptx(kernel.py_func, ARGUMENTS[name], cc=(8, 0))
-            assert ".entry" in text
-            print(name)
+    triton.runtime.driver.set_active(NoCard())
+    run = JITFunction.run
+
+    @functools.wraps(run)
+    def compiled(self, *args, warmup, **kwargs):
+        kernel = run(self, *args, warmup=True, **kwargs)
+        assert ".entry" in kernel.asm["ptx"] and kernel.asm["cubin"]
+        print(self.fn.__name__)
+        return kernel
+
+    with mock.patch.object(JITFunction, "run", compiled):
+        compile_all()
 
 
 if __name__ == "__main__":

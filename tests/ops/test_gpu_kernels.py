@@ -1,12 +1,12 @@
-"""GPU kernels against the twins, in Numba's simulator or, where there is one, on an NVIDIA GPU.
+"""GPU kernels against the twins, in Triton's interpreter or, where there is one, on an NVIDIA GPU.
 
-The simulator takes a millisecond a thread or more, hence the small sizes.
+The interpreter takes milliseconds an operation, hence the small sizes.
 """
 
+import inspect
 import os
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +16,35 @@ from random_field import random_field
 
 from climatenerf.field import field as field_module
 from climatenerf.field.field import _to_radiance
-from climatenerf.ops import cpu, dispatch, gpu, gpu_render, reference
+from climatenerf.ops import cpu, dispatch, reference
+
+triton = pytest.importorskip("triton", reason="Triton is for Linux")
+import triton.language as tl  # noqa: E402
+
+from climatenerf.ops import gpu, gpu_march, gpu_network, gpu_render  # noqa: E402
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
-# The simulator's numbers are NumPy's, which warns where a hash's products wrap around.
-pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")
+# The interpreter's numbers are NumPy's, which warns where a hash's products wrap around.
+pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
+
+
+def by(kernels, monkeypatch):
+    """From here on all operations are by those kernels."""
+    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: kernels)
+    monkeypatch.setattr(dispatch, "_array", array_of if kernels is cpu else tensor_of)
+
+
+def array_of(tensor):
+    return tensor_of(tensor).numpy()
+
+
+def tensor_of(tensor):
+    return tensor.detach().contiguous()
 
 
 @pytest.fixture(autouse=True)
 def gpu_kernels(monkeypatch):
-    """All operations by the GPU's kernels."""
-    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: gpu)
+    by(gpu, monkeypatch)
 
 
 @pytest.fixture
@@ -120,6 +138,62 @@ def test_networks_go_to_matrix_products(generator):
     assert assert_close(pairs, 1e-3) == 2
 
 
+@pytest.mark.parametrize("outputs", [1, 3])
+@pytest.mark.parametrize("with_rays", [False, True])
+def test_an_encoding_with_its_network(generator, outputs, with_rays):
+    """Values, and gradients to places, table, layers and what rays add to the hidden layer."""
+    table, resolutions = grid(generator)
+    u = torch.rand(70, 3, generator=generator)  # more than a tile
+    w1, b1 = random(generator, 6, 8), random(generator, 8)
+    w2, b2 = random(generator, 8, outputs), random(generator, outputs)
+    shared, row = random(generator, 4, 8), torch.arange(70) * 4 // 70
+
+    def network(encoded):
+        def run(u, table, w1, b1, w2, b2, shared):
+            rays = (shared, row.to(u.device)) if with_rays else (None, None)
+            return encoded(u, table, resolutions.to(u.device), [(w1, b1), (w2, b2)], *rays)
+
+        return run
+
+    given = (u, table, w1, b1, w2, b2, shared)
+    if not with_rays:
+        given, reduced = given[:-1], network
+        network = lambda encoded: lambda *inputs: reduced(encoded)(*inputs, None)  # noqa: E731
+    twin = lambda u, table, resolutions, layers, *rays: reference.mlp(  # noqa: E731
+        reference.hash_encode(u, table, resolutions), layers, *rays
+    )
+    pairs = both(network(dispatch.encoded_mlp), network(twin), *given)
+    # A GPU's gradients pass through the tensor cores once, with 11 bits.
+    assert assert_close(pairs, 1e-4 if DEVICE == "cpu" else 3e-3) == 1 + len(given)
+
+
+def test_a_tables_gradient_goes_to_its_buffer(generator):
+    table, resolutions = grid(generator)
+    table = table.to(DEVICE).requires_grad_()
+    u = torch.rand(20, 3, generator=generator).to(DEVICE)
+    layers = [(random(generator, 6, 8).to(DEVICE), torch.zeros(8, device=DEVICE))]
+    layers += [(random(generator, 8, 2).to(DEVICE), torch.zeros(2, device=DEVICE))]
+    dispatch.encoded_mlp(u, table, resolutions.to(DEVICE), layers).sum().backward()
+    wanted, table.grad = table.grad, None
+    table.grad_buffer = torch.ones_like(table)
+    dispatch.encoded_mlp(u, table, resolutions.to(DEVICE), layers).sum().backward()
+    assert table.grad is None
+    assert torch.allclose(table.grad_buffer - 1, wanted, atol=1e-4 * float(wanted.abs().max()))
+
+
+def test_slopes_of_the_density_inside_and_outside_the_core(generator):
+    weights = net(generator)
+    table, resolutions, *layers = (x.cpu().double() if x.is_floating_point() else x.cpu()
+                                   for x in weights)  # fmt: skip
+    q = 2 * random(generator, 70, 3)
+    ours = dispatch.density_slopes(q.to(DEVICE), weights).cpu().double()
+    pairs = [(layers[0], layers[1]), (layers[2], layers[3])]
+    real = reference.density_slopes(q.double(), table, resolutions, pairs)
+    # On a cell's face the slope jumps; rounding decides the side.
+    off = (ours - real).abs().amax(-1)
+    assert (off > 1e-4 * real.abs().max()).sum() <= 1, off
+
+
 def net(generator):
     table, resolutions = grid(generator)
     weights = 0.3 * random(generator, 6, 8), random(generator, 8), random(generator, 8, 1)
@@ -194,13 +268,13 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     with torch.no_grad():
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
-    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: cpu)
+    by(cpu, monkeypatch)
     field.shown = 1
     real = field.composited(o, d, near, 4.0, stop)
     assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.4).sum() > 3, (
         "some see matter, one does not"
     )
-    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: gpu)
+    by(gpu, monkeypatch)
     marched = []
     monkeypatch.setattr(gpu, "march", lambda *given: marched.append(given))
     field = field.to(DEVICE)
@@ -214,13 +288,16 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
         assert (off > 2e-3 * theirs.abs().max()).sum() <= 1, off
 
 
+@triton.jit
+def radiance_of(raw, out):
+    tl.store(out + tl.arange(0, 1), gpu_render.radiance(tl.zeros([1], tl.float32) + raw))
+
+
 @pytest.mark.parametrize("raw", [-3.0, -0.5, -0.47, 0.1, 1.9, 2.1, 40.0])
 def test_a_colour_is_decoded_as_the_field_does(raw):
-    if DEVICE == "cuda":
-        pytest.skip("a device function cannot be called from here; covered by whole rays")
-    assert float(gpu_render._radiance(np.float32(raw))) == pytest.approx(
-        float(_to_radiance(torch.tensor([raw]))), rel=1e-4, abs=1e-9
-    )
+    out = torch.empty(1, device=DEVICE)
+    radiance_of[(1,)](raw, out)
+    assert float(out) == pytest.approx(float(_to_radiance(torch.tensor([raw]))), rel=1e-4, abs=1e-9)
 
 
 def test_merging_two_lists(generator, rays):
@@ -252,16 +329,24 @@ def test_adam_leaves_entries_without_gradient_alone(generator):
     assert torch.equal(ours.cpu()[~some], start[~some])
 
 
-def test_all_kernels_compile_for_cuda():
-    """NVIDIA's code generator comes as a wheel (extra `dev`, Linux on x86-64); no GPU is needed."""
-    found = find_spec("nvidia.cuda_nvcc") if find_spec("nvidia") else None
-    if found is None or not found.submodule_search_locations:
-        pytest.skip("needs the package nvidia-cuda-nvcc-cu12, which is for Linux on x86-64")
-    home = next(iter(found.submodule_search_locations))
-    environment = {**os.environ, "CUDA_HOME": home, "NUMBA_ENABLE_CUDASIM": "0"}
+@pytest.mark.parametrize("card", [pytest.param("80", marks=pytest.mark.slow), "90"])
+def test_all_kernels_compile_for_cuda(card, tmp_path):
+    """Triton brings all that it takes; no GPU is needed."""
+    environment = {**os.environ, "TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
     script = Path(__file__).with_name("compile_kernels.py")
     done = subprocess.run(
-        [sys.executable, str(script)], env=environment, capture_output=True, text=True
+        [sys.executable, str(script), card], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert {"_march", "_composite", "_adam"} < set(done.stdout.split())
+    kernels = {
+        name
+        for module in (gpu, gpu_march, gpu_network, gpu_render)
+        for name in vars(module)
+        if is_launched(module, name)
+    }
+    assert kernels == set(done.stdout.split())
+
+
+def is_launched(module, name):
+    source = inspect.getsource(module)
+    return f"\n    {name}[(" in source or f"over({name}," in source

@@ -68,7 +68,8 @@ class Fit:
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
     capture's depth_relative files, else its depth files; none leaves both alone."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute. cuda: an NVIDIA GPU; checked in a simulator, not yet run on one."""
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler beside it; its
+    present kernels were tested without one."""
     seed: int = 0
     """Of all randomness."""
 

@@ -57,7 +57,8 @@ class Render:
     layer_format: tuple[Literal["npz", "png", "exr"], ...] = ("npz",)
     """How layers are written."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute. cuda: an NVIDIA GPU; checked in a simulator, not yet run on one."""
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler beside it; its
+    present kernels were tested without one."""
     smog: Smog = field(default_factory=Smog)
     flood: Flood = field(default_factory=Flood)
     snow: Snow = field(default_factory=Snow)

@@ -270,8 +270,8 @@ class Field(nn.Module):
 
     def raw_density(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Logarithm of the density per contracted length at unit-cube coordinates."""
-        features = dispatch.hash_encode(u, self.geometry_grid, self.geometry_resolutions)
-        return dispatch.mlp(features, _pairs(self.geometry_net))[:, 0]
+        grid, resolutions = self.geometry_grid, self.geometry_resolutions
+        return dispatch.encoded_mlp(u, grid, resolutions, _pairs(self.geometry_net))[:, 0]
 
     def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Density (1/grid unit) at unit-cube coordinates, with gradients to the parameters."""
@@ -380,8 +380,9 @@ class Field(nn.Module):
     def _coloured(
         self, u: Float[Tensor, "s 3"], ray: Int[Tensor, "s"], shared: Float[Tensor, "n h"]
     ) -> Float[Tensor, "s 3"]:
-        features = dispatch.hash_encode(u, self.appearance_grid, self.appearance_resolutions)
-        return _to_radiance(dispatch.mlp(features, _pairs(self.colour_net), shared, ray))
+        grid, resolutions = self.appearance_grid, self.appearance_resolutions
+        layers = _pairs(self.colour_net)
+        return _to_radiance(dispatch.encoded_mlp(u, grid, resolutions, layers, shared, ray))
 
     def surface_at(
         self, u: Float[Tensor, "s 3"]
@@ -391,7 +392,7 @@ class Field(nn.Module):
             grid, resolutions = self.surface_grid, self.surface_resolutions
         else:
             grid, resolutions = self.appearance_grid, self.appearance_resolutions
-        raw = dispatch.mlp(dispatch.hash_encode(u, grid, resolutions), _pairs(self.surface_net))
+        raw = dispatch.encoded_mlp(u, grid, resolutions, _pairs(self.surface_net))
         # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
         return unit_vector(raw[:, :3], 1e-6), raw[:, 3:]
 

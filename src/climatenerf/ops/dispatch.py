@@ -1,7 +1,7 @@
 """The operations as the rest of the program calls them: one function each, with gradients.
 
 The device of the tensors decides the kernel. Those of 32 bits go to Numba on a CPU (`cpu.py`), to
-Numba-CUDA on an NVIDIA GPU (`gpu.py`, the same functions); all others go to the reference, which is
+Triton on an NVIDIA GPU (`gpu.py`, the same functions); all others go to the reference, which is
 slow and always right.
 """
 
@@ -24,7 +24,7 @@ def _kernels(*tensors: Tensor) -> ModuleType | None:
     if devices == {"cpu"}:
         return cpu
     if devices == {"cuda"}:
-        from climatenerf.ops import gpu  # where there is no GPU, its libraries need not load
+        from climatenerf.ops import gpu  # where there is no GPU, Triton need not be installed
 
         return gpu
     return None
@@ -33,11 +33,7 @@ def _kernels(*tensors: Tensor) -> ModuleType | None:
 def _array(tensor: Tensor) -> Any:
     """A tensor's numbers as kernels take them; a copy if they do not lie in order."""
     tensor = tensor.detach().contiguous()
-    if tensor.is_cuda:
-        from numba import cuda
-
-        return cuda.as_cuda_array(tensor)
-    return tensor.numpy()
+    return tensor if tensor.is_cuda else tensor.numpy()
 
 
 CAPACITY = 1024  # samples a ray may have; a ray across all cascades takes 850 whole steps
@@ -237,6 +233,56 @@ def mlp(
     return reference.mlp(x, layers, shared, row)
 
 
+class _EncodedNetwork(torch.autograd.Function):
+    """An encoding and the network on it in one launch. Keeps nothing but where the samples are."""
+
+    @staticmethod
+    def forward(ctx, u, table, resolutions, shared, row, w1, b1, w2, b2):
+        from climatenerf.ops import gpu_network
+
+        rays = None if shared is None else (_array(shared), _array(row))
+        encoding, layers = (
+            (_array(table), _array(resolutions)),
+            tuple(map(_array, (w1, b1, w2, b2))),
+        )
+        u = _array(u)
+        out = torch.empty(u.shape[0], w2.shape[1], device=u.device)
+        gpu_network.network_forward(u, encoding, layers, rays, out)
+        ctx.given = u, encoding, layers, rays
+        ctx.table = table
+        return out
+
+    @staticmethod
+    def backward(ctx, grad):
+        from climatenerf.ops import gpu_network
+
+        u, encoding, layers, rays = ctx.given
+        # As `_HashEncode.backward`: the optimiser clears what it has used.
+        buffer = getattr(ctx.table, "grad_buffer", None)
+        of_table = torch.zeros_like(encoding[0]) if buffer is None else buffer
+        of_shared = None if rays is None else torch.zeros_like(rays[0])
+        of_u = torch.empty_like(u) if ctx.needs_input_grad[0] else None
+        of_layers = gpu_network.network_backward(
+            u, encoding, layers, rays, _array(grad), (of_table, of_shared, of_u)
+        )
+        return of_u, (of_table if buffer is None else None), None, of_shared, None, *of_layers
+
+
+def encoded_mlp(
+    u: Float[Tensor, "n 3"],
+    table: Float[Tensor, "levels rows 2"],
+    resolutions: Int[Tensor, "levels"],
+    layers: list[tuple[Tensor, Tensor]],
+    shared: Float[Tensor, "m h"] | None = None,
+    row: Int[Tensor, "n"] | None = None,
+) -> Float[Tensor, "n o"]:
+    """`mlp` of `hash_encode`: on a GPU in one launch, where there is one hidden layer."""
+    given = [u, table, *(each for pair in layers for each in pair)]
+    if _kernels(*given) not in (None, cpu) and len(layers) == 2:
+        return _EncodedNetwork.apply(u, table, resolutions, shared, row, *layers[0], *layers[1])
+    return mlp(hash_encode(u, table, resolutions), layers, shared, row)
+
+
 def merge_order(
     t_a: Float[Tensor, "a"],
     offsets_a: Int[Tensor, "rays+1"],
@@ -286,12 +332,16 @@ def density_slopes(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n 3"]:
     """See `reference.density_slopes`; q in grid units, no gradient."""
     kernels = _kernels(q, *net)
     table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
+    if kernels is None:
+        return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)])
+    out = torch.empty_like(q, memory_format=torch.contiguous_format)
     if kernels is cpu:
-        out = torch.empty_like(q, memory_format=torch.contiguous_format)
         cpu.density_slopes(_array(q), _cpu_net(net), _array(w1), _array(out))
-        return out
-    encode = reference.hash_encode if kernels is None else hash_encode
-    return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)], encode)
+    else:
+        from climatenerf.ops import gpu_network
+
+        gpu_network.density_slopes(_array(q), tuple(map(_array, net)), _array(out))
+    return out
 
 
 @torch.no_grad()

@@ -1,515 +1,464 @@
-"""GPU kernels in Numba-CUDA, one thread a ray or a sample; `reference.py` specifies them.
+"""GPU kernels in Triton, for blocks of samples or rays; `reference.py` specifies them.
 
-Function by function the interface of `cpu.py`, on arrays of the device, but for what is packed or
-turned for a CPU (`dispatch.cells_of`, `_cpu_net`). Nothing is compiled before
-the first launch, and no compiler is needed on the machine. Launches go to the default stream, as
-PyTorch's own do, so neither waits for the other. Numba's simulator runs the same code on the CPU
-(NUMBA_ENABLE_CUDASIM=1), which is how it is tested without a GPU.
+Function by function the interface of `cpu.py`, on tensors of the device, but for what is packed or
+turned for a CPU (`dispatch.cells_of`, `_cpu_net`); marching is in `gpu_march.py`, encodings with
+their networks are in `gpu_network.py`. Triton comes with PyTorch for CUDA and compiles at the first
+launch; no compiler need be on the machine. Its interpreter runs the same code on the CPU
+(TRITON_INTERPRET=1), which is how it is tested without a GPU.
 """
 
-# Numba's stubs take kernels for plain Python.
+# Triton's functions have no types that pyright could know.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportOptionalSubscript=false
 
-import math
+import triton
+import triton.language as tl
+from torch import Tensor
 
-import numpy as np
-from numba import cuda, float32
+from climatenerf.ops import gpu_march
+from climatenerf.ops.gpu_encoding import (
+    features_at,
+    lattice,
+    over,
+    padded,
+    pair_at,
+    points,
+    rows_of,
+    share_of,
+    unit_cube,
+)
+from climatenerf.ops.gpu_march import weight_of
 
-THREADS = 128  # of a block
-FEATURES = 64  # of an encoding, at most: they stay in the thread's own memory
-PRIME_Y = np.uint32(2654435761)
-PRIME_Z = np.uint32(805459861)
-LEAST_TAU = np.float32(1e-3)  # samples thinner than this are left out
+density_at, march = gpu_march.density_at, gpu_march.march
 
-
-def launch(kernel, count: int, *arguments: object) -> None:
-    """Runs a kernel with `count` threads or a few more."""
-    if count:
-        kernel[(count + THREADS - 1) // THREADS, THREADS](*arguments)
-
-
-# --- Python's own min and max do not compile for CUDA from Numba 0.66 on -------------------------
-
-
-@cuda.jit(device=True)
-def _low(a, b):
-    return a if a < b else b
-
-
-@cuda.jit(device=True)
-def _high(a, b):
-    return a if a > b else b
+SAMPLES = 64  # of a tile of an encoding
+LIST = 64  # rays of a block of compositing
 
 
 # --- hash encoding -------------------------------------------------------------------------------
 
 
-@cuda.jit(device=True)
-def _corner(x, y, z, resolution, size):
-    """Table row of a lattice corner: direct where the level fits its table, else hashed."""
-    side = np.uint32(resolution + 1)
-    if (resolution + 1) ** 3 <= size:
-        return np.uint32(x + side * np.uint32(y + side * z))
-    hashed = np.uint32(x ^ np.uint32(y * PRIME_Y)) ^ np.uint32(z * PRIME_Z)
-    return np.uint32(hashed) & np.uint32(size - 1)
+@triton.jit
+def both(features, i, n, some, SIZES: tl.constexpr):
+    """Where a level's first and second feature of samples lie in [2L,n], and which there are."""
+    level = tl.arange(0, SIZES[1])[None, :].to(tl.int64)
+    first = features + 2 * level * n + i[:, None]
+    return first, first + n, some[:, None] & (level < SIZES[0])
 
 
-@cuda.jit(device=True)
-def _row(ix, iy, iz, corner, resolution, size):
-    """Table row of one of a cell's eight corners; bits 0 to 2 say which side on x, y and z."""
-    x = np.uint32(ix + np.uint32(corner & 1))
-    y = np.uint32(iy + np.uint32((corner >> 1) & 1))
-    z = np.uint32(iz + np.uint32(corner >> 2))
-    return _corner(x, y, z, resolution, size)
+@triton.jit(do_not_specialize=["n"])
+def _hash_encode(u, encoding, out, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    i, some, ux, uy, uz = points(u, tl.program_id(0), n, BLOCK)
+    first, second = features_at(ux, uy, uz, some, encoding, SIZES)
+    at_first, at_second, known = both(out, i, n, some, SIZES)
+    tl.store(at_first, first, mask=known)
+    tl.store(at_second, second, mask=known)
 
 
-@cuda.jit(device=True)
-def _cell(ux, uy, uz, resolution):
-    """Lattice cell of a point and the place in it."""
-    scale = np.float32(resolution)
-    px, py, pz = ux * scale, uy * scale, uz * scale
-    ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-    return ix, iy, iz, px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
-
-
-@cuda.jit(device=True)
-def _side(f, upper):
-    """Weight of a cell's lower or upper side for a point a share f across it."""
-    return f if upper else np.float32(1.0) - f
-
-
-@cuda.jit(device=True)
-def _encode(ux, uy, uz, table, level, resolution, features):
-    """Trilinear interpolation of one level's two features, into features[2 level : 2 level + 2]."""
-    ix, iy, iz, fx, fy, fz = _cell(ux, uy, uz, resolution)
-    first, second = np.float32(0.0), np.float32(0.0)
-    for corner in range(8):
-        dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-        weight = _side(fx, dx) * _side(fy, dy) * _side(fz, dz)
-        row = _row(ix, iy, iz, corner, resolution, table.shape[1])
-        first += weight * table[level, row, 0]
-        second += weight * table[level, row, 1]
-    features[2 * level] = first
-    features[2 * level + 1] = second
-
-
-@cuda.jit
-def _hash_encode(u, table, resolutions, out):
-    i = cuda.grid(1)
-    n = u.shape[0]
-    if i < n * table.shape[0]:
-        level, p = i // n, i % n  # neighbouring threads take neighbouring points
-        pair = cuda.local.array(FEATURES, float32)
-        _encode(u[p, 0], u[p, 1], u[p, 2], table, level, resolutions[level], pair)
-        out[2 * level, p] = pair[2 * level]
-        out[2 * level + 1, p] = pair[2 * level + 1]
-
-
-def hash_encode(u, table, resolutions, out) -> None:
+def hash_encode(u: Tensor, table: Tensor, resolutions: Tensor, out: Tensor) -> None:
     """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n]."""
-    launch(_hash_encode, u.shape[0] * table.shape[0], u, table, resolutions, out)
+    n, levels, size = u.shape[0], table.shape[0], table.shape[1]
+    encoding = table, resolutions, size
+    over(_hash_encode, n, SAMPLES)(
+        u, encoding, out, n, SIZES=(levels, padded(levels)), BLOCK=SAMPLES
+    )
 
 
-@cuda.jit
-def _hash_encode_backward(u, grad_out, resolutions, grad_table):
-    i = cuda.grid(1)
-    n = u.shape[0]
-    if i < n * grad_table.shape[0]:
-        level, p = i // n, i % n
-        ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
-        if ga != 0.0 or gb != 0.0:
-            resolution = resolutions[level]
-            ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
-            for corner in range(8):
-                dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                weight = _side(fx, dx) * _side(fy, dy) * _side(fz, dz)
-                row = _row(ix, iy, iz, corner, resolution, grad_table.shape[1])
-                cuda.atomic.add(grad_table, (level, row, 0), weight * ga)
-                cuda.atomic.add(grad_table, (level, row, 1), weight * gb)
+@triton.jit(do_not_specialize=["n"])
+def _hash_encode_backward(u, grad_out, encoding, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    grad_table, resolutions, size = encoding
+    i, some, ux, uy, uz = points(u, tl.program_id(0), n, BLOCK)
+    at_first, at_second, known = both(grad_out, i, n, some, SIZES)
+    first = tl.load(at_first, mask=known, other=0.0)
+    second = tl.load(at_second, mask=known, other=0.0)
+    scatter(first, second, ux, uy, uz, known, grad_table, resolutions, size, SIZES)
 
 
-def hash_encode_backward(u, grad_out, resolutions, grad_table) -> None:
+@triton.jit
+def scatter(first, second, ux, uy, uz, known, grad_table, resolutions, size, SIZES: tl.constexpr):
+    """Adds gradients to both features of the levels [samples, levels] to the table's."""
+    cell, place, resolution = lattice(ux, uy, uz, resolutions, SIZES)
+    known = known & ((first != 0.0) | (second != 0.0))
+    for corner in tl.static_range(8):
+        at = grad_table + 2 * rows_of(cell, corner, resolution, size)
+        weight = share_of(place, corner)
+        tl.atomic_add(at, weight * first, mask=known, sem="relaxed")
+        tl.atomic_add(at + 1, weight * second, mask=known, sem="relaxed")
+
+
+def hash_encode_backward(
+    u: Tensor, grad_out: Tensor, resolutions: Tensor, grad_table: Tensor
+) -> None:
     """Adds the gradient of `hash_encode` to grad_table [L,T,2]; the sum's order is not fixed."""
-    count = u.shape[0] * grad_table.shape[0]
-    launch(_hash_encode_backward, count, u, grad_out, resolutions, grad_table)
+    n, levels, size = u.shape[0], grad_table.shape[0], grad_table.shape[1]
+    encoding = grad_table, resolutions, size
+    over(_hash_encode_backward, n, SAMPLES)(
+        u, grad_out, encoding, n, SIZES=(levels, padded(levels)), BLOCK=SAMPLES
+    )
 
 
-@cuda.jit
-def _hash_encode_slopes(u, grad_out, table, resolutions, grad_u):
-    p = cuda.grid(1)
-    if p < u.shape[0]:
-        one = np.float32(1.0)
-        tx, ty, tz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for level in range(table.shape[0]):
-            resolution = resolutions[level]
-            ga, gb = grad_out[2 * level, p], grad_out[2 * level + 1, p]
-            ix, iy, iz, fx, fy, fz = _cell(u[p, 0], u[p, 1], u[p, 2], resolution)
-            for corner in range(8):
-                dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-                row = _row(ix, iy, iz, corner, resolution, table.shape[1])
-                value = np.float32(resolution) * (
-                    ga * table[level, row, 0] + gb * table[level, row, 1]
-                )
-                wx, wy, wz = _side(fx, dx), _side(fy, dy), _side(fz, dz)
-                tx += value * wy * wz * (one if dx else -one)
-                ty += value * wx * wz * (one if dy else -one)
-                tz += value * wx * wy * (one if dz else -one)
-        grad_u[p, 0], grad_u[p, 1], grad_u[p, 2] = tx, ty, tz
+@triton.jit
+def slopes_of(first, second, ux, uy, uz, known, encoding, SIZES: tl.constexpr):
+    """Gradient to the positions from those to both features of the levels."""
+    table, resolutions, size = encoding
+    cell, place, resolution = lattice(ux, uy, uz, resolutions, SIZES)
+    fx, fy, fz = place
+    tx, ty, tz = tl.zeros_like(fx), tl.zeros_like(fx), tl.zeros_like(fx)
+    for corner in tl.static_range(8):
+        a, b = pair_at(table, rows_of(cell, corner, resolution, size), known)
+        value = first * a + second * b
+        wx = fx if corner & 1 else 1.0 - fx
+        wy = fy if corner >> 1 & 1 else 1.0 - fy
+        wz = fz if corner >> 2 else 1.0 - fz
+        tx += value * wy * wz * (1.0 if corner & 1 else -1.0)
+        ty += value * wx * wz * (1.0 if corner >> 1 & 1 else -1.0)
+        tz += value * wx * wy * (1.0 if corner >> 2 else -1.0)
+    scale = resolution.to(tl.float32)[None, :]
+    return tl.sum(tx * scale, 1), tl.sum(ty * scale, 1), tl.sum(tz * scale, 1)
 
 
-def hash_encode_slopes(u, grad_out, table, resolutions, grad_u) -> None:
+@triton.jit(do_not_specialize=["n"])
+def _hash_encode_slopes(u, grad_out, encoding, grad_u, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    i, some, ux, uy, uz = points(u, tl.program_id(0), n, BLOCK)
+    at_first, at_second, known = both(grad_out, i, n, some, SIZES)
+    first = tl.load(at_first, mask=known, other=0.0)
+    second = tl.load(at_second, mask=known, other=0.0)
+    gx, gy, gz = slopes_of(first, second, ux, uy, uz, known, encoding, SIZES)
+    tl.store(grad_u + 3 * i, gx, mask=some)
+    tl.store(grad_u + 3 * i + 1, gy, mask=some)
+    tl.store(grad_u + 3 * i + 2, gz, mask=some)
+
+
+def hash_encode_slopes(
+    u: Tensor, grad_out: Tensor, table: Tensor, resolutions: Tensor, grad_u: Tensor
+) -> None:
     """Gradient of `hash_encode` to the positions: grad_out [2L,n] → grad_u [n,3]."""
-    launch(_hash_encode_slopes, u.shape[0], u, grad_out, table, resolutions, grad_u)
+    n, levels, size = u.shape[0], table.shape[0], table.shape[1]
+    encoding = table, resolutions, size
+    over(_hash_encode_slopes, n, SAMPLES)(
+        u, grad_out, encoding, grad_u, n, SIZES=(levels, padded(levels)), BLOCK=SAMPLES
+    )
 
 
-# --- density and marching ------------------------------------------------------------------------
+# --- lists of samples: a block of rays goes along them side by side ------------------------------
 
 
-@cuda.jit(device=True)
-def _unit_cube(qx, qy, qz, u):
-    """Contraction into the unit cube, → u [3]; returns the distance from the centre."""
-    m = math.sqrt(qx * qx + qy * qy + qz * qz)
-    one, two, quarter = np.float32(1.0), np.float32(2.0), np.float32(0.25)
-    s = quarter * (one if m <= one else (two - one / m) / m)
-    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
-    u[0] = _low(_high(qx * s + half, low), high)
-    u[1] = _low(_high(qy * s + half, low), high)
-    u[2] = _low(_high(qz * s + half, low), high)
-    return m
+@triton.jit
+def _lists(offsets, n, BLOCK: tl.constexpr):
+    """A block's rays, where their samples begin, and how many they are (0 beyond the last ray)."""
+    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    some = r < n
+    first = tl.load(offsets + r, mask=some, other=0)
+    return r, first, tl.load(offsets + r + 1, mask=some, other=0) - first
 
 
-@cuda.jit(device=True)
-def _density(q, net, u, features):
-    """Density (1/grid unit) at q [3]; u [3] and features are room to work in, u its coordinates."""
-    table, resolutions, w1, b1, w2, b2 = net
-    m = _unit_cube(q[0], q[1], q[2], u)
-    for level in range(table.shape[0]):
-        _encode(u[0], u[1], u[2], table, level, resolutions[level], features)
-    raw = b2[0]
-    for j in range(w1.shape[1]):
-        h = b1[j]
-        for i in range(w1.shape[0]):
-            h += features[i] * w1[i, j]
-        raw += _high(h, np.float32(0.0)) * w2[j, 0]
-    return math.exp(_low(raw, np.float32(15.0))) / _high(m * m, np.float32(1.0))
+@triton.jit(do_not_specialize=["n", "total"])
+def _pack(rows, offsets, out, n, total, capacity, BLOCK: tl.constexpr):
+    r, first, count = _lists(offsets, n, BLOCK)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        some = k < count
+        for kind in tl.static_range(3):
+            value = tl.load(rows + (kind * capacity + k) * n + r, mask=some)
+            tl.store(out + kind * total + first + k, value, mask=some)
+        k += 1
 
 
-@cuda.jit
-def _density_at(q, net, out):
-    p = cuda.grid(1)
-    if p < q.shape[0]:
-        u = cuda.local.array(3, float32)
-        features = cuda.local.array(FEATURES, float32)
-        out[p] = _density(q[p], net, u, features)
-
-
-def density_at(q, net, out) -> None:
-    """Density (1/grid unit) at q [n,3] in grid units → out [n]."""
-    launch(_density_at, q.shape[0], q, net, out)
-
-
-@cuda.jit(device=True)
-def _exit(o, d, index, cell, half):
-    """Ray length at which the ray leaves the lattice cell of side `cell`, along one axis."""
-    if d == np.float32(0.0):
-        return np.float32(1e30)
-    return (np.float32(index + 1 if d > 0 else index) * cell - half - o) / d
-
-
-@cuda.jit(device=True)
-def _next(o, d, t, end, cells, steps, place):
-    """The next step in an occupied cell: its start, or `end` if there is none; place [4] gets its
-    middle and the step's length."""
-    occupied, blocks = cells
-    cascades, side = occupied.shape[0], occupied.shape[1]
-    size = side // blocks.shape[1]
-    dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
-    one, two = np.float32(1.0), np.float32(2.0)
-    while t < end:
-        dt = _low(_high(dt_min, cone * t), end - t)
-        tm = t + np.float32(0.5) * dt
-        qx, qy, qz = o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
-        m = _high(_high(abs(qx), abs(qy)), abs(qz))
-        cascade, half = 0, one
-        while m > half and cascade < cascades - 1:
-            half *= two
-            cascade += 1
-        cell = two * half / np.float32(side)
-        ix = _low(_high(int((qx + half) / cell), 0), side - 1)
-        iy = _low(_high(int((qy + half) / cell), 0), side - 1)
-        iz = _low(_high(int((qz + half) / cell), 0), side - 1)
-        if not blocks[cascade, ix // size, iy // size, iz // size]:
-            cell *= np.float32(size)
-            ix, iy, iz = ix // size, iy // size, iz // size
-        elif occupied[cascade, ix, iy, iz]:
-            place[0], place[1], place[2], place[3] = qx, qy, qz, dt
-            return t
-        leave = _exit(o[0], d[0], ix, cell, half)
-        leave = _low(leave, _exit(o[1], d[1], iy, cell, half))
-        leave = _low(leave, _exit(o[2], d[2], iz, cell, half))
-        # Whole steps, so that the sampling comb does not depend on the cells crossed.
-        t += dt * _high(np.float32(math.ceil((leave - tm) / dt)), one)
-    return end
-
-
-@cuda.jit(device=True)
-def _clip(o, d, far, span):
-    """Cuts span [2] to the part of the ray within the outermost cube."""
-    for axis in range(3):
-        if d[axis] == np.float32(0.0):
-            if o[axis] < -far or o[axis] > far:
-                span[1] = np.float32(-1.0)
-        else:
-            a, b = (-far - o[axis]) / d[axis], (far - o[axis]) / d[axis]
-            span[0] = _high(span[0], _low(a, b))
-            span[1] = _low(span[1], _high(a, b))
-
-
-@cuda.jit(device=True)
-def _begin(rays, r, spans, cells, steps, o, d, span):
-    """Ray r into o and d [3]; into span [2] where its comb begins and ends in the cells."""
-    for axis in range(3):
-        o[axis], d[axis] = rays[0][r, axis], rays[1][r, axis]
-    span[0], span[1] = spans[r, 0], spans[r, 1]
-    _clip(o, d, np.float32(2.0 ** (cells[0].shape[0] - 1)), span)
-    span[0] += spans[r, 2] * _high(np.float32(steps[0]), np.float32(steps[1]) * span[0])
-
-
-@cuda.jit
-def _march(rays, spans, cells, steps, stop, net, rows, counts):
-    r = cuda.grid(1)
-    if r >= spans.shape[0]:
-        return
-    o, d = cuda.local.array(3, float32), cuda.local.array(3, float32)
-    u, span = cuda.local.array(3, float32), cuda.local.array(2, float32)
-    place, features = cuda.local.array(4, float32), cuda.local.array(FEATURES, float32)
-    _begin(rays, r, spans, cells, steps, o, d, span)
-    t, end = span[0], span[1]
-    tau, enough = np.float32(0.0), np.float32(-math.log(stop))
-    k, capacity = 0, rows.shape[1]
-    while k < capacity and tau < enough:
-        t = _next(o, d, t, end, cells, steps, place)
-        if t >= end:
-            break
-        dt = place[3]
-        sigma = _density(place, net, u, features)
-        if sigma * dt > LEAST_TAU:
-            # By step, then by ray: neighbouring threads write side by side.
-            rows[0, k, r] = t + np.float32(0.5) * dt
-            rows[1, k, r] = dt
-            rows[2, k, r] = sigma
-            tau += sigma * dt
-            k += 1
-        t += dt
-    counts[r] = k
-
-
-def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts) -> None:
-    """Marches rays front to back through occupied space, evaluating density on the way.
-
-    Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
-    cells = (occupied [K,G,G,G], the same for blocks); steps = (smallest step, step per length);
-    stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
-    rows [3, capacity, n] receive t, dt and sigma, counts [n] how many.
-    """
-    launch(_march, spans.shape[0], (rays_o, rays_d), spans, cells, steps, stop, net, rows, counts)
-
-
-@cuda.jit
-def _pack(rows, offsets, out):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        for k in range(offsets[r + 1] - offsets[r]):
-            for kind in range(3):
-                out[kind, offsets[r] + k] = rows[kind, k, r]
-
-
-def pack(rows, offsets, out) -> None:
+def pack(rows: Tensor, offsets: Tensor, out: Tensor) -> None:
     """Packs what `march` has left in rows into out [3, samples]."""
-    launch(_pack, offsets.shape[0] - 1, rows, offsets, out)
+    n = offsets.shape[0] - 1
+    over(_pack, n, LIST)(rows, offsets, out, n, out.shape[1], rows.shape[1], BLOCK=LIST)
 
 
-@cuda.jit
-def _grid_positions(rays_o, rays_d, offsets, t, out):
-    r = cuda.grid(1)
-    if r < rays_o.shape[0]:
-        u = cuda.local.array(3, float32)
-        for i in range(offsets[r], offsets[r + 1]):
-            _unit_cube(
-                rays_o[r, 0] + t[i] * rays_d[r, 0],
-                rays_o[r, 1] + t[i] * rays_d[r, 1],
-                rays_o[r, 2] + t[i] * rays_d[r, 2],
-                u,
-            )
-            out[i, 0], out[i, 1], out[i, 2] = u[0], u[1], u[2]
+@triton.jit(do_not_specialize=["n"])
+def _grid_positions(rays_o, rays_d, offsets, t, out, n, BLOCK: tl.constexpr):
+    r, first, count = _lists(offsets, n, BLOCK)
+    some = r < n
+    ox = tl.load(rays_o + 3 * r, mask=some)
+    oy = tl.load(rays_o + 3 * r + 1, mask=some)
+    oz = tl.load(rays_o + 3 * r + 2, mask=some)
+    dx = tl.load(rays_d + 3 * r, mask=some)
+    dy = tl.load(rays_d + 3 * r + 1, mask=some)
+    dz = tl.load(rays_d + 3 * r + 2, mask=some)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        i, own = first + k, k < count
+        far = tl.load(t + i, mask=own, other=0.0)
+        ux, uy, uz, _ = unit_cube(ox + far * dx, oy + far * dy, oz + far * dz)
+        tl.store(out + 3 * i, ux, mask=own)
+        tl.store(out + 3 * i + 1, uy, mask=own)
+        tl.store(out + 3 * i + 2, uz, mask=own)
+        k += 1
 
 
-def grid_positions(rays_o, rays_d, offsets, t, u) -> None:
+def grid_positions(rays_o: Tensor, rays_d: Tensor, offsets: Tensor, t: Tensor, u: Tensor) -> None:
     """Unit-cube coordinates (after contraction) of packed samples: → u [samples,3]."""
-    launch(_grid_positions, rays_o.shape[0], rays_o, rays_d, offsets, t, u)
+    n = rays_o.shape[0]
+    over(_grid_positions, n, LIST)(rays_o, rays_d, offsets, t, u, n, BLOCK=LIST)
 
 
-# --- compositing: a thread a ray -----------------------------------------------------------------
+@triton.jit(do_not_specialize=["n"])
+def _weights_forward(tau, offsets, weights, transmittance, n, BLOCK: tl.constexpr):
+    r, first, count = _lists(offsets, n, BLOCK)
+    total = tl.zeros([BLOCK], tl.float32)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        own = tl.load(tau + first + k, mask=k < count, other=0.0)
+        tl.store(weights + first + k, weight_of(total, own), mask=k < count)
+        total += own
+        k += 1
+    tl.store(transmittance + r, tl.exp(-total), mask=r < n)
 
 
-@cuda.jit
-def _weights_forward(tau, offsets, weights, transmittance):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        total = np.float32(0.0)
-        for i in range(offsets[r], offsets[r + 1]):
-            before = math.exp(-total)
-            total += tau[i]
-            weights[i] = before * -math.expm1(-tau[i])
-        transmittance[r] = math.exp(-total)
-
-
-def weights_forward(tau, offsets, weights, transmittance) -> None:
+def weights_forward(tau: Tensor, offsets: Tensor, weights: Tensor, transmittance: Tensor) -> None:
     """Rendering weights of packed samples with optical depths tau; transmittance left per ray."""
-    launch(_weights_forward, offsets.shape[0] - 1, tau, offsets, weights, transmittance)
+    n = offsets.shape[0] - 1
+    over(_weights_forward, n, LIST)(tau, offsets, weights, transmittance, n, BLOCK=LIST)
 
 
-@cuda.jit
-def _weights_backward(tau, offsets, grad_w, grad_t, grad_tau):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        total = np.float32(0.0)
-        for i in range(offsets[r], offsets[r + 1]):
-            total += tau[i]
-        behind = grad_t[r] * math.exp(-total)
-        for i in range(offsets[r + 1] - 1, offsets[r] - 1, -1):
-            after = math.exp(-total)
-            total -= tau[i]
-            grad_tau[i] = grad_w[i] * after - behind
-            behind += grad_w[i] * math.exp(-total) * -math.expm1(-tau[i])
+@triton.jit(do_not_specialize=["n"])
+def _weights_backward(tau, offsets, grad_w, grad_t, grad_tau, n, BLOCK: tl.constexpr):
+    r, first, count = _lists(offsets, n, BLOCK)
+    total = tl.zeros([BLOCK], tl.float32)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        total += tl.load(tau + first + k, mask=k < count, other=0.0)
+        k += 1
+    behind = tl.load(grad_t + r, mask=r < n, other=0.0) * tl.exp(-total)
+    j = 0
+    while j < longest:
+        i, known = first + count - 1 - j, j < count  # from the last on
+        own = tl.load(tau + i, mask=known, other=0.0)
+        grad = tl.load(grad_w + i, mask=known, other=0.0)
+        after = tl.exp(-total)
+        total -= own
+        tl.store(grad_tau + i, grad * after - behind, mask=known)
+        behind += grad * weight_of(total, own)
+        j += 1
 
 
-def weights_backward(tau, offsets, grad_w, grad_t, grad_tau) -> None:
+def weights_backward(
+    tau: Tensor, offsets: Tensor, grad_w: Tensor, grad_t: Tensor, grad_tau: Tensor
+) -> None:
     """Gradient of `weights_forward`."""
-    launch(_weights_backward, offsets.shape[0] - 1, tau, offsets, grad_w, grad_t, grad_tau)
+    n = offsets.shape[0] - 1
+    over(_weights_backward, n, LIST)(tau, offsets, grad_w, grad_t, grad_tau, n, BLOCK=LIST)
 
 
-@cuda.jit
-def _accumulate_forward(weights, values, offsets, out):
-    i = cuda.grid(1)
-    channels = values.shape[1]
-    if i < (offsets.shape[0] - 1) * channels:
-        r, c = i // channels, i % channels
-        total = np.float32(0.0)
-        for k in range(offsets[r], offsets[r + 1]):
-            total += weights[k] * values[k, c]
-        out[r, c] = total
+def _channels(values: Tensor) -> dict[str, object]:
+    return {"CHANNELS": values.shape[1], "WIDTH": triton.next_power_of_2(values.shape[1])}
 
 
-def accumulate_forward(weights, values, offsets, out) -> None:
+@triton.jit(do_not_specialize=["n"])
+def _accumulate_forward(
+    weights,
+    values,
+    offsets,
+    out,
+    n,
+    CHANNELS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    r, first, count = _lists(offsets, n, BLOCK)
+    c = tl.arange(0, WIDTH)[None, :]
+    total = tl.zeros([BLOCK, WIDTH], tl.float32)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        i, own = first + k, k < count
+        weight = tl.load(weights + i, mask=own, other=0.0)
+        known = own[:, None] & (c < CHANNELS)
+        value = tl.load(values + i[:, None] * CHANNELS + c, mask=known, other=0.0)
+        total += weight[:, None] * value
+        k += 1
+    tl.store(out + r[:, None] * CHANNELS + c, total, mask=(r < n)[:, None] & (c < CHANNELS))
+
+
+def accumulate_forward(weights: Tensor, values: Tensor, offsets: Tensor, out: Tensor) -> None:
     """Sum over each ray of weights [s] · values [s,c] → out [rays,c]."""
-    count = (offsets.shape[0] - 1) * values.shape[1]
-    launch(_accumulate_forward, count, weights, values, offsets, out)
+    n = offsets.shape[0] - 1
+    over(_accumulate_forward, n, LIST)(
+        weights, values, offsets, out, n, **_channels(values), BLOCK=LIST
+    )
 
 
-@cuda.jit
-def _accumulate_backward(weights, values, offsets, grad_out, grad_w, grad_v):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        for i in range(offsets[r], offsets[r + 1]):
-            total = np.float32(0.0)
-            for c in range(values.shape[1]):
-                total += grad_out[r, c] * values[i, c]
-                grad_v[i, c] = grad_out[r, c] * weights[i]
-            grad_w[i] = total
+@triton.jit(do_not_specialize=["n"])
+def _accumulate_backward(
+    weights,
+    values,
+    offsets,
+    grad_out,
+    grad_w,
+    grad_v,
+    n,
+    CHANNELS: tl.constexpr,
+    WIDTH: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    r, first, count = _lists(offsets, n, BLOCK)
+    c = tl.arange(0, WIDTH)[None, :]
+    some = (r < n)[:, None] & (c < CHANNELS)
+    grad = tl.load(grad_out + r[:, None] * CHANNELS + c, mask=some, other=0.0)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        i, own = first + k, k < count
+        known = own[:, None] & (c < CHANNELS)
+        at = i[:, None] * CHANNELS + c
+        value = tl.load(values + at, mask=known, other=0.0)
+        weight = tl.load(weights + i, mask=own, other=0.0)
+        tl.store(grad_v + at, grad * weight[:, None], mask=known)
+        tl.store(grad_w + i, tl.sum(grad * value, 1), mask=own)
+        k += 1
 
 
-def accumulate_backward(weights, values, offsets, grad_out, grad_w, grad_v) -> None:
+def accumulate_backward(
+    weights: Tensor,
+    values: Tensor,
+    offsets: Tensor,
+    grad_out: Tensor,
+    grad_w: Tensor,
+    grad_v: Tensor,
+) -> None:
     """Gradient of `accumulate_forward`."""
-    count = offsets.shape[0] - 1
-    launch(_accumulate_backward, count, weights, values, offsets, grad_out, grad_w, grad_v)
+    n = offsets.shape[0] - 1
+    over(_accumulate_backward, n, LIST)(
+        weights, values, offsets, grad_out, grad_w, grad_v, n, **_channels(values), BLOCK=LIST
+    )
 
 
-@cuda.jit
-def _distortion_forward(weights, s, ds, offsets, out):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        two, third = np.float32(2.0), np.float32(1.0 / 3.0)
-        total, w_sum, ws_sum = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for i in range(offsets[r], offsets[r + 1]):
-            total += two * weights[i] * (s[i] * w_sum - ws_sum)
-            total += weights[i] * weights[i] * ds[i] * third
-            w_sum += weights[i]
-            ws_sum += weights[i] * s[i]
-        out[r] = total
+@triton.jit(do_not_specialize=["n"])
+def _distortion_forward(weights, s, ds, offsets, out, n, BLOCK: tl.constexpr):
+    r, first, count = _lists(offsets, n, BLOCK)
+    total = tl.zeros([BLOCK], tl.float32)
+    w_sum, ws_sum = tl.zeros_like(total), tl.zeros_like(total)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        i, own = first + k, k < count
+        w = tl.load(weights + i, mask=own, other=0.0)
+        p = tl.load(s + i, mask=own, other=0.0)
+        width = tl.load(ds + i, mask=own, other=0.0)
+        total += 2.0 * w * (p * w_sum - ws_sum) + w * w * width * (1.0 / 3.0)
+        w_sum += w
+        ws_sum += w * p
+        k += 1
+    tl.store(out + r, total, mask=r < n)
 
 
-def distortion_forward(weights, s, ds, offsets, out) -> None:
+def distortion_forward(
+    weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor, out: Tensor
+) -> None:
     """Distortion loss per ray, in linear time (DVGOv2); see `reference.distortion`."""
-    launch(_distortion_forward, offsets.shape[0] - 1, weights, s, ds, offsets, out)
+    n = offsets.shape[0] - 1
+    over(_distortion_forward, n, LIST)(weights, s, ds, offsets, out, n, BLOCK=LIST)
 
 
-@cuda.jit
-def _distortion_backward(weights, s, ds, offsets, grad_out, grad_w):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        two, third = np.float32(2.0), np.float32(1.0 / 3.0)
-        w_all, ws_all = np.float32(0.0), np.float32(0.0)
-        for i in range(offsets[r], offsets[r + 1]):
-            w_all += weights[i]
-            ws_all += weights[i] * s[i]
-        w_sum, ws_sum = np.float32(0.0), np.float32(0.0)
-        for i in range(offsets[r], offsets[r + 1]):
-            w, p = weights[i], s[i]
-            before = p * w_sum - ws_sum
-            w_sum += w
-            ws_sum += w * p
-            after = (ws_all - ws_sum) - p * (w_all - w_sum)
-            grad_w[i] = grad_out[r] * two * (before + after + w * ds[i] * third)
+@triton.jit(do_not_specialize=["n"])
+def _distortion_backward(weights, s, ds, offsets, grad_out, grad_w, n, BLOCK: tl.constexpr):
+    r, first, count = _lists(offsets, n, BLOCK)
+    longest = tl.max(count, 0)
+    w_all = tl.zeros([BLOCK], tl.float32)
+    ws_all, w_sum, ws_sum = tl.zeros_like(w_all), tl.zeros_like(w_all), tl.zeros_like(w_all)
+    k = 0
+    while k < longest:
+        w = tl.load(weights + first + k, mask=k < count, other=0.0)
+        w_all += w
+        ws_all += w * tl.load(s + first + k, mask=k < count, other=0.0)
+        k += 1
+    grad = tl.load(grad_out + r, mask=r < n, other=0.0)
+    k = 0
+    while k < longest:
+        i, own = first + k, k < count
+        w = tl.load(weights + i, mask=own, other=0.0)
+        p = tl.load(s + i, mask=own, other=0.0)
+        width = tl.load(ds + i, mask=own, other=0.0)
+        before = p * w_sum - ws_sum
+        w_sum += w
+        ws_sum += w * p
+        after = (ws_all - ws_sum) - p * (w_all - w_sum)
+        each = grad * 2.0 * (before + after + w * width * (1.0 / 3.0))
+        tl.store(grad_w + i, each, mask=own)
+        k += 1
 
 
-def distortion_backward(weights, s, ds, offsets, grad_out, grad_w) -> None:
+def distortion_backward(
+    weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor, grad_out: Tensor, grad_w: Tensor
+) -> None:
     """Gradient of `distortion_forward` to the weights."""
-    count = offsets.shape[0] - 1
-    launch(_distortion_backward, count, weights, s, ds, offsets, grad_out, grad_w)
+    n = offsets.shape[0] - 1
+    over(_distortion_backward, n, LIST)(weights, s, ds, offsets, grad_out, grad_w, n, BLOCK=LIST)
 
 
-@cuda.jit
-def _merge_order(t_a, offsets_a, t_b, offsets_b, offsets, order):
-    r = cuda.grid(1)
-    if r < offsets.shape[0] - 1:
-        i, j, shift = offsets_a[r], offsets_b[r], t_a.shape[0]
-        for k in range(offsets[r], offsets[r + 1]):
-            if j >= offsets_b[r + 1] or (i < offsets_a[r + 1] and t_a[i] <= t_b[j]):
-                order[k] = i
-                i += 1
-            else:
-                order[k] = shift + j
-                j += 1
+@triton.jit(do_not_specialize=["n", "shift"])
+def _merge_order(t_a, offsets_a, t_b, offsets_b, offsets, order, n, shift, BLOCK: tl.constexpr):
+    r, i, count_a = _lists(offsets_a, n, BLOCK)
+    _, j, count_b = _lists(offsets_b, n, BLOCK)
+    _, first, count = _lists(offsets, n, BLOCK)
+    last_a, last_b = i + count_a, j + count_b
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        more_a, more_b = i < last_a, j < last_b
+        a = tl.load(t_a + i, mask=more_a, other=float("inf"))
+        b = tl.load(t_b + j, mask=more_b, other=float("inf"))
+        from_a = more_a & ((a <= b) | (j >= last_b))
+        tl.store(order + first + k, tl.where(from_a, i, shift + j), mask=k < count)
+        i += from_a.to(tl.int64)
+        j += (more_b & (from_a == 0)).to(tl.int64)
+        k += 1
 
 
-def merge_order(t_a, offsets_a, t_b, offsets_b, offsets, order) -> None:
+def merge_order(
+    t_a: Tensor, offsets_a: Tensor, t_b: Tensor, offsets_b: Tensor, offsets: Tensor, order: Tensor
+) -> None:
     """Order that merges two packed sample lists by t; indices ≥ len(t_a) mean list b."""
-    launch(_merge_order, offsets.shape[0] - 1, t_a, offsets_a, t_b, offsets_b, offsets, order)
+    n, shift = offsets.shape[0] - 1, t_a.shape[0]
+    over(_merge_order, n, LIST)(
+        t_a, offsets_a, t_b, offsets_b, offsets, order, n, shift, BLOCK=LIST
+    )
 
 
 # --- the optimiser's -----------------------------------------------------------------------------
 
 
-@cuda.jit
-def _adam(parameter, gradient, first, second, rates):
-    i = cuda.grid(1)
-    if i < parameter.shape[0]:
-        g = gradient[i]
-        if g != np.float32(0.0):
-            rate, beta1, beta2, epsilon, correction1, correction2 = rates
-            one = np.float32(1.0)
-            m = beta1 * first[i] + (one - beta1) * g
-            v = beta2 * second[i] + (one - beta2) * g * g
-            first[i] = m
-            second[i] = v
-            parameter[i] -= rate * (m / correction1) / (math.sqrt(v / correction2) + epsilon)
-            gradient[i] = np.float32(0.0)
+@triton.jit(do_not_specialize=["n", "rate", "correction1", "correction2"])
+def _adam(
+    parameter,
+    gradient,
+    first,
+    second,
+    n,
+    rate,
+    beta1,
+    beta2,
+    epsilon,
+    correction1,
+    correction2,
+    BLOCK: tl.constexpr,
+):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    g = tl.load(gradient + i, mask=i < n, other=0.0)
+    own = g != 0.0
+    m = beta1 * tl.load(first + i, mask=own, other=0.0) + (1.0 - beta1) * g
+    v = beta2 * tl.load(second + i, mask=own, other=0.0) + (1.0 - beta2) * g * g
+    tl.store(first + i, m, mask=own)
+    tl.store(second + i, v, mask=own)
+    move = rate * (m / correction1) / (tl.sqrt(v / correction2) + epsilon)
+    tl.store(parameter + i, tl.load(parameter + i, mask=own, other=0.0) - move, mask=own)
+    tl.store(gradient + i, tl.zeros_like(g), mask=own)
 
 
-def adam(parameter, gradient, first, second, *rates) -> None:
+def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *rates: float) -> None:
     """One Adam step over flat arrays that leaves entries without gradient untouched.
 
     Rates: rate, beta1, beta2, epsilon, and the corrections of both moments.
     """
-    launch(_adam, parameter.shape[0], parameter, gradient, first, second, rates)
+    n = parameter.shape[0]
+    over(_adam, n, 1024)(parameter, gradient, first, second, n, *map(float, rates), BLOCK=1024)

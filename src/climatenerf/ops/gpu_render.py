@@ -1,98 +1,150 @@
-"""Whole rays on a GPU, one thread each: march, encode, both networks, composite, in one launch.
+"""Whole rays on a GPU, a block at a time: march, encode, both networks, composite, in one launch.
 
-The twin is the composition of the operations (`Field.composited` on the CPU). Nothing is stored for
-the samples, so memory does not grow with them. In Numba-CUDA, as `gpu.py`, whose march this shares.
+The twin is the composition of the operations (`Field.composited` on the CPU). Nothing is stored
+for the samples, so memory does not grow with them. In Triton, with the walk of `gpu_march.py`.
 """
 
-# Numba's stubs take kernels for plain Python.
+# Triton's functions have no types that pyright could know.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 
 import math
 
-import numpy as np
-from numba import cuda, float32
+import triton
+import triton.language as tl
+from torch import Tensor
 
-from climatenerf.ops.gpu import FEATURES, LEAST_TAU, _begin, _density, _encode, _next, launch
+from climatenerf.ops.gpu_encoding import (
+    FAST,
+    density_layers,
+    density_of,
+    features_at,
+    first_layer,
+    hidden_of,
+    over,
+    sizes_of,
+    unit_cube,
+)
+from climatenerf.ops.gpu_march import (
+    LEAST_TAU,
+    RAYS,
+    TRIES,
+    WARPS,
+    begin,
+    cells_of,
+    step_at,
+    walk,
+    weight_of,
+)
 
-SHARPNESS = np.float32(8.0)  # of the softplus; see `field.field._to_radiance`
+SHARPNESS = tl.constexpr(8.0)  # of the softplus; see `field.field._to_radiance`
+BRIGHT = tl.constexpr(2.4 / 1.055)  # slope beyond white; see `field.colour_space.decode_srgb`
 
-BRIGHT = np.float32(2.4 / 1.055)  # slope beyond white; see `field.colour_space.decode_srgb`
 
-
-@cuda.jit(device=True)
-def _radiance(raw):
+@triton.jit
+def radiance(raw):
     """Network output to linear radiance: softplus, then the display curve undone."""
-    x = raw + np.float32(0.5)
-    if SHARPNESS * x <= np.float32(20.0):  # beyond it is the identity, and exp would overflow
-        x = math.log1p(math.exp(SHARPNESS * x)) / SHARPNESS
-    if x <= np.float32(0.04045):
-        return x / np.float32(12.92)
-    if x > np.float32(1.0):
-        return np.float32(1.0) + (x - np.float32(1.0)) * BRIGHT
-    return ((x + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
+    x = raw + 0.5
+    # Far up it is the identity, and exp would overflow; far down exp alone, and 1 would swallow it.
+    e = tl.exp(tl.minimum(x * SHARPNESS, 20.0))
+    soft = tl.where(e < 1e-3, e * (1.0 - 0.5 * e), tl.log(1.0 + e)) / SHARPNESS
+    x = tl.where(x * SHARPNESS <= 20.0, soft, x)
+    curve = tl.exp2(2.4 * tl.log2((tl.maximum(x, 0.04045) + 0.055) / 1.055))
+    bright = 1.0 + (x - 1.0) * BRIGHT
+    return tl.where(x <= 0.04045, x / 12.92, tl.where(x > 1.0, bright, curve))
 
 
-@cuda.jit(device=True)
-def _colour(u, colours, shared, r, features, rgb):
-    """Linear radiance at unit-cube u [3] on ray r, into rgb [3]."""
-    table, resolutions, w1, b1, w2, b2 = colours
-    for level in range(table.shape[0]):
-        _encode(u[0], u[1], u[2], table, level, resolutions[level], features)
-    for c in range(3):
-        rgb[c] = b2[c]
-    for j in range(w1.shape[1]):
-        h = b1[j] + shared[r, j]
-        for i in range(w1.shape[0]):
-            h += features[i] * w1[i, j]
-        if h > 0:
-            for c in range(3):
-                rgb[c] += h * w2[j, c]
-    for c in range(3):
-        rgb[c] = _radiance(rgb[c])
-
-
-@cuda.jit
-def _composite(rays, spans, cells, steps, limits, net, colours, shared, out):
-    r = cuda.grid(1)
-    if r >= spans.shape[0]:
-        return
-    o, d = cuda.local.array(3, float32), cuda.local.array(3, float32)
-    u, span = cuda.local.array(3, float32), cuda.local.array(2, float32)
-    place, features = cuda.local.array(4, float32), cuda.local.array(FEATURES, float32)
-    rgb, total = cuda.local.array(3, float32), cuda.local.array(4, float32)
-    for c in range(4):
-        total[c] = np.float32(0.0)
-    _begin(rays, r, spans, cells, steps, o, d, span)
-    t, end = span[0], span[1]
-    left, stop, least = np.float32(1.0), np.float32(limits[0]), np.float32(limits[1])
-    tau, enough = np.float32(0.0), -math.log(stop)
-    while tau < enough:
-        t = _next(o, d, t, end, cells, steps, place)
-        if t >= end:
-            break
-        dt = place[3]
-        own = _density(place, net, u, features) * dt
-        if own > LEAST_TAU:
-            weight = left * -math.expm1(-own)
+@triton.jit(do_not_specialize=["n"])
+def _composite(
+    rays,
+    spans,
+    cells,
+    steps,
+    limits,
+    density,
+    colour,
+    shared,
+    out,
+    n,
+    SIZES: tl.constexpr,
+    SIZES_C: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    r, some, o, d, t, end = begin(rays, spans, cells[2][0], steps, n, BLOCK)
+    layers = density_layers(density[1], SIZES)
+    w1, b1, w2, b2 = colour[1]
+    layer = first_layer(w1, b1, SIZES_C)
+    HIDDEN: tl.constexpr = SIZES_C[3]
+    unit, c = tl.arange(0, SIZES_C[2]), tl.arange(0, 16)
+    known = (unit < HIDDEN)[:, None] & (c < 3)[None, :]
+    second_layer = tl.load(w2 + unit[:, None] * 3 + c[None, :], mask=known, other=0.0)
+    bias = tl.load(b2 + c, mask=c < 3, other=0.0)
+    known = some[:, None] & (unit < HIDDEN)[None, :]
+    own_shared = tl.load(shared + r[:, None] * HIDDEN + unit[None, :], mask=known, other=0.0)
+    tau, far = tl.zeros_like(t), tl.zeros_like(t)
+    rgb = tl.zeros([BLOCK, 16], tl.float32)
+    live = some & (t < end)
+    while tl.max(live.to(tl.int32), 0) > 0:
+        found = tl.zeros_like(t).to(tl.int32)
+        for _try in range(TRIES):
+            t, found = walk(o, d, t, end, live & (t < end), found, cells, steps)
+        here = found > 0
+        if tl.max(found, 0) > 0:
+            dt = step_at(t, end, steps)
+            tm = t + 0.5 * dt
+            qx, qy, qz = o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
+            own = density_of(qx, qy, qz, here, density[0], layers, SIZES) * dt
+            own = tl.where(here & (own > LEAST_TAU), own, 0.0)
+            weight = weight_of(tau, own)
             tau += own
-            left = math.exp(-tau)
-            total[3] += weight * (t + np.float32(0.5) * dt)
-            if weight > least:
-                _colour(u, colours, shared, r, features, rgb)
-                for c in range(3):
-                    total[c] += weight * rgb[c]
-        t += dt
-    for c in range(4):
-        out[r, c] = total[c]
-    out[r, 4] = left
+            far += weight * tm
+            heavy = weight > limits[1]
+            if tl.max(heavy.to(tl.int32), 0) > 0:
+                ux, uy, uz, _distance = unit_cube(qx, qy, qz)
+                first, second = features_at(ux, uy, uz, heavy, colour[0], SIZES_C)
+                h = tl.maximum(hidden_of(first, second, layer, FAST) + own_shared, 0.0)
+                y = tl.dot(h, second_layer, input_precision=FAST) + bias[None, :]
+                rgb += tl.where(heavy, weight, 0.0)[:, None] * radiance(y)
+            t = tl.where(here, t + dt, t)
+        live = live & (t < end) & (tau < limits[0])
+    tl.store(out + 5 * r[:, None] + c[None, :], rgb, mask=some[:, None] & (c < 3)[None, :])
+    tl.store(out + 5 * r + 3, far, mask=some)
+    tl.store(out + 5 * r + 4, tl.exp(-tau), mask=some)
 
 
-def composite(rays, spans, cells, steps, limits, net, colours, shared, out) -> None:
+def composite(
+    rays: tuple[Tensor, Tensor],
+    spans: Tensor,
+    cells: tuple[Tensor, Tensor],
+    steps: tuple[float, float],
+    limits: tuple[float, float],
+    net: tuple[Tensor, ...],
+    colours: tuple[Tensor, ...],
+    shared: Tensor,
+    out: Tensor,
+) -> None:
     """What rays see of matter: radiance, weighted sum of lengths, transmittance.
 
     Args: as `gpu.march`, but rays = (origins, directions); limits = (transmittance at which a ray
     ends, weight from which a sample has a colour); colours = (table, resolutions, w1, b1, w2, b2)
     of the appearance, to whose hidden layer shared [n,H] is added; out [n,5].
     """
-    launch(_composite, spans.shape[0], rays, spans, cells, steps, limits, net, colours, shared,
-           out)  # fmt: skip
+    nets = []
+    for table, resolutions, *layers in (net, colours):
+        nets.append(((table, resolutions, table.shape[1]), tuple(layers)))
+    n, stop = spans.shape[0], -math.log(limits[0])
+    over(_composite, n, RAYS)(
+        rays,
+        spans,
+        cells_of(cells),
+        steps,
+        (stop, limits[1]),
+        *nets,
+        shared,
+        out,
+        n,
+        SIZES=sizes_of(net[0], net[2]),
+        SIZES_C=sizes_of(colours[0], colours[2]),
+        BLOCK=RAYS,
+        num_warps=WARPS,
+    )

@@ -512,7 +512,8 @@ class Fitting:
         """
         budget = self.settings.samples_per_step * min(1.0, 0.25 + 2.5 * self.stage)
         factor = min(2.0, max(0.5, budget / max(samples, 1)))
-        self.rays = int(min(16384, max(256, rays * factor)))
+        most = self.settings.samples_per_step // LEAST_SAMPLES
+        self.rays = int(min(most, max(256, rays * factor)))
         self.step_scale *= 1.03 if samples > SAMPLES_PER_RAY * rays else 0.98
         coarsest = 1 + (MAX_STEP_SCALE - 1) * max(0.0, 1 - self.stage / FINE_AT)
         self.step_scale = min(coarsest, max(1.0, self.step_scale))
@@ -565,6 +566,7 @@ SURE_PULL = 4.0  # of the ground loss's weight, once the field's own classes tel
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
 POINT_SHARE = 16  # rays of photos for one to a sparse point
 MAX_STEP_SCALE = 8.0
+LEAST_SAMPLES = 4  # of a ray in the mean: empty ones cost too
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
 FINE_AT = 0.8  # stage from which steps are as fine as when rendering
 REFINE_AT = 0.25  # stage at which occupancy cells are halved
