@@ -10,7 +10,7 @@ import torch
 from numba import njit
 
 from climatenerf.field.occupancy import Occupancy
-from climatenerf.ops import cpu, cpu_network, dispatch, lanes, reference
+from climatenerf.ops import cpu, cpu_network, dispatch, lanes, metaballs, reference
 from climatenerf.ops.lanes import LANES
 from climatenerf.ops.vectors import length, unit
 
@@ -33,7 +33,7 @@ def network(features, w1, b1, w2, b2, out):
 def test_kernels_are_compiled_anew_when_their_instructions_change():
     """Numba looks at a kernel's own file alone; its text has to change with `lanes.py`'s."""
     digest = hashlib.sha256(Path(lanes.__file__).read_bytes()).hexdigest()[:12]
-    for module in (cpu, cpu_network):
+    for module in (cpu, cpu_network, metaballs):
         assert digest == module.LANES_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
 
 

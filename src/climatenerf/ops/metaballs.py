@@ -15,11 +15,14 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from numba import njit, prange
 
+from climatenerf.ops.lanes import BALL_REACH, ball_means, ball_sums
+
+LANES_DIGEST = "867c92b329b6"  # of `lanes.py`, which says why
 BRICK = 8
 """Cells along a brick's side."""
 STORED = BRICK + 3
 """Vertices along a brick's side that are stored."""
-REACH = 2.0
+REACH = BALL_REACH
 """Support 1.5 R of the kernel in lattice spacings."""
 RADIUS = REACH / 1.5
 """R of the kernel in lattice spacings (measured in docs/decisions.md)."""
@@ -105,30 +108,7 @@ def _sum(lattice, brick, px, py, pz):
     i, j, m = int(px), int(py), int(pz)
     i, j, m = min(max(i, 0), BRICK - 1), min(max(j, 0), BRICK - 1), min(max(m, 0), BRICK - 1)
     ux, uy, uz = np.float32(px - i), np.float32(py - j), np.float32(pz - m)
-    zero = np.float32(0)
-    top, bottom = zero, zero
-    tx, ty, tz, bx, by, bz = zero, zero, zero, zero, zero, zero
-    for a in range(4):
-        dx = ux - np.float32(a - 1)
-        for b in range(4):
-            dy = uy - np.float32(b - 1)
-            rest = np.float32(REACH * REACH) - dx * dx - dy * dy
-            if rest <= zero:
-                continue
-            for c in range(4):
-                dz = uz - np.float32(c - 1)
-                q = max(rest - dz * dz, zero)
-                slope = q * q  # dK/dx = -6 q^2 dx
-                weight = slope * q
-                f = np.float32(lattice.fill[brick, i + a, j + b, m + c])
-                bottom += weight
-                bx += slope * dx
-                by += slope * dy
-                bz += slope * dz
-                top += weight * f
-                tx += slope * dx * f
-                ty += slope * dy * f
-                tz += slope * dz * f
+    bottom, top, bx, by, bz, tx, ty, tz = ball_sums(lattice.fill, brick, i, j, m, ux, uy, uz)
     s = top / bottom
     scale = np.float32(-6.0 / 255.0) / bottom
     return (
@@ -148,21 +128,11 @@ def _means(lattice, brick, px, py, pz):
     i, j, m = int(px), int(py), int(pz)
     i, j, m = min(max(i, 0), BRICK - 1), min(max(j, 0), BRICK - 1), min(max(m, 0), BRICK - 1)
     ux, uy, uz = np.float32(px - i), np.float32(py - j), np.float32(pz - m)
-    zero = np.float32(0)
-    total, height, shade = zero, zero, zero
-    for a in range(4):
-        dx = ux - np.float32(a - 1)
-        for b in range(4):
-            dy = uy - np.float32(b - 1)
-            for c in range(4):
-                dz = uz - np.float32(c - 1)
-                q = max(np.float32(REACH * REACH) - dx * dx - dy * dy - dz * dz, zero)
-                weight = q * q * q * np.float32(lattice.fill[brick, i + a, j + b, m + c])
-                over = np.float32(lattice.height[brick, i + a, j + b, m + c])
-                total += weight
-                height += weight * (over * np.float32(HEIGHT_UNIT) + dz)
-                shade += weight * np.float32(lattice.shade[brick, i + a, j + b, m + c])
-    if total <= zero:  # nothing within reach: 0 / 0 would give NaN
+    total, over, dz, shade = ball_means(
+        lattice.fill, lattice.height, lattice.shade, brick, i, j, m, ux, uy, uz
+    )
+    height = over * np.float32(HEIGHT_UNIT) + dz
+    if total <= np.float32(0):  # nothing within reach: 0 / 0 would give NaN
         return np.float32(0), np.float32(1)
     return height / total, shade / (total * np.float32(255))
 
