@@ -528,9 +528,21 @@ def triples(n: int, m: int) -> Int[Tensor, "3 m"]:
     return torch.stack([torch.arange(m), torch.arange(n - 2 * m, n - m), torch.arange(n - m, n)])
 
 
+class _ScaledGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value, factor):
+        ctx.save_for_backward(factor)
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (factor,) = ctx.saved_tensors
+        return grad * factor, None
+
+
 def scale_gradient(value: Float[Tensor, "*n"], factor: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """The same value, its gradient multiplied by a factor."""
-    return value * factor + (value * (1 - factor)).detach()
+    return _ScaledGradient.apply(value, factor)
 
 
 # The sky's share before and after surfaces are found, where no labels tell it from matter: it may
