@@ -55,6 +55,8 @@ def compile_all() -> None:
     gpu.hash_encode_slopes(u, features, table, resolutions, u)
     gpu.density_at(u, density, some)
     gpu.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
+    one = cells[0][:1, :12, :12, :12].contiguous()  # a single cascade without blocks
+    gpu.march(real, real, real, (one, one), steps, 1e-3, density, room, whole[1:])
     gpu.pack(room, whole, torch.zeros(3, s))
     gpu.grid_positions(real, real, whole, some, u)
     gpu.weights_forward(some, whole, some, real[:, 0])

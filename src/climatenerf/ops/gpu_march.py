@@ -66,7 +66,8 @@ def begin(rays, spans, cascades, steps, n, BLOCK: tl.constexpr):
     dz = tl.load(rays[1] + 3 * r + 2, mask=some, other=1.0)
     t = tl.load(spans + 3 * r, mask=some, other=0.0)
     end = tl.load(spans + 3 * r + 1, mask=some, other=-1.0)
-    far = tl.exp2((cascades - 1).to(tl.float32))
+    # A count of 1 is a constant to the compiler, which has no types of its own.
+    far = tl.exp2(tl.full((), cascades - 1, tl.int32).to(tl.float32))
     t, end = _clip(ox, dx, far, t, end)
     t, end = _clip(oy, dy, far, t, end)
     t, end = _clip(oz, dz, far, t, end)
