@@ -222,8 +222,14 @@ def fit_with_bars(scene, options: Fit) -> dict:
 
     settings = fit_settings(options)
     with on(options.device), progress.Bar("fit", 1.0) as bar:
+        begun = False
 
         def report(state: Report) -> None:
+            nonlocal begun
+            if not begun:  # the kernels are there
+                bar.prepared()
+                begun = True
+                return
             bar.update(
                 state.progress,
                 {

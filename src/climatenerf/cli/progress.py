@@ -42,13 +42,13 @@ class Bar:
         self.done = 0.0
         self.columns: dict[str, str] = {}
         self._quiet = quiet
-        self._start = time.monotonic()
+        self._start = self._paced = time.monotonic()
         self._next_line = self._start + LINE_EVERY
         self._progress: Progress | None = None
 
     def __enter__(self) -> Self:
         """Shows the bar."""
-        self._start = time.monotonic()
+        self._start = self._paced = time.monotonic()
         self._next_line = self._start + LINE_EVERY
         if not self._quiet and _console().is_terminal:
             self._progress = _rich_progress(_console())
@@ -86,11 +86,17 @@ class Bar:
         """Tells that another piece is done."""
         self.update(self.done + by, columns)
 
+    def prepared(self) -> None:
+        """Tells that the work begins now: what came before says nothing of its pace."""
+        self._paced = time.monotonic()
+        if self._progress is not None:
+            self._progress.reset(self._task, total=self.total)
+
     def eta(self) -> float | None:
         """Seconds until the end at the pace so far, or None before anything is done."""
         if self.done <= 0:
             return None
-        return (time.monotonic() - self._start) / self.done * (self.total - self.done)
+        return (time.monotonic() - self._paced) / self.done * (self.total - self.done)
 
     def _text(self) -> str:
         return "  ".join(f"{label} {text}" for label, text in self.columns.items())
