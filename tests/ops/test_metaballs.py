@@ -22,6 +22,7 @@ def dense_lattice(fill: np.ndarray, height: np.ndarray, shade: np.ndarray) -> La
         window = tuple(slice(c * BRICK, c * BRICK + STORED) for c in (i, j, m))
         for part, array in zip(parts, padded, strict=True):
             part.append(array[window])
+    band, near = metaballs.where_matter_is(np.stack(parts[0]))
     return Lattice(
         lower=np.array([[-0.3, 0.2, 0.1]]),
         spacing=np.array([SPACING]),
@@ -31,7 +32,8 @@ def dense_lattice(fill: np.ndarray, height: np.ndarray, shade: np.ndarray) -> La
         fill=np.stack(parts[0]),
         height=np.stack(parts[1]),
         shade=np.stack(parts[2]),
-        band=metaballs.bands(np.stack(parts[0])),
+        band=band,
+        near=near,
         burial=np.array([1e9]),
     )
 

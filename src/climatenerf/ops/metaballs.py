@@ -66,22 +66,27 @@ class Lattice(NamedTuple):
     """uint8: brightness under the scene's light, in 1/255."""
     band: np.ndarray
     """[b, 2] uint8: layers of cells, from and to, outside of which a brick's sums are low."""
+    near: np.ndarray
+    """[b, 8, 8] uint8: bit m says whether sums in the cell (x, y, m) may be more than low."""
     burial: Float[np.ndarray, "k"]
     """Depth under the ground below which there is no matter, m."""
 
 
-def bands(fill: np.ndarray) -> np.ndarray:
-    """Bands of layers for `Lattice.band` from `Lattice.fill`.
+def where_matter_is(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`Lattice.band` and `Lattice.near` from `Lattice.fill`.
 
-    A cell's sum is a mean over the vertices one below to two above it.
+    A cell's sum is a mean over the vertices one below to two above it along each axis: where they
+    all are low, so is the sum.
     """
-    full = fill.max((1, 2), initial=0) >= LOW * 255
-    cells = np.zeros((len(fill), BRICK + 1), bool)
-    for vertex in range(4):
-        cells[:, :BRICK] |= full[:, vertex : vertex + BRICK]
-    first = cells.argmax(1)
-    last = np.where(cells.any(1), BRICK + 1 - cells[:, ::-1].argmax(1), 0)
-    return np.stack([first, last], 1).astype(np.uint8)
+    cells = fill >= LOW * 255
+    for axis in (1, 2, 3):
+        runs = np.lib.stride_tricks.sliding_window_view(cells, 4, axis)
+        cells = runs.any(-1)
+    near = np.packbits(cells, axis=-1, bitorder="little")[..., 0]
+    layers = np.concatenate([cells.any((1, 2)), np.zeros((len(fill), 1), bool)], 1)
+    first = layers.argmax(1)
+    last = np.where(layers.any(1), BRICK + 1 - layers[:, ::-1].argmax(1), 0)
+    return np.stack([first, last], 1).astype(np.uint8), near
 
 
 @njit(cache=True, fastmath=_FAST, inline="always")
@@ -200,34 +205,55 @@ def _to_band(px, py, pz, d, low, high):
 
 
 @njit(cache=True, fastmath=_FAST)
+def _to_face(ux, uy, uz, d):
+    """Way (spacings) out of a cell from a place in it."""
+    way = np.inf
+    for p, c in ((ux, d[0]), (uy, d[1]), (uz, d[2])):
+        if c != 0:
+            way = min(way, ((1 if c > 0 else 0) - p) / c)
+    return max(way, 0.0)
+
+
+@njit(cache=True, fastmath=_FAST)
 def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
     """Samples of one ray into the given rows; returns their number."""
     n = 0
     depth = 0.0  # optical depth so far
     group, moment, first, last = 0.0, 0.0, 0.0, 0.0
+    k, brick, h, per = -1, -1, 0.0, 0.0
+    cx, cy, cz = 0.0, 0.0, 0.0  # the brick's corner
     while t < end and depth < _OPAQUE:
         x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
-        k, brick, i, j, m = _find(lattice, x, y, z)
-        if k < 0:
-            break  # the ray was cut to the outermost cascade before
-        h = lattice.spacing[k]
-        side = h * BRICK
+        px, py, pz = (x - cx) * per, (y - cy) * per, (z - cz) * per
+        # Most steps stay in their brick; only of the finest is it sure that no finer one is there.
+        inside = min(px, py, pz) >= 0 and max(px, py, pz) < BRICK
+        if not (k == 0 and brick >= 0 and inside):
+            k, brick, i, j, m = _find(lattice, x, y, z)
+            if k < 0:
+                break  # the ray was cut to the outermost cascade before
+            h = lattice.spacing[k]
+            side, per = h * BRICK, 1 / h
+            cx = lattice.lower[k, 0] + i * side
+            cy = lattice.lower[k, 1] + j * side
+            cz = lattice.lower[k, 2] + m * side
+            px, py, pz = (x - cx) * per, (y - cy) * per, (z - cz) * per
         if brick < 0:
             step = np.inf
-            for axis, cell in ((0, i), (1, j), (2, m)):
+            for axis, face in ((0, cx), (1, cy), (2, cz)):
                 if d[axis] != 0:
-                    face = lattice.lower[k, axis] + (cell + (1 if d[axis] > 0 else 0)) * side
-                    step = min(step, (face - o[axis]) / d[axis] - t)
+                    far = face + (h * BRICK if d[axis] > 0 else 0.0)
+                    step = min(step, (far - o[axis]) / d[axis] - t)
             t += max(step, 0.0) + 1e-3 * h
             sigma, step = 0.0, 0.0
         else:
-            px = (x - lattice.lower[k, 0]) / h - i * BRICK
-            py = (y - lattice.lower[k, 1]) / h - j * BRICK
-            pz = (z - lattice.lower[k, 2]) / h - m * BRICK
-            # A mean over vertices: where they all are below LOW, so is the sum.
+            # Rounding may bring the last cell's far face to 8.
+            i, j, m = min(int(px), BRICK - 1), min(int(py), BRICK - 1), min(int(pz), BRICK - 1)
             if pz < lattice.band[brick, 0] or pz > lattice.band[brick, 1]:
                 t += _to_band(px, py, pz, d, lattice.band[brick, 0], lattice.band[brick, 1]) * h
                 t += 1e-3 * h
+                s, sigma, step = 0.0, 0.0, 0.0
+            elif not lattice.near[brick, i, j] >> m & 1:
+                t += _to_face(px - i, py - j, pz - m, d) * h + 1e-3 * h
                 s, sigma, step = 0.0, 0.0, 0.0
             else:
                 s, gx, gy, gz = _sum(lattice, brick, px, py, pz)

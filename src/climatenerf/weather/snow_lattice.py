@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from numba import njit
 
-from climatenerf.ops.metaballs import BRICK, HEIGHT_UNIT, REACH, STORED, Lattice, bands
+from climatenerf.ops.metaballs import BRICK, HEIGHT_UNIT, REACH, STORED, Lattice, where_matter_is
 
 _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 # A slab buried by the kernel's and the prefilter's reach looks like a half-space from its top.
@@ -135,16 +135,19 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
         bricks.append(count)
     sizes = [part.size for part in index]
     spacing = np.array([grid.spacing_of(k) for k in range(grid.cascades)])
+    fill = np.concatenate([p[0] for p in pool])
+    band, near = where_matter_is(fill)
     return Lattice(
         lower=np.array(lower),
         spacing=spacing,
         bricks=np.array(bricks),
         start=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
         index=np.concatenate(index),
-        fill=np.concatenate([p[0] for p in pool]),
+        fill=fill,
         height=np.concatenate([p[1] for p in pool]),
         shade=np.concatenate([p[2] for p in pool]),
-        band=bands(np.concatenate([p[0] for p in pool])),
+        band=band,
+        near=near,
         # Deep enough to leave no gap to a rough ground, too little to show under a table.
         burial=np.clip(0.5 * spacing, 0.02, 0.04),
     )
