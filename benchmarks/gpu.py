@@ -106,7 +106,7 @@ def main() -> None:
         "step": lambda: steps(options.run, options.samples, options.repeats, device, seed),
     }
     if options.capture:
-        settings = replace(settings_of(options.preset), minutes=options.minutes, seed=seed)
+        settings = replace(settings_of(options.preset, device), minutes=options.minutes, seed=seed)
         parts["fit"] = lambda: time_to_psnr(
             options.capture, settings, options.downscale, options.every, GOALS
         )

@@ -21,11 +21,14 @@ from pathlib import Path
 
 import torch
 
-# The package index has torchvision for CUDA alone. Its operators do not load beside PyTorch for a
-# CPU; nothing here calls them, but it will not be imported without knowing of these two.
-OPERATORS = torch.library.Library("torchvision", "DEF")
-OPERATORS.define("nms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
-OPERATORS.define("qnms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+try:
+    import torchvision  # noqa: F401
+except RuntimeError:
+    # A torchvision for CUDA beside a PyTorch for the CPU lacks its operators. Nothing here calls
+    # them, but it will not be imported without knowing of these two.
+    OPERATORS = torch.library.Library("torchvision", "DEF")
+    OPERATORS.define("nms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
+    OPERATORS.define("qnms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
 
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig  # noqa: E402
 from nerfstudio.configs.method_configs import method_configs  # noqa: E402
@@ -64,6 +67,8 @@ def present(capture: Path, folder: Path) -> Path:
         found = [name, *(name.with_name(name.name + end) for end in (".jpg", ".png"))]
         there = [path for each in found if (path := capture.resolve() / each).is_file()]
         frame["file_path"] = str(there[0]) if there else ""
+        for key in [key for key in frame if key.endswith("_path") and key != "file_path"]:
+            del frame[key]  # masks and depths are beside the photos, not here
     poses["frames"] = [frame for frame in poses["frames"] if frame["file_path"]]
     (folder / "transforms.json").write_text(json.dumps(poses))
     return folder / "transforms.json"

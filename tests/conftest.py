@@ -1,7 +1,6 @@
 """Fixtures shared by all tests."""
 
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,6 @@ from climatenerf.cli import THREADING
 # Before any test imports torch: without it two OpenMP run times spin against each other.
 for variable, value in THREADING.items():
     os.environ.setdefault(variable, value)
-# GPU kernels run in Triton's interpreter where there is no NVIDIA GPU.
-if shutil.which("nvidia-smi") is None:
-    os.environ.setdefault("TRITON_INTERPRET", "1")
 
 CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 

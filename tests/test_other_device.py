@@ -12,7 +12,7 @@ from training.toy_scene import CAMERA, TINY, make_scene
 from climatenerf import cli
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.device import on
+from climatenerf.field.device import check_triton, on
 from climatenerf.field.extent import find_extent
 from climatenerf.field.presets import PRESETS
 from climatenerf.render.frame import render_frame
@@ -150,11 +150,21 @@ def test_a_gpu_that_is_not_there_is_refused(tmp_path, capsys):
         assert "NVIDIA GPU" in said and "Traceback" not in said
 
 
-def test_what_a_gpu_needs_beside_it_is_asked_for(monkeypatch):
+def test_what_a_gpu_needs_beside_it_is_asked_for(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(UserError, match="C compiler"), on("cuda"):
-        pass
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(UserError, match="needs Triton"), on("cuda"):
-        pass
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "3.4.0+git")
+    monkeypatch.delenv("CC", raising=False)
+    there = {"clang": "/usr/bin/clang", "/usr/bin/clang": "/usr/bin/clang"}
+    monkeypatch.setattr("shutil.which", there.get)
+    monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
+    with pytest.raises(UserError, match="Python's headers"):
+        check_triton()
+    (tmp_path / "Python.h").touch()
+    check_triton()
+    monkeypatch.setenv("CC", "not-there")
+    with pytest.raises(UserError, match="C compiler"):
+        check_triton()
+    for version in ("3.3.1", "2.9", "0"):
+        monkeypatch.setattr("importlib.metadata.version", lambda name, own=version: own)
+        with pytest.raises(UserError, match=r"needs Triton 3\.4"), on("cuda"):
+            pass

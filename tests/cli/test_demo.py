@@ -25,7 +25,7 @@ def small(monkeypatch):
     )
     monkeypatch.setitem(PRESETS, "cpu", tiny)
     settings = functools.partial(FitSettings, samples_per_step=2**14)
-    monkeypatch.setattr(cli_fit, "settings_of", lambda preset: settings(preset=preset))
+    monkeypatch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 64)
     monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))
 

@@ -83,7 +83,7 @@ def run_folder(tmp_path_factory):
     words = ["fit", str(REFERENCE), "-o", str(folder), "--steps", "400", "--downscale", "4"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "cpu", small)
-        patch.setattr(cli_fit, "settings_of", lambda preset: settings(preset=preset))
+        patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0
     return folder

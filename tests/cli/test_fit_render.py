@@ -40,7 +40,7 @@ def run_folder(tmp_path_factory):
     words = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "cpu", small)
-        patch.setattr(cli_fit, "settings_of", lambda preset: settings(preset=preset))
+        patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0
     return folder
@@ -73,7 +73,9 @@ def test_steps_alone_have_no_time_limit_and_the_device_chooses_the_preset():
     assert fit_settings(dataclasses.replace(fit, steps=9)).minutes is None
     both = fit_settings(dataclasses.replace(fit, steps=9, minutes=2.0))
     assert (both.minutes, both.steps) == (2.0, 9)
-    assert fit_settings(dataclasses.replace(fit, device="cuda")).preset == "gpu"
+    there = fit_settings(dataclasses.replace(fit, device="cuda"))
+    assert there.preset == "gpu" and there.samples_per_step == 2**20
+    assert fit_settings(dataclasses.replace(fit, preset="gpu")).samples_per_step == 2**16
     chosen = dataclasses.replace(fit, device="cuda", preset="cpu")
     assert fit_settings(chosen).preset == "cpu"
 

@@ -43,11 +43,13 @@ def test_plain_lines_every_ten_seconds_with_eta(clock, capsys):
 def test_preparing_says_nothing_of_the_pace(clock, capsys):
     with progress.Bar("fit", total=100) as bar:
         clock.now += 30  # compiling
-        bar.prepared()
+        bar.prepared(70)  # continued
+        bar.update(70)
+        assert bar.eta() is None
         clock.now += 1
-        bar.update(2)
-        assert bar.eta() == pytest.approx(49)
-    assert capsys.readouterr().err.splitlines()[-1] == "fit: 2 %  0:31 in all"
+        bar.update(72)
+        assert bar.eta() == pytest.approx(14)
+    assert capsys.readouterr().err.splitlines()[-1] == "fit: 72 %  0:31 in all"
 
 
 def test_quiet_is_silent(clock, capsys):

@@ -1,4 +1,4 @@
-"""Compiles every GPU kernel for CUDA, without a GPU: prints its name and registers, or fails.
+"""Compiles every GPU kernel for CUDA, without a GPU: prints its name, or fails.
 
 The interpreter runs kernels as NumPy; what Triton's compiler refuses shows here alone. Run in a
 process of its own, by `test_gpu_kernels.py`: it must not be in the interpreter. An argument is the

@@ -68,8 +68,8 @@ class Fit:
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
     capture's depth_relative files, else its depth files; none leaves both alone."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler beside it; its
-    present kernels were tested without one."""
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler beside it, in larger
+    steps; its present kernels were tested without one."""
     seed: int = 0
     """Of all randomness."""
 
@@ -227,9 +227,8 @@ def fit_with_bars(scene, options: Fit) -> dict:
         def report(state: Report) -> None:
             nonlocal begun
             if not begun:  # the kernels are there
-                bar.prepared()
+                bar.prepared(state.progress)
                 begun = True
-                return
             bar.update(
                 state.progress,
                 {
@@ -250,7 +249,9 @@ def fit_with_bars(scene, options: Fit) -> dict:
 
 def fit_settings(options: Fit) -> FitSettings:
     """What the flags say of the fit, on top of what its preset says."""
-    settings = settings_of(options.preset or ("gpu" if options.device == "cuda" else "cpu"))
+    settings = settings_of(
+        options.preset or ("gpu" if options.device == "cuda" else "cpu"), options.device
+    )
     weights = parse_losses(options.loss)
     if weights.get("bend") and weights.get("normals") == 0:
         raise UserError("--loss bend needs predicted normals; leave --loss normals=0 out")

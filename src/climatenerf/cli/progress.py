@@ -43,6 +43,7 @@ class Bar:
         self.columns: dict[str, str] = {}
         self._quiet = quiet
         self._start = self._paced = time.monotonic()
+        self._given = 0.0
         self._next_line = self._start + LINE_EVERY
         self._progress: Progress | None = None
 
@@ -86,17 +87,22 @@ class Bar:
         """Tells that another piece is done."""
         self.update(self.done + by, columns)
 
-    def prepared(self) -> None:
-        """Tells that the work begins now: what came before says nothing of its pace."""
-        self._paced = time.monotonic()
+    def prepared(self, done: float = 0.0) -> None:
+        """Tells that the work begins now, with so much done: time before says nothing of its pace.
+
+        Args:
+            done: amount done before, as of a run that is continued.
+        """
+        self._paced, self._given = time.monotonic(), float(done)
         if self._progress is not None:
-            self._progress.reset(self._task, total=self.total)
+            self._progress.reset(self._task, total=self.total, completed=int(done))
 
     def eta(self) -> float | None:
         """Seconds until the end at the pace so far, or None before anything is done."""
-        if self.done <= 0:
+        own = self.done - self._given
+        if own <= 0:
             return None
-        return (time.monotonic() - self._paced) / self.done * (self.total - self.done)
+        return (time.monotonic() - self._paced) / own * (self.total - self.done)
 
     def _text(self) -> str:
         return "  ".join(f"{label} {text}" for label, text in self.columns.items())

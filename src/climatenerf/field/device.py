@@ -1,14 +1,44 @@
 """On which device a field is fitted and rendered."""
 
 import contextlib
-import importlib.util
+import importlib.metadata
 import os
+import re
 import shutil
+import sysconfig
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 
 from climatenerf.errors import UserError
+
+TRITON = (3, 4)  # the first that takes our kernels; PyTorch 2.8 brings it
+
+
+def check_triton() -> None:
+    """What a GPU's kernels need beside PyTorch is there.
+
+    Raises:
+        UserError: what is missing, and where to get it.
+    """
+    try:
+        version = importlib.metadata.version("triton")
+    except importlib.metadata.PackageNotFoundError:
+        version = "0"
+    if tuple(map(int, re.findall(r"\d+", version)[:2])) < TRITON:
+        raise UserError(
+            "--device cuda needs Triton 3.4, which comes with PyTorch 2.8 for CUDA on Linux;"
+            " install that PyTorch or a newer one, or leave --device out"
+        )
+    # Triton builds what starts its kernels, and looks for a compiler in this order.
+    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+    headers = Path(sysconfig.get_path("include"), "Python.h")
+    if compiler is None or shutil.which(compiler) is None or not headers.is_file():
+        raise UserError(
+            "Triton needs a C compiler and Python's headers, and lacks one of them; install both"
+            " (apt install gcc python3-dev), or leave --device out"
+        )
 
 
 @contextlib.contextmanager
@@ -26,15 +56,6 @@ def on(device: str) -> Iterator[None]:
             "PyTorch finds no NVIDIA GPU; install the card's driver and PyTorch with CUDA, or leave"
             " --device out"
         )
-    if importlib.util.find_spec("triton") is None:
-        raise UserError(
-            "--device cuda needs Triton, which comes with PyTorch for CUDA on Linux; install it"
-            " (pip install triton), or leave --device out"
-        )
-    if not any(map(shutil.which, (os.environ.get("CC", "cc"), "gcc", "clang"))):
-        raise UserError(
-            "Triton builds what starts kernels with a C compiler, and finds none; install one"
-            " (apt install gcc python3-dev), or leave --device out"
-        )
+    check_triton()
     with torch.device(device):
         yield

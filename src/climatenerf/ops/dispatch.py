@@ -245,10 +245,9 @@ class _EncodedNetwork(torch.autograd.Function):
             (_array(table), _array(resolutions)),
             tuple(map(_array, (w1, b1, w2, b2))),
         )
-        u = _array(u)
         out = torch.empty(u.shape[0], w2.shape[1], device=u.device)
-        gpu_network.network_forward(u, encoding, layers, rays, out)
-        ctx.given = u, encoding, layers, rays
+        gpu_network.network_forward(_array(u), encoding, layers, rays, out)
+        ctx.save_for_backward(u, resolutions, shared, row, w1, b1, w2, b2)
         ctx.table = table
         return out
 
@@ -256,11 +255,15 @@ class _EncodedNetwork(torch.autograd.Function):
     def backward(ctx, grad):
         from climatenerf.ops import gpu_network
 
-        u, encoding, layers, rays = ctx.given
+        u, resolutions, shared, row, *layers = ctx.saved_tensors
+        u, layers = _array(u), tuple(map(_array, layers))
+        rays = None if shared is None else (_array(shared), _array(row))
+        encoding = _array(ctx.table), _array(resolutions)
         # As `_HashEncode.backward`: the optimiser clears what it has used.
         buffer = getattr(ctx.table, "grad_buffer", None)
-        of_table = torch.zeros_like(encoding[0]) if buffer is None else buffer
-        of_shared = None if rays is None else torch.zeros_like(rays[0])
+        learns = ctx.needs_input_grad[1]
+        of_table = (torch.zeros_like(encoding[0]) if buffer is None else buffer) if learns else None
+        of_shared = torch.zeros_like(rays[0]) if rays and ctx.needs_input_grad[3] else None
         of_u = torch.empty_like(u) if ctx.needs_input_grad[0] else None
         of_layers = gpu_network.network_backward(
             u, encoding, layers, rays, _array(grad), (of_table, of_shared, of_u)
@@ -278,7 +281,10 @@ def encoded_mlp(
 ) -> Float[Tensor, "n o"]:
     """`mlp` of `hash_encode`: on a GPU in one launch, where there is one hidden layer."""
     given = [u, table, *(each for pair in layers for each in pair)]
-    if _kernels(*given) not in (None, cpu) and len(layers) == 2:
+    if (
+        _kernels(*given, *([] if shared is None else [shared])) not in (None, cpu)
+        and len(layers) == 2
+    ):
         return _EncodedNetwork.apply(u, table, resolutions, shared, row, *layers[0], *layers[1])
     return mlp(hash_encode(u, table, resolutions), layers, shared, row)
 

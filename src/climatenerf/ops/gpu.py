@@ -2,9 +2,9 @@
 
 Function by function the interface of `cpu.py`, on tensors of the device, but for what is packed or
 turned for a CPU (`dispatch.cells_of`, `_cpu_net`); marching is in `gpu_march.py`, encodings with
-their networks are in `gpu_network.py`. Triton comes with PyTorch for CUDA and compiles at the first
-launch; no compiler need be on the machine. Its interpreter runs the same code on the CPU
-(TRITON_INTERPRET=1), which is how it is tested without a GPU.
+their networks are in `gpu_network.py`. Triton comes with PyTorch for CUDA, compiles at the first
+launch, and has a C compiler build what starts kernels. Its interpreter runs the same code on the
+CPU (TRITON_INTERPRET=1), which is how it is tested without a GPU.
 """
 
 # Triton's functions have no types that pyright could know.
@@ -34,6 +34,7 @@ density_at, march = gpu_march.density_at, gpu_march.march
 
 SAMPLES = 64  # of a tile of an encoding
 LIST = 64  # rays of a block of compositing
+ENTRIES = 1024  # of a block of the optimiser's
 
 
 # --- hash encoding -------------------------------------------------------------------------------
@@ -461,4 +462,6 @@ def adam(parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, *ra
     Rates: rate, beta1, beta2, epsilon, and the corrections of both moments.
     """
     n = parameter.shape[0]
-    over(_adam, n, 1024)(parameter, gradient, first, second, n, *map(float, rates), BLOCK=1024)
+    over(_adam, n, ENTRIES)(
+        parameter, gradient, first, second, n, *map(float, rates), BLOCK=ENTRIES
+    )

@@ -118,6 +118,7 @@ def _backward(
     grads,
     n,
     SHARED: tl.constexpr,
+    LEARNS: tl.constexpr,
     SIZES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
@@ -157,7 +158,7 @@ def _backward(
         sum_bias += tl.sum(back, 0)
         sum_even += tl.dot(tl.trans(back), first, input_precision=FAST)
         sum_odd += tl.dot(tl.trans(back), second, input_precision=FAST)
-        if SHARED:
+        if LEARNS:
             at, known = _of_rays(grad_shared, rays[1], i, some, SIZES)
             tl.atomic_add(at, back, mask=known & active, sem="relaxed")
         even, odd, _bias = first_layer(w1, b1, SIZES)
@@ -186,7 +187,7 @@ def network_backward(
     layers: tuple[Tensor, Tensor, Tensor, Tensor],
     rays: tuple[Tensor, Tensor] | None,
     grad_out: Tensor,
-    grads: tuple[Tensor, Tensor | None, Tensor | None],
+    grads: tuple[Tensor | None, Tensor | None, Tensor | None],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradient of `network_forward` to the layers.
 
@@ -210,11 +211,13 @@ def network_backward(
         (u if of_shared is None else of_shared, sums),
         n,
         SHARED=rays is not None,
+        LEARNS=of_shared is not None,
         SIZES=sizes_of(table, w1, w2),
         BLOCK=SAMPLES,
         num_warps=WARPS,
     )
-    hash_encode_backward(u, features, resolutions, of_table)
+    if of_table is not None:
+        hash_encode_backward(u, features, resolutions, of_table)
     if of_u is not None:
         hash_encode_slopes(u, features, table, resolutions, of_u)
     parts = sums.sum(0).split([inputs * hidden, hidden, hidden * outputs, outputs])

@@ -80,10 +80,9 @@ def where_matter_is(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     cells = fill >= LOW * 255
     for axis in (1, 2, 3):
-        runs = np.lib.stride_tricks.sliding_window_view(cells, 4, axis)
-        cells = runs.any(-1)
+        cells = np.lib.stride_tricks.sliding_window_view(cells, 4, axis).any(-1)
     near = np.packbits(cells, axis=-1, bitorder="little")[..., 0]
-    layers = np.concatenate([cells.any((1, 2)), np.zeros((len(fill), 1), bool)], 1)
+    layers = np.pad(cells.max((1, 2), initial=False), ((0, 0), (0, 1)))
     first = layers.argmax(1)
     last = np.where(layers.any(1), BRICK + 1 - layers[:, ::-1].argmax(1), 0)
     return np.stack([first, last], 1).astype(np.uint8), near

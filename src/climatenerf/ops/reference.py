@@ -7,8 +7,6 @@ depth sigma·dt, `weights` its rendering weight. Everything works on the last ax
 samples; gradients come from autograd. Tests hold the fast kernels against these functions.
 """
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -91,12 +89,11 @@ def density_slopes(
     table: Tensor,
     resolutions: Tensor,
     layers: list[tuple[Tensor, Tensor]],
-    encode: Callable[[Tensor, Tensor, Tensor], Tensor] = hash_encode,
 ) -> Float[Tensor, "n 3"]:
     """Gradient of the density's logarithm: the density's own direction, and no overflow."""
     with torch.enable_grad():
         q = q.detach().requires_grad_()
-        raw = mlp(encode(contract(q), table, resolutions), layers)[:, 0]
+        raw = mlp(hash_encode(contract(q), table, resolutions), layers)[:, 0]
         log_density = raw - q.square().sum(-1).clamp_min(1.0).log()
         return torch.autograd.grad(log_density.sum(), q)[0]
 

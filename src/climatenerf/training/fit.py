@@ -512,7 +512,7 @@ class Fitting:
         """
         budget = self.settings.samples_per_step * min(1.0, 0.25 + 2.5 * self.stage)
         factor = min(2.0, max(0.5, budget / max(samples, 1)))
-        most = self.settings.samples_per_step // LEAST_SAMPLES
+        most = max(16384, self.settings.samples_per_step // LEAST_SAMPLES)
         self.rays = int(min(most, max(256, rays * factor)))
         self.step_scale *= 1.03 if samples > SAMPLES_PER_RAY * rays else 0.98
         coarsest = 1 + (MAX_STEP_SCALE - 1) * max(0.0, 1 - self.stage / FINE_AT)

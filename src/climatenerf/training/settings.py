@@ -1,6 +1,6 @@
 """How a field is fitted, as plain values. Imports no torch."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ PAPER = FitSettings(
 """The paper's (supplement, "Training Details"), whose print "3^{-4}" is a mis-set 3e-4."""
 
 
-def settings_of(preset: str) -> FitSettings:
-    """The settings that go with a preset of `field.presets`."""
-    if preset == "gpu":  # a GPU takes as long for a small step as for a large one
-        return FitSettings(preset=preset, samples_per_step=2**20)
-    return PAPER if preset == "paper" else FitSettings(preset=preset)
+def settings_of(preset: str, device: str = "cpu") -> FitSettings:
+    """The settings that go with a preset of `field.presets` on a device, "cpu" or "cuda"."""
+    own = PAPER if preset == "paper" else FitSettings(preset=preset)
+    # A GPU takes as long for a small step as for a large one.
+    return replace(own, samples_per_step=2**20) if device == "cuda" else own
