@@ -238,7 +238,7 @@ def test_marching(generator, monkeypatch, skip, share):
     )
     spans[2, 1] = 0.5
     steps = (0.1, 0.02)
-    monkeypatch.setattr(dispatch, "GPU_RAYS", 17)  # in two parts, the first of two blocks
+    monkeypatch.setattr(dispatch, "GPU_RAYS", 19)  # in two parts, the first of two blocks
     monkeypatch.setattr(dispatch, "CAPACITY", 64)
     offsets, samples = dispatch.march(
         (o.to(DEVICE), d.to(DEVICE)), spans.to(DEVICE), cells, steps, 1e-3, weights

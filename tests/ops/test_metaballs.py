@@ -181,3 +181,26 @@ def test_march_respects_its_limits_and_misses_nothing():
 
 def test_reach_and_radius_belong_together():
     assert abs(REACH - 1.5 * RADIUS) < 1e-12
+
+
+def test_cells_without_snow_have_low_sums():
+    """And those that may have some are told apart from them on every axis."""
+    rng = np.random.default_rng(3)
+    size = (3 * BRICK, 4 * BRICK, 2 * BRICK)
+    blobs = rng.random((6, 8, 4)) < 0.1
+    fill = (255 * blobs.repeat(4, 0).repeat(4, 1).repeat(4, 2)).astype(np.uint8)
+    lattice = dense_lattice(fill, np.zeros(size, np.int16), np.zeros(size, np.uint8))
+    cell = rng.integers([8, 8, 1], [16, 24, 14], (4000, 3))
+    points = (cell + rng.random((4000, 3))) * SPACING + [-0.3, 0.2, 0.1]
+    sums, _, _ = metaballs.evaluate(points.astype(np.float32), lattice)
+    at = cell // BRICK
+    brick = lattice.index[(at[:, 0] * 4 + at[:, 1]) * 2 + at[:, 2]]
+    x, y, m = (cell % BRICK).T
+    near = (lattice.near[brick, x, y] >> m & 1).astype(bool)
+    assert (sums[~near] < metaballs.LOW).all() and sums[near].max() > 0.9
+    # By the vertices themselves.
+    around = np.pad(fill >= metaballs.LOW * 255, 2)
+    for i in range(200):
+        a, b, c = cell[i] + 1  # one below the cell's own, in the padded array
+        assert near[i] == around[a : a + 4, b : b + 4, c : c + 4].any()
+    assert 100 < (~near).sum() < 3900
