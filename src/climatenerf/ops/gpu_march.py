@@ -84,13 +84,24 @@ def _leave(o, d, index, cell, half):
 
 
 @triton.jit
-def step_at(t, end, steps):
-    """Length of the comb's step that begins at t."""
-    return tl.minimum(tl.maximum(steps[0], steps[1] * t), end - t)
+def middle_of(o, d, t, end, steps):
+    """The comb's step that begins at t: its length, ray length of its middle, and place there."""
+    dt = tl.minimum(tl.maximum(steps[0], steps[1] * t), end - t)
+    tm = t + 0.5 * dt
+    return dt, tm, o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
 
 
 @triton.jit
-def walk(o, d, t, end, live, found, cells, steps):
+def search(o, d, t, end, live, cells, steps):
+    """Live rays cross `TRIES` cells at most: t, and 1 for those that have found an occupied one."""
+    found = tl.zeros_like(t).to(tl.int32)
+    for _try in range(TRIES):
+        t, found = _walk(o, d, t, end, live & (t < end), found, cells, steps)
+    return t, found
+
+
+@triton.jit
+def _walk(o, d, t, end, live, found, cells, steps):
     """Rays that are live and have not found an occupied cell look into the one they are in.
 
     Returns t, behind the cell (or its block of cells) where that is empty, and who has found one.
@@ -98,9 +109,7 @@ def walk(o, d, t, end, live, found, cells, steps):
     occupied, blocks, sides = cells
     cascades, side, size = sides
     look = live & (found == 0)
-    dt = step_at(t, end, steps)
-    tm = t + 0.5 * dt
-    qx, qy, qz = o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
+    dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
     reach = tl.maximum(tl.maximum(tl.abs(qx), tl.abs(qy)), tl.abs(qz))
     # The least cascade that holds it: exponents are exact where logarithms round.
     bits = tl.maximum(reach, 1.0).to(tl.int32, bitcast=True)
@@ -149,14 +158,10 @@ def _march(
     k = tl.zeros_like(r)
     live = some & (t < end)
     while tl.max(live.to(tl.int32), 0) > 0:
-        found = tl.zeros_like(t).to(tl.int32)
-        for _try in range(TRIES):
-            t, found = walk(o, d, t, end, live & (t < end), found, cells, steps)
+        t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
         if tl.max(found, 0) > 0:
-            dt = step_at(t, end, steps)
-            tm = t + 0.5 * dt
-            qx, qy, qz = o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
+            dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
             sigma = density_of(qx, qy, qz, here, encoding, layers, SIZES)
             thick = here & (sigma * dt > LEAST_TAU)
             # By step, then by ray: neighbouring threads write side by side.

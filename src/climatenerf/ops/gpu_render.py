@@ -1,7 +1,7 @@
 """Whole rays on a GPU, a block at a time: march, encode, both networks, composite, in one launch.
 
 The twin is the composition of the operations (`Field.composited` on the CPU). Nothing is stored
-for the samples, so memory does not grow with them. In Triton, with the walk of `gpu_march.py`.
+for the samples, so memory does not grow with them. In Triton, with the search of `gpu_march.py`.
 """
 
 # Triton's functions have no types that pyright could know.
@@ -28,12 +28,11 @@ from climatenerf.ops.gpu_encoding import (
 from climatenerf.ops.gpu_march import (
     LEAST_TAU,
     RAYS,
-    TRIES,
     WARPS,
     begin,
     cells_of,
-    step_at,
-    walk,
+    middle_of,
+    search,
     weight_of,
 )
 
@@ -85,14 +84,10 @@ def _composite(
     rgb = tl.zeros([BLOCK, 16], tl.float32)
     live = some & (t < end)
     while tl.max(live.to(tl.int32), 0) > 0:
-        found = tl.zeros_like(t).to(tl.int32)
-        for _try in range(TRIES):
-            t, found = walk(o, d, t, end, live & (t < end), found, cells, steps)
+        t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
         if tl.max(found, 0) > 0:
-            dt = step_at(t, end, steps)
-            tm = t + 0.5 * dt
-            qx, qy, qz = o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
+            dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
             own = density_of(qx, qy, qz, here, density[0], layers, SIZES) * dt
             own = tl.where(here & (own > LEAST_TAU), own, 0.0)
             weight = weight_of(tau, own)
