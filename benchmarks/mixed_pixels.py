@@ -1,12 +1,14 @@
-"""How pure the reference street's pixels are: what a perfect field would score.
+"""How pure the reference street's pixels are: what a perfect field would score, and what one does.
 
-python benchmarks/mixed_pixels.py --rays 6
+python benchmarks/mixed_pixels.py --rays 6 --run RUN
 
 The truth of a pixel is that of the ray through its middle; its photo is the mean over its area.
 Pixels of leaves against the sky are both. With `rays` times `rays` rays a pixel this tells which
 share of the true sky pixels is sky over 99 % of its area, which share is so of those with sky all
-around, and how much of the area lies before the surface of the middle. A field that shows the
-photos' areas rightly can score no better than that. Needs `pip install ".[street]"`.
+around, and how much of the area lies before the surface of the middle: the scores of a field that
+shows the photos' areas rightly. Of a fit of the street, RUN, it tells how many of the pure and of
+the mixed sky pixels are empty, and of the sky pixels of the photos it was fitted to (every eighth).
+Needs `pip install ".[street]"`.
 """
 
 import argparse
@@ -16,10 +18,16 @@ from pathlib import Path
 
 import common
 import numpy as np
+import torch
 from jaxtyping import Float
 
-from climatenerf.evaluation.geometry import emptiness_scores, free_space
+from climatenerf.evaluation.geometry import EMPTY, emptiness_scores, free_space
 from climatenerf.evaluation.reference import read_reference
+from climatenerf.evaluation.scores import Place, check_views, passing
+from climatenerf.field.checkpoint import load_field
+from climatenerf.scene import load_scene
+from climatenerf.scene.classes import MERGED, SKY
+from climatenerf.scene.images import load_labels
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -37,11 +45,40 @@ def depths(scene, pose: Float[np.ndarray, "4 4"], size: tuple[int, int], rays: i
     return t.transpose(0, 2, 1, 3).reshape(height, width, rays * rays)
 
 
+def transmittance(fitted, camera, c2w) -> Float[np.ndarray, "h w"]:
+    """Of the whole ray of each pixel of a view."""
+    endless = torch.full((camera.width * camera.height,), 1e9)
+    return passing(fitted, camera, c2w, endless).view(camera.height, camera.width).numpy()
+
+
+def run_scores(run: Path, truths, pure: list[np.ndarray]) -> dict[str, float]:
+    """Shares of a fit's sky pixels that are empty; `pure` are those that are all sky."""
+    place = Place(load_field(run), load_scene(run), read_reference(ROOT / "reference" / "street"))
+    check_views(place.scene, place.reference)
+    passed = [transmittance(place.fitted, *place.pose(truth)) for truth in truths]
+    empty = np.concatenate([(p >= EMPTY)[t.sky] for p, t in zip(passed, truths, strict=True)])
+    all_sky = np.concatenate([p[t.sky] for p, t in zip(pure, truths, strict=True)])
+    known = []
+    for view in place.scene.of_split("train")[::8]:
+        label = load_labels(view, place.scene)
+        assert label is not None
+        sky = MERGED[label] == SKY
+        camera, c2w = place.scene.cameras[view.camera], place.scene.c2w_world(view)
+        known.append((transmittance(place.fitted, camera, c2w) >= EMPTY)[sky])
+    return {
+        "pure_empty": float(empty[all_sky].mean()),
+        "mixed_empty": float(empty[~all_sky].mean()),
+        "fitted_photos_empty": float(np.concatenate(known).mean()),
+    }
+
+
 def main() -> None:
-    """Traces the test views and prints the scores of a perfect field."""
+    """Traces the test views and prints the scores of a perfect field, and of a run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rays", type=int, default=6)
-    rays = parser.parse_args().rays
+    parser.add_argument("--run", type=Path, help="a fit of the reference street")
+    options = parser.parse_args()
+    rays = options.rays
     sys.path.insert(0, str(ROOT))
     from street.layout import build_scene, measuring_poses
     from street.render import load
@@ -55,7 +92,10 @@ def main() -> None:
         t = depths(scene, poses[truth.name], truth.depth.shape[::-1], rays)
         absorbed.append((t < free_space(truth)[..., None]).mean(-1))
         skyward.append(np.isinf(t).mean(-1))
-    common.report("how pure pixels are", {"perfect": emptiness_scores(absorbed, skyward, truths)})
+    found = {"perfect": emptiness_scores(absorbed, skyward, truths)}
+    if options.run:
+        found["run"] = run_scores(options.run, truths, [s > EMPTY for s in skyward])
+    common.report("how pure pixels are", found)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """How much cleaner the air would be if the distance of every surface were known.
 
-python benchmarks/true_depth.py --steps 900 --downscale 2
+python benchmarks/true_depth.py --steps 5000 --fits sparse 1 10
 
-Fits the reference street twice: with the sparse points that it has, and with thousands of points a
-photo that lie exactly on what the photo shows. What the second fit still leaves in the air is not
-for want of depth: it is what the field cannot hold, or not learn in so many steps. Needs
-`pip install ".[street]"`.
+Fits the reference street with the sparse points that it has, and with thousands of points a photo
+that lie exactly on what the photo shows, their loss weighted so many times more than usual. What
+these fits still leave in the air is not for want of depth: it is what the field cannot hold, or not
+learn in so many steps. Needs `pip install ".[street]"`.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.scene import Scene
 from climatenerf.training.ablation import measure_row
 from climatenerf.training.run import fit_scene
-from climatenerf.training.settings import FitSettings
+from climatenerf.training.settings import FitSettings, Losses
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "reference" / "street"
@@ -58,26 +58,33 @@ def with_true_points(capture: Scene, each: int, seed: int) -> Scene:
 
 
 def main() -> None:
-    """Fits with sparse and with true points, and prints the scores of both."""
+    """Makes the fits asked for, and prints the scores of each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=900)
-    parser.add_argument("--downscale", type=int, default=2)
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument(
+        "--fits", nargs="+", default=["sparse", "1"], help="sparse, or true points so many times"
+    )
     parser.add_argument("--points", type=int, default=3000, help="true points of each photo")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    settings = FitSettings(minutes=None, steps=options.steps, seed=options.seed)
     capture = read_scene(REFERENCE)
     truth = with_true_points(capture, options.points, options.seed)
     found = {}
     with tempfile.TemporaryDirectory() as work:
-        for name, scene in (("sparse points", capture), ("true points", truth)):
-            run = Path(work) / name
+        for fit in options.fits:
+            scene, factor = (capture, 1.0) if fit == "sparse" else (truth, float(fit))
+            losses = Losses(points=factor * Losses().points)
+            settings = FitSettings(
+                minutes=None, steps=options.steps, seed=options.seed, losses=losses, match=False
+            )
+            run = Path(work) / fit
             fit_scene(
                 scene, run, settings, options.downscale, False, lambda _: None, lambda *_: None
             )
             place = Place(load_field(run), load_scene(run), read_reference(REFERENCE))
-            found[name], _ = measure_row(place, settings, False)
-            print(name, found[name], file=sys.stderr)
+            found[fit], _ = measure_row(place, settings, False)
+            print(fit, found[fit], file=sys.stderr, flush=True)
     common.report("floaters with sparse and with true points", found, options.seed)
 
 

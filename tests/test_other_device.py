@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from toy_device import TOY, kernels_for_toys
+from training.toy_photos import BENT, pattern, photos
 from training.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
@@ -14,12 +15,16 @@ from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import check_triton, on
 from climatenerf.field.extent import find_extent
+from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
+from climatenerf.ops.placing import array_of
 from climatenerf.render.frame import render_frame
 from climatenerf.render.stage import prepare
 from climatenerf.scene import load_image
 from climatenerf.storage import read_json
+from climatenerf.training.carving import Carving
 from climatenerf.training.fit import Fitting
+from climatenerf.training.matching import match_photos
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.run import fit_scene
@@ -118,6 +123,24 @@ def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
         assert fitting.knows_sky and fitting.carving.ground is not None
         fitting.run(nothing)
         assert fitting.field.embeddings.device == TOY and fitting.poses.shift.device == TOY
+
+
+def test_photos_are_matched_alike_on_both():
+    """And what is nearer to cameras than the points so found is the same."""
+    grey, found, empty = pattern(), [], []
+    for device in (contextlib.nullcontext(), on_toy()):
+        with device:
+            pixels = photos(BENT, lambda i, t, x: grey(x))
+            matched = match_photos(pixels, None, (1.5, 4.0), 0)
+            assert matched is not None
+            field = Field(TINY, 5, np.array([0.0, 3.0, 0.0]), 3.0, 0.1)
+            carving = Carving(field, pixels, matched, FitSettings())
+            place = matched.rays_o + 0.3 * matched.depth[:, None] * matched.rays_d
+            before = carving.in_the_way(place, torch.full_like(matched.depth, 0.01))
+            found.append(array_of(matched.depth))
+            empty.append(array_of(before))
+    assert len(found[0]) > 300 and np.array_equal(*found)
+    assert empty[0].any() and np.array_equal(*empty)
 
 
 @pytest.mark.slow

@@ -113,6 +113,13 @@ def test_floaters_and_sky_are_counted_where_they_are():
     passed[0, :8] = 0.5
     found = geometry.emptiness_scores([lost], [passed], (truth,))
     assert found["floater_mass"] == pytest.approx(0.25)
+    assert found["floaters_road"] == pytest.approx(0.25) and "floaters_terrain" not in found
+    grown = dataclasses.replace(truth, label=truth.label.copy())
+    half = np.arange(truth.label.shape[1])[None, :] < 32
+    grown.label[~truth.sky & half] = LEAVES
+    each = geometry.emptiness_scores([np.where(half, 0.5, 0.125) + 0 * lost], [passed], (grown,))
+    assert each["floaters_vegetation"] == pytest.approx(0.5)
+    assert each["floaters_road"] == pytest.approx(0.125)
     assert truth.sky[0, :8].all()
     assert found["sky_empty_fraction"] == pytest.approx(1 - 8 / truth.sky.sum())
     free = geometry.free_space(truth)

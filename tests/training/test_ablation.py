@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from toy_scene import TINY, make_scene
 
 from climatenerf.errors import UserError
@@ -53,8 +54,16 @@ def test_each_row_leaves_out_just_what_it_says():
     }
     plain = rows["plain NGP"]
     assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
-    assert not plain.sky_labels
+    assert not plain.sky_labels and not plain.match
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
+
+
+def test_rows_are_chosen_by_name_in_the_table_s_order():
+    assert list(ablation.chosen_rows(4.0, ())) == list(ablation.rows(4.0))
+    some = ablation.chosen_rows(2.0, ("full", "plain NGP"))
+    assert list(some) == ["plain NGP", "full"] and some["full"] == FitSettings(minutes=2.0)
+    with pytest.raises(UserError, match="'no sun'; there are: plain NGP, no appearance"):
+        ablation.chosen_rows(4.0, ("full", "no sun"))
 
 
 def test_the_papers_weights_are_the_papers():
@@ -107,7 +116,7 @@ def test_a_row_stopped_midway_is_finished_later(tmp_path):
 def test_a_capture_without_truth_is_refused_before_any_fit(tmp_path):
     scene = make_scene(tmp_path / "toy")
     with pytest.raises(UserError, match="reference"):
-        ablation.ablate(scene, tmp_path / "out", 1.0, 1, 1, print, print)
+        ablation.ablate(scene, tmp_path / "out", 1.0, 1, 1, print, print, ablation.rows(1.0))
     assert not (tmp_path / "out").exists()
 
 
@@ -134,10 +143,10 @@ def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
     full = FitSettings(minutes=None, steps=250, samples_per_step=2**14)
     bare = ablation.rows(1.0)["no sky"]
     bare = dataclasses.replace(bare, minutes=None, steps=250, samples_per_step=2**14)
-    monkeypatch.setattr(ablation, "rows", lambda minutes: {"no sky": bare, "full": full})
+    chosen = {"no sky": bare, "full": full}
     monkeypatch.setattr(ablation, "WEATHERS", ("smog-mid",))
     data = ablation.ablate(
-        read_scene(REFERENCE), tmp_path, 1.0, 4, 1, lambda name, state: None, lambda name: None
+        read_scene(REFERENCE), tmp_path, 1.0, 4, 1, lambda *_: None, lambda name: None, chosen
     )
     rows = {name: each[0] for name, each in data["rows"].items()}
     assert rows["full"]["sky_empty_fraction"] > rows["no sky"]["sky_empty_fraction"]
@@ -161,6 +170,21 @@ def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
     # What is shown is far smoother than what the density alone would give.
     assert found["normal_median_deg"] < 0.6 * found["slope_median_deg"]
     assert found["open_sky"] > 0.95 and found["sky_empty_fraction"] > 0.9
+    # Upwards all round, and down from below the ground, as water reflects: nothing is black.
+    photos = np.concatenate([truth.clean.reshape(-1, 3) for truth in place.reference.truths])
+    least = 0.25 * np.median(photos.mean(-1))
+    angle, up = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0.05, 1.0, 20))
+    level = np.sqrt(1 - up**2)
+    d = np.stack([level * np.cos(angle), level * np.sin(angle), up], -1).reshape(-1, 3)
+    sky = place.fitted.sky(torch.from_numpy(d.astype(np.float32)))
+    assert sky.mean(-1).min() > least
+
+
+def test_a_report_of_more_rows_is_not_replaced_by_one_of_fewer(tmp_path):
+    (tmp_path / ablation.FILE_NAME).write_text(json.dumps({"rows": {"full": [], "no sky": []}}))
+    ablation.check_folder(tmp_path, REFERENCE, ("no sky", "full", "no depth"))
+    with pytest.raises(UserError, match="more rows .no sky.; choose another folder"):
+        ablation.check_folder(tmp_path, REFERENCE, ("full",))
 
 
 def test_what_cannot_be_measured_is_refused_before_the_first_fit(tmp_path, monkeypatch):
@@ -169,7 +193,7 @@ def test_what_cannot_be_measured_is_refused_before_the_first_fit(tmp_path, monke
 
     def refused(match, out, of=scene):
         with pytest.raises(UserError, match=match):
-            ablation.ablate(of, out, 1.0, 2, 1, lambda *_: None, lambda _: None)
+            ablation.ablate(of, out, 1.0, 2, 1, print, print, ablation.rows(1.0))
 
     refused("lies in the reference set", REFERENCE / "mine")
     trained = [dataclasses.replace(view, split="train") for view in scene.views]

@@ -88,6 +88,72 @@ def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tow
     assert touches.sum() > 50 and not barred[touches].any()
 
 
+def test_matter_with_points_is_kept_though_every_view_takes_it_for_sky():
+    """A network's word, even unanimous, empties nothing that was measured."""
+
+    def err(maps):
+        return [np.where(m == 2, 10, m).astype(np.uint8) for m in maps]
+
+    found = carving(err, losses=type(FitSettings().losses)(ground=0.0))
+    field, barred = found.field, found.field.occupancy.barred.view(-1)
+    assert found.points is not None
+    ends = field.to_grid(found.points.ends)
+    on_tower = ends[found.points.ends[:, 2] > 0.2]
+    assert len(on_tower) > 10
+    cells, _ = field._cells(on_tower)
+    assert not barred[cells].any(), "where points lie"
+    side = 2.0 / field.occupancy.side  # of the cells of the first cascade
+    beside, _ = field._cells(on_tower - torch.tensor([0.9 * side, 0.0, 0.0]))
+    assert not barred[beside].any(), "and beside them"
+    found.points = None
+    found.bar()
+    assert barred[cells].float().mean() > 0.2, "without points the word would empty it"
+
+
+def test_what_is_much_nearer_to_a_camera_than_its_points_is_empty():
+    found = carving(losses=type(FitSettings().losses)(ground=0.0))
+    field, occupancy = found.field, found.field.occupancy
+    assert found.points is not None
+    middle, size = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
+    x, radius = middle * field.unit + field.centre, size * field.unit * 3**0.5 / 2
+    before = found.in_the_way(x, radius)
+    away = torch.stack([(x - eye).norm(dim=-1) for eye in found.pixels.c2w[:, :3, 3]])
+    nearest = [found.points.depth[found.points.image == i] for i in range(12)]
+    told = torch.tensor([len(each) >= 20 for each in nearest])
+    assert before.any() and told.any()
+    reach = [0.8 * float(each.quantile(0.02)) if len(each) >= 20 else 0.0 for each in nearest]
+    within = (away < torch.tensor(reach)[:, None]).any(0)
+    assert within[before].all() and away[told].amin(0)[before].max() > 0.7 * max(reach)
+    spared = ~occupancy.barred.view(-1)[before]
+    apart = torch.cdist(x[before][spared], found.points.ends).amin(-1)
+    assert spared.float().mean() < 0.5 and (apart < 3 * size.min() * field.unit).all(), "by points"
+    one = int(told.nonzero()[0, 0])
+    found.points = found.points.some(torch.isin(found.points.image, torch.tensor([one])))
+    assert away[one][found.in_the_way(x, radius)].max() < float(nearest[one].min()) + 1e-3
+    found.points = found.points.some(torch.arange(19))
+    assert not found.in_the_way(x, radius).any(), "too few points say nothing"
+    found.points = None
+    assert not found.in_the_way(x, radius).any()
+
+
+def test_smooth_ground_right_before_a_camera_is_spared():
+    """Its nearest points lie far off: an asphalt road has few."""
+    found = carving()
+    assert found.points is not None and found.ground is not None
+    middle, size = found.field.occupancy.cell_centres(
+        torch.arange(found.field.occupancy.occupied.numel())
+    )
+    x, radius = middle * found.field.unit + found.field.centre, size * found.field.unit * 3**0.5 / 2
+    some = found.points
+    found.points = PointRays(some.rays_o, some.rays_d, some.depth + 4.0, some.image)
+    known = found.ground.over(middle)[1]
+    low = known & (x[:, 2].abs() < radius)
+    kept, found.ground = found.in_the_way(x, radius), None
+    without = found.in_the_way(x, radius)
+    assert (without & low).sum() > 20 and not (kept & low).any()
+    assert (kept & known).any() and torch.equal(kept & ~known, without & ~known)
+
+
 def test_what_is_below_a_crest_nearby_is_not_taken_to_be_in_the_open():
     """A ditch 0.3 units deep: what is in it is hidden from most, though they see its far bank."""
     xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 7

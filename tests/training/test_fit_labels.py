@@ -15,7 +15,7 @@ from climatenerf.scene.classes import PERSON, ROAD, SKY, UNKNOWN, VEHICLE
 from climatenerf.training import fit, losses
 from climatenerf.training.carving import Carving
 from climatenerf.training.fit import Fitting
-from climatenerf.training.points import find_point_rays
+from climatenerf.training.points import PointRays, find_point_rays
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import PAPER, FitSettings, Losses
 
@@ -169,6 +169,25 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
         height = o[ray, 2] + samples.t * d[ray, 2]
         above[weight] = float((weights * (height > 0.15)).sum() / len(d))
     assert above[100.0] < 0.5 * above[0.0], above
+
+
+def test_what_is_matched_on_the_ground_is_left_to_its_map(scene):
+    known, labels = labelled(scene)
+    pixels = labelled_pixels(known, labels)
+    views = known.of_split("train")
+    extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
+    settings = FitSettings(preset="tiny", minutes=None, steps=10)
+    batch = pixels.draw(2000, torch.Generator().manual_seed(0))
+    matched = PointRays(batch.rays_o, batch.rays_d, torch.full((2000,), 3.0), batch.image)
+    lies = int((batch.label == 3).sum())
+    assert 200 < lies < 1800
+    points = find_point_rays(known)
+    fitting = Fitting(pixels, len(views), extent, settings, points, matched)
+    assert fitting.carving.ground is not None
+    assert fitting.measured[0] is points
+    assert len(fitting.measured[1].depth) == pytest.approx(2000 - lies, abs=20)
+    alone = Fitting(pixels, len(views), extent, settings, None, matched)
+    assert alone.carving.ground is None and alone.measured == [matched]
 
 
 def test_classes_and_normals_move_no_matter(scene, monkeypatch):

@@ -6,7 +6,7 @@ import torch
 from toy_scene import poses
 
 from climatenerf.scene.cameras import Camera
-from climatenerf.training.in_view import in_view, pyramids
+from climatenerf.training.in_view import before_a_camera, in_view, pyramids
 
 PLAIN = Camera(48, 36, 40.0, 44.0, 20.0, 19.0)
 BENT = Camera(48, 36, 40.0, 44.0, 20.0, 19.0, k1=-0.2, k2=0.03, p1=0.01)
@@ -67,3 +67,18 @@ def test_all_is_in_view_of_a_camera_too_wide_for_a_pyramid(camera):
 def test_no_places_are_asked_and_none_answered():
     views = pyramids([PLAIN], np.eye(4)[None])
     assert in_view(torch.zeros(0, 3), torch.zeros(0), views).shape == (0,)
+
+
+def test_what_is_before_a_camera_is_within_its_pyramid_and_its_reach():
+    c2w = np.stack(poses(5))
+    x = np.random.default_rng(2).uniform(-6, 6, (20_000, 3)).astype(np.float32)
+    reach = np.array([0.5, 1.0, 2.0, 3.0, 0.0], np.float32)
+    eyes = c2w[:, :3, 3].astype(np.float32)
+    near = np.zeros(len(x), bool)
+    for pose, far in zip(c2w, reach, strict=True):
+        near |= projected(PLAIN, [pose], x) & (np.linalg.norm(x - pose[:3, 3], axis=-1) < far)
+    arguments = (pyramids([PLAIN] * 5, c2w), torch.from_numpy(eyes), torch.from_numpy(reach))
+    ours = before_a_camera(torch.from_numpy(x), torch.zeros(len(x)), *arguments)
+    assert near.sum() > 100 and (ours.numpy() != near).sum() <= 2, "but for rounding"
+    balls = before_a_camera(torch.from_numpy(x), torch.full((len(x),), 0.2), *arguments)
+    assert (ours | ~balls).all() and balls.sum() < ours.sum(), "whole balls are nearer"

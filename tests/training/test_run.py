@@ -21,6 +21,7 @@ from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import carving as carving_module
 from climatenerf.training import run as run_module
+from climatenerf.training.points import PointRays
 from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
 from climatenerf.training.settings import PAPER, FitSettings, Losses
 from climatenerf.training.witness import Witness
@@ -491,3 +492,30 @@ def test_a_run_that_never_got_saved_can_be_begun_again(scene, tmp_path, monkeypa
         with pytest.raises(UserError, match="disk is full"):
             fitted(scene, tmp_path / "run", steps=3)
     assert fitted(scene, tmp_path / "run", steps=3)["steps"] == 3
+
+
+def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
+    """Matched points reach the fit; without the loss, or by the settings, none are looked for."""
+    scene, asked = make_scene(tmp_path / "toy"), []
+
+    def match_photos(pixels, points, typical, seed):
+        asked.append(seed)
+        return PointRays(
+            torch.zeros(9, 3), torch.eye(3).repeat(3, 1), torch.ones(9), torch.zeros(9).long()
+        )
+
+    measured = []
+    began = run_module.Fitting
+
+    def begin(*words):
+        fitting = began(*words)
+        measured.append(len(fitting.measured))
+        return fitting
+
+    monkeypatch.setattr(run_module, "match_photos", match_photos)
+    monkeypatch.setattr(run_module, "Fitting", begin)
+    for index, chosen in enumerate(({}, {"match": False}, {"losses": Losses(points=0.0)})):
+        settings = FitSettings(preset="tiny", minutes=None, steps=1, seed=5, **chosen)
+        run = tmp_path / str(index)
+        run_module.fit_scene(scene, run, settings, 1, False, lambda _: None, lambda *_: None)
+    assert asked == [5] and measured == [1, 0, 0]

@@ -37,14 +37,18 @@ class Evaluate:
     """Photos are reduced this many times for the ablation."""
     seeds: int = 2
     """Fits of each row of the ablation."""
+    rows: tuple[str, ...] = ()
+    """Rows of the ablation, such as "plain NGP" full. Default: all."""
 
 
 def run(options: Evaluate) -> int:
     """Measures, prints the table, and says where the report is."""
     if options.ablation:
         return run_ablation(options)
-    if (options.minutes, options.downscale, options.seeds) != (4.0, 2, 2):
-        raise UserError("--minutes, --downscale and --seeds belong to --ablation; leave them out")
+    if (options.minutes, options.downscale, options.seeds, options.rows) != (4.0, 2, 2, ()):
+        raise UserError(
+            "--minutes, --downscale, --seeds and --rows belong to --ablation; leave them out"
+        )
     if not options.reference:
         raise UserError("say what to measure against: climatenerf evaluate RUN --reference -o OUT")
 
@@ -95,10 +99,11 @@ def run_ablation(options: Evaluate) -> int:
 
     scene = read_scene(options.run)
 
-    from climatenerf.training.ablation import TEXT_NAME, ablate, markdown, rows
+    from climatenerf.training.ablation import TEXT_NAME, ablate, chosen_rows, markdown
     from climatenerf.training.fit import Report
 
-    total = len(rows(options.minutes)) * options.seeds
+    chosen = chosen_rows(options.minutes, options.rows)
+    total = len(chosen) * options.seeds
     with progress.Bar("ablation", float(total)) as bar:
         done = 0
 
@@ -110,9 +115,8 @@ def run_ablation(options: Evaluate) -> int:
             done += 1
             bar.update(float(done), {"measured": name})
 
-        data = ablate(
-            scene, options.out, options.minutes, options.downscale, options.seeds, report, tell
-        )
+        asked = (options.minutes, options.downscale, options.seeds)
+        data = ablate(scene, options.out, *asked, report, tell, chosen)
     progress.result(markdown(data))
     progress.result(f"report: {options.out / TEXT_NAME}")
     return 0

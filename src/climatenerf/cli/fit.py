@@ -215,7 +215,10 @@ def _each(value: object) -> tuple:
 def fit_with_bars(scene, options: Fit) -> dict:
     """Fits with progress bars; returns the metrics."""
     # torch comes in here, so that help and errors in the input do not wait for it.
-    progress.say("Preparing (the first run on a machine compiles kernels, about half a minute)")
+    progress.say(
+        "Preparing: photos are matched, up to half a minute; so long again where kernels are to be"
+        " compiled, once on a machine"
+    )
     from climatenerf.field.device import on
     from climatenerf.training.fit import Report
     from climatenerf.training.run import fit_scene

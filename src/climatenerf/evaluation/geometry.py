@@ -116,16 +116,23 @@ def emptiness_scores(
         truths: of the same views.
 
     Returns:
-        `floater_mass`, the mean share lost before the surface; `sky_empty_fraction`, the share of
-        true sky pixels that at least `EMPTY` of the light passes; `clear_sky_empty_fraction`, the
-        same of those with sky all around (a pixel beside a leaf is leaf in part, whatever its
-        middle shows).
+        `floater_mass`, the mean share lost before the surface, and `floaters_CLASS`, the same
+        before surfaces of each class; `sky_empty_fraction`, the share of true sky pixels that at
+        least `EMPTY` of the light passes; `clear_sky_empty_fraction`, the same of those with sky
+        all around (a pixel beside a leaf is leaf in part, whatever its middle shows).
     """
     lost = np.concatenate([a[~t.sky] for a, t in zip(absorbed, truths, strict=True)])
     passed = np.concatenate([s[t.sky] for s, t in zip(skyward, truths, strict=True)])
     clear = np.concatenate([within(t.sky)[t.sky] for t in truths])
+    kind = np.concatenate([MERGED[t.label][~t.sky] for t in truths])
+    each = {
+        f"floaters_{name}": float(lost[kind == own].mean())
+        for own, name in enumerate(CLASS_NAMES)
+        if (kind == own).any()
+    }
     return {
         "floater_mass": float(lost.mean()),
+        **each,
         "sky_empty_fraction": _share(passed >= EMPTY),
         "clear_sky_empty_fraction": _share(passed[clear] >= EMPTY),
     }

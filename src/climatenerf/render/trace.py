@@ -24,7 +24,7 @@ from climatenerf.weather import smog, waves
 HIDDEN = 1e-3  # what this share of the light or less comes from is not looked for
 LEAST_SHARE = 1.0 / 2048  # of a pixel that water must have to be traced: below an 8-bit step
 BOUNCES = 2  # meetings with the water, then the plain field
-SECONDARY_STEP = 5.0  # marching step of secondary rays; RENDER_STEP is that of camera rays
+SECONDARY_STEP = 5.0  # marching step of what is seen by way of the water; RENDER_STEP: of the rest
 SKIN = 2e-3  # secondary rays begin this far from the water, m
 
 
@@ -393,7 +393,7 @@ def _other_side(
     if down.numel():
         o, d = start[down], direction[down]
         zero, far = torch.zeros(down.shape[0]), torch.full_like(o[:, 0], 1e9)
-        samples = world.field.march(o, d, zero, far, SECONDARY_STEP)
+        samples = world.field.march(o, d, zero, far, RENDER_STEP)  # a bed is seen as it is
         weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
         ray = samples.ray_index()
         keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]

@@ -76,6 +76,7 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         appearance=False,
         sky_labels=False,
         carve=False,
+        match=False,
         crowded=0.0,
     )
     return {
@@ -90,6 +91,19 @@ def rows(minutes: float) -> dict[str, FitSettings]:
     }
 
 
+def chosen_rows(minutes: float, names: tuple[str, ...]) -> dict[str, FitSettings]:
+    """The rows of these names; all if none is given.
+
+    Raises:
+        UserError: there is no row of a name.
+    """
+    known = rows(minutes)
+    for name in names:
+        if name not in known:
+            raise UserError(f"there is no row {name!r}; there are: {', '.join(known)}")
+    return {name: row for name, row in known.items() if not names or name in names}
+
+
 def ablate(
     scene: Scene,
     out: Path,
@@ -98,8 +112,9 @@ def ablate(
     seeds: int,
     report: Callable[[str, Report], None],
     tell: Tell,
+    chosen: dict[str, FitSettings],
 ) -> dict[str, Any]:
-    """Fits and measures every row; returns and writes the table.
+    """Fits and measures some rows; returns and writes the table.
 
     What an earlier call has finished in the folder is taken from there.
 
@@ -111,6 +126,7 @@ def ablate(
         seeds: fits of each row.
         report: told the row and where its fit is.
         tell: told what is being measured.
+        chosen: settings of the rows, see `chosen_rows`.
 
     Raises:
         UserError: the capture has no reference set, or the folder holds fits of other settings.
@@ -118,15 +134,15 @@ def ablate(
     # All that can be wrong is to be known before hours of fitting.
     reference = read_reference(scene.root)
     check_views(scene, reference)
-    check_folder(out, reference.folder)
+    check_folder(out, reference.folder, tuple(chosen))
     make_folder(out / "runs")
     table: dict[str, list[dict[str, float]]] = {}
     sheet = []
-    for name, settings in rows(minutes).items():
+    for name, settings in chosen.items():
         for seed in range(seeds):
             run = out / "runs" / f"{name.replace(' ', '-')}-{seed}"
-            chosen = dataclasses.replace(settings, seed=seed)
-            fit_row(scene, run, chosen, downscale, lambda state, name=name: report(name, state))
+            seeded = dataclasses.replace(settings, seed=seed)
+            fit_row(scene, run, seeded, downscale, lambda state, name=name: report(name, state))
             tell(f"{name}, seed {seed}")
             place = Place(load_field(run), load_scene(run), read_reference(scene.root))
             scores, pictures = measure_row(place, settings, seed == 0)
@@ -146,11 +162,20 @@ def ablate(
     return data
 
 
-def check_folder(out: Path, reference: Path) -> None:
-    """Refuses a folder within the reference set, or with files that no ablation wrote."""
+def check_folder(out: Path, reference: Path, names: tuple[str, ...]) -> None:
+    """Refuses a folder within the reference set, or with a report that these rows do not replace.
+
+    That is one that no ablation wrote, or one of other rows, too.
+    """
     if out.resolve().is_relative_to(reference.resolve()):
         raise UserError(f"{out} lies in the reference set; choose another folder with -o")
     ours = (out / FILE_NAME).is_file() and "rows" in read_json(out / FILE_NAME, "an ablation")
+    more = set(read_json(out / FILE_NAME, "an ablation")["rows"]) - set(names) if ours else set()
+    if more:
+        raise UserError(
+            f"{out} holds a report of more rows ({', '.join(sorted(more))}); choose another folder"
+            " with -o, or ask for these, too"
+        )
     for name in (FILE_NAME, TEXT_NAME, SHEET):
         if (out / name).exists() and not ours:
             raise UserError(f"{out / name} would be overwritten; choose another folder with -o")

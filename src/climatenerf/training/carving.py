@@ -1,11 +1,12 @@
 """What photos, labels and sparse points say of space before anything is learned.
 
-Cells that no photo has in view stay empty, as do those that photos agree to be before the sky,
-unless a point lies by them, and those above points of the ground that most photos see ground
-behind. Elsewhere matter above the ground costs, but is not forbidden: a crest may hide a ditch and
-what is in it, and the map of the ground does not know every step. What stands on the ground is
-spared, with a rim about it: a trunk is narrower than the haze that becomes one. Once the field has
-learned classes of its own they say better what stands, and lumps in the rim are pulled as well.
+Cells that no photo has in view stay empty, as do those right before a camera, those that photos
+agree to be before the sky, unless a point lies by them, and those above points of the ground that
+most photos see ground behind. Elsewhere matter above the ground costs, but is not forbidden: a
+crest may hide a ditch and what is in it, and the map of the ground does not know every step. What
+stands on the ground is spared, with a rim about it: a trunk is narrower than the haze that becomes
+one. Once the field has learned classes of its own they say better what stands, and lumps in the rim
+are pulled as well.
 """
 
 import torch
@@ -17,7 +18,7 @@ from climatenerf.ops import reference
 from climatenerf.ops.placing import placed
 from climatenerf.scene.classes import GROUND, SOLID
 from climatenerf.training.ground_map import draw_ground
-from climatenerf.training.in_view import in_view
+from climatenerf.training.in_view import before_a_camera, in_view
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import PointRays
 from climatenerf.training.settings import FitSettings
@@ -82,6 +83,7 @@ class Carving:
         empty = torch.zeros(cells.shape[0], dtype=torch.bool)
         if not self.moves:  # cameras that are still to turn have something else in view
             empty = ~in_view(x, radius, self.pixels.pyramids)
+            empty |= self.in_the_way(x, radius)
         if witness is not None:
             empty |= witness.agreed(x, radius)
         barred = occupancy.barred.view(-1)
@@ -93,6 +95,28 @@ class Carving:
             high = high[~self.stands.view(-1)[cells[high]]]
             barred[cells[high]] = True
         occupancy.occupied.view(-1)[barred] = 0
+
+    def in_the_way(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """Whether balls (world m) lie before a camera and much nearer than all that it shows.
+
+        What fills a corner of a few photos may as well be a dark lump before them; other photos
+        hardly see so small a place. But points are found on what is truly near, except for smooth
+        ground, which is spared where its map is known.
+        """
+        if self.points is None:
+            return torch.zeros(x.shape[0], dtype=torch.bool)
+        count = self.pixels.c2w.shape[0]
+        reach = torch.zeros(count)
+        for image in range(count):
+            depth = self.points.depth[self.points.image == image]
+            if depth.numel() >= LEAST_POINTS:
+                reach[image] = IN_THE_WAY * depth.quantile(NEAREST)
+        eyes = self.pixels.c2w[:, :3, 3]
+        before = before_a_camera(x, radius, self.pixels.pyramids, eyes, reach)
+        if self.ground is not None:
+            over, known = self.ground.over(self.field.to_grid(x))
+            before &= ~known | (over > radius / self.field.unit + self.ground.tolerance)
+        return before
 
     def find_cells_of_points(self) -> None:
         """Notes the occupancy's cells in which sparse points lie, and those by what stands."""
@@ -193,3 +217,6 @@ AT_ONCE = 2**18  # cells that are asked about: their places take room
 SAME = 1e-4  # grid units within which two ends are one point
 STEP = 0.05  # grid units over which a ray nears the ground
 LEAST_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst
+NEAREST = 0.02  # quantile of the distances of a photo's points that stands for the nearest,
+LEAST_POINTS = 20  # where it has so many
+IN_THE_WAY = 0.8  # of that distance: what is nearer shows no point because it is not there

@@ -27,7 +27,7 @@ from climatenerf.training.carving import Carving, on_the_ground
 from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.pixels import HORIZON, Batch, TrainingPixels
-from climatenerf.training.points import PointRays
+from climatenerf.training.points import PointRays, joined
 from climatenerf.training.poses import RATE as POSE_RATE
 from climatenerf.training.poses import PoseCorrections
 from climatenerf.training.settings import FitSettings
@@ -61,8 +61,9 @@ class Fitting:
         extent: Extent,
         settings: FitSettings,
         points: PointRays | None = None,
+        matched: PointRays | None = None,
     ):
-        """Begins with an untrained field."""
+        """Begins with an untrained field; a few of the points matched (`matching`) are wrong."""
         torch.manual_seed(settings.seed)
         self.points = points
         self.first_near = FIRST_NEAR * extent.unit
@@ -83,6 +84,11 @@ class Fitting:
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
         self.fill = fill_sky(pixels, self.generator)
         self.carving = Carving(self.field, pixels, points, settings)
+        if matched is not None and self.carving.ground is not None:
+            # A map is better than what is matched on ground: windows mix fences with lawns behind.
+            label = pixels.label_towards(matched.image, matched.rays_d)
+            matched = matched.some(~on_the_ground(label))
+        self.measured = [each for each in (points, matched) if each is not None]
         kinds = pixels.kinds()
         self.still = self.cells_of_points(images)
         self.solid_of = placed(SOLID_OF.astype(np.int64))
@@ -229,10 +235,12 @@ class Fitting:
             loss = loss + self.poses.loss()
 
         used = samples.t.shape[0]
-        if settings.losses.points and self.points is not None:
-            measured = self.points.draw(max(n // POINT_SHARE, 16), self.generator)
-            loss_of_depth, more = self.depth_loss(measured)
-            loss, used = loss + settings.losses.points * loss_of_depth, used + more
+        if settings.losses.points and self.measured:
+            some = max(n // POINT_SHARE, 16)
+            drawn = [each.draw(some, self.generator) for each in self.measured]
+            loss_of_depth, more = self.depth_loss(joined(drawn))
+            weight = len(drawn) * settings.losses.points  # of each kind as if it were alone
+            loss, used = loss + weight * loss_of_depth, used + more
 
         self.net_adam.zero_grad()
         loss.backward()
@@ -576,7 +584,7 @@ BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
 SURE_PULL = 4.0  # of the ground loss's weight, once the field's own classes tell ground
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
-POINT_SHARE = 16  # rays of photos for one to a sparse point
+POINT_SHARE = 16  # rays of photos for one to a sparse point, and one to a matched one
 MAX_STEP_SCALE = 8.0
 LEAST_SAMPLES = 4  # of a ray in the mean: empty ones cost too
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this

@@ -1,7 +1,7 @@
-"""What cameras have in view at all: of space outside every picture the photos say nothing.
+"""What cameras have in view at all, and what is so near before one that it would be in its way.
 
-Matter that grows there only shelters the ground and blackens reflections, so it is left empty
-(as Instant-NGP does: Müller et al. 2022).
+Of space outside every picture the photos say nothing. Matter that grows there only shelters the
+ground and blackens reflections, so it is left empty (as Instant-NGP does: Müller et al. 2022).
 """
 
 from collections.abc import Sequence
@@ -59,3 +59,23 @@ def in_view(
             outside = torch.maximum(outside, place @ side[:, :3].T + side[:, 3])
         found.append(outside.amin(-1) < reach)
     return torch.cat(found)
+
+
+def before_a_camera(
+    x: Float[Tensor, "n 3"],
+    radius: Float[Tensor, "n"],
+    views: Float[Tensor, "v 4 4"],
+    eyes: Float[Tensor, "v 3"],
+    reach: Float[Tensor, "v"],
+) -> Bool[Tensor, "n"]:
+    """Whether balls are wholly within a view's reach (m) of its eye, their middles in view."""
+    found = torch.zeros(x.shape[0], dtype=torch.bool)
+    low, high = (eyes - reach[:, None]).amin(0), (eyes + reach[:, None]).amax(0)
+    near = ((x > low) & (x < high)).all(-1).nonzero()[:, 0]
+    for some in near.split(max(256, AT_ONCE // views.shape[0])):
+        place, own = x[some], radius[some, None]
+        beyond = (place[:, None] - eyes).norm(dim=-1) + own - reach
+        for side in views.unbind(1):
+            beyond = torch.maximum(beyond, place @ side[:, :3].T + side[:, 3])
+        found[some] = beyond.amin(-1) < 0
+    return found

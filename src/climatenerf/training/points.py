@@ -1,5 +1,6 @@
 """Sparse points as measured depth: rays from photos to the points that they are known to show."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,3 +63,9 @@ def find_point_rays(scene: Scene) -> PointRays | None:
         depth=placed(depth[kept].astype(np.float32)),
         image=placed(np.concatenate(of)[kept].astype(np.int64)),
     )
+
+
+def joined(some: Sequence[PointRays]) -> PointRays:
+    """The rays of all of them; at least one."""
+    every = zip(*(vars(each).values() for each in some), strict=True)
+    return PointRays(*(torch.cat(same) for same in every))

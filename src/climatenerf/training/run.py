@@ -38,6 +38,7 @@ from climatenerf.storage import (
 )
 from climatenerf.training.fit import REFINE_AT, Fitting, Report
 from climatenerf.training.folder import OPTIMISER, check_folder
+from climatenerf.training.matching import match_photos
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import find_point_rays
 from climatenerf.training.settings import FitSettings
@@ -116,7 +117,12 @@ def fit_scene(
     poses = np.stack([scene.c2w_world(view) for view in views])
     check_moves(poses)
     extent = find_extent(poses, scene.points_world())
-    fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(scene))
+    points = find_point_rays(scene)
+    matched = None
+    if settings.match and settings.losses.points:
+        known = pixels if settings.sky_labels else pixels.without_sky()
+        matched = match_photos(known, points, (extent.near, extent.unit), settings.seed)
+    fitting = Fitting(pixels, len(views), extent, settings, points, matched)
     if resume:
         restore(fitting, run)
     make_folder(run / "previews")

@@ -62,6 +62,8 @@ class FitSettings:
     """What is labelled sky is known to be; False: it is a class that nobody named."""
     carve: bool = True
     """What no photo has in view, or photos agree to be sky, is kept empty from the beginning."""
+    match: bool = True
+    """Photos are searched for what their neighbours show alike, as more measured points."""
     crowded: float = 3.0
     """Gradients shrink within this many times the nearest distance to a camera; 0: nowhere."""
     opaque_sky: bool = False
@@ -88,6 +90,7 @@ PAPER = FitSettings(
     ),
     opaque_sky=True,
     carve=False,
+    match=False,
     crowded=0.0,
 )
 """The paper's (supplement, "Training Details"), whose print "3^{-4}" is a mis-set 3e-4."""

@@ -1,0 +1,214 @@
+"""Search along pixels' rays for the distance at which neighbouring pictures look alike: Numba, CPU.
+
+Pictures are grey and of pinhole cameras, pixel centres at .5. Inverse z-depth s in 1/m: a pixel's
+direction d (z = 1) at s is seen by another camera in the direction A d + s b, A and b the turn and
+the shift between the two cameras' frames.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int, UInt8
+from numba import njit, prange
+
+SIDE = 2  # pixels from a window's middle to its border
+STEP = 1.0  # pixels that the projection moves between two distances that are tried, or more:
+MOST_STEPS = 256  # what comes near moves over all of a large picture
+FINE = 8  # smaller steps to either side of the best one
+APART = 3  # steps from the best one that count as another place
+LEAST_CONTRAST = 4.0  # standard deviation of a window, 8-bit levels
+UNSEEN = 0  # the level of a pixel that a picture does not show
+NONE = -2.0  # a likeness that is not known
+HOPELESS = 0.5  # a likeness at whole steps that no smaller step makes a good one
+# NaN keeps its meaning: it stands for what a picture does not show.
+_FAST = {"contract", "reassoc", "arcp", "nsz"}
+
+
+class Pictures(NamedTuple):
+    """Grey pictures in one row, and how they see each other (Numba takes named tuples as is)."""
+
+    grey: UInt8[np.ndarray, "total"]
+    """Levels from 1 to 255, or `UNSEEN`."""
+    start: Int[np.ndarray, "v"]
+    """Where each picture begins."""
+    size: Int[np.ndarray, "v 2"]
+    """Width and height, px."""
+    intrinsics: Float32[np.ndarray, "v 4"]
+    """fx, fy, cx, cy, px."""
+    others: Int[np.ndarray, "v k"]
+    """The neighbours that each is compared with; -1: none."""
+    turn: Float32[np.ndarray, "v k 3 3"]
+    """A: from the picture's camera frame to a neighbour's."""
+    shift: Float32[np.ndarray, "v k 3"]
+    """b: the picture's eye in a neighbour's frame, m."""
+    most: Float32[np.ndarray, "v"]
+    """The largest inverse z-depth that is tried, 1/m; the least is 0."""
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def match(
+    pictures: Pictures, view: Int[np.ndarray, "n"], pixel: Float32[np.ndarray, "n 2"]
+) -> Float32[np.ndarray, "n 3"]:
+    """Inverse z-depth of pixels (x, y) of views, by Goesele et al. 2006, "Multi-View Stereo
+    Revisited": windows are compared by normalized cross-correlation.
+
+    Returns:
+        [n 3]: inverse z-depth (1/m); likeness there, the mean of the two neighbours that are most
+        alike; and the most at any other distance. Likeness is in [-1,1], or `NONE`, also where it
+        is poor.
+    """
+    n = view.shape[0]
+    found = np.empty((n, 3), np.float32)
+    for p in prange(n):
+        i, x, y = view[p], pixel[p, 0], pixel[p, 1]
+        window = np.empty((2 * SIDE + 1) ** 2, np.float32)
+        found[p, 0], found[p, 1], found[p, 2] = 0.0, NONE, NONE
+        if not _take_window(pictures, i, x, y, window):
+            continue
+        steps = _steps(pictures, i, x, y)
+        per_step = pictures.most[i] / (steps - 1)
+        likeness = np.empty(steps, np.float32)
+        best = 0
+        for h in range(steps):
+            likeness[h] = _alike(pictures, i, x, y, h * per_step, window)
+            if likeness[h] > likeness[best]:
+                best = h
+        if likeness[best] < HOPELESS:
+            continue
+        second = -1
+        for h in range(steps):
+            apart = abs(h - best) >= APART and likeness[h] > NONE
+            if apart and (second < 0 or likeness[h] > likeness[second]):
+                second = h
+        found[p, 0], found[p, 1] = _refined(pictures, i, x, y, best, per_step, window)
+        if second >= 0:  # as finely, or it would look less alike than it is
+            _, found[p, 2] = _refined(pictures, i, x, y, second, per_step, window)
+    return found
+
+
+@njit(cache=True, fastmath=_FAST)
+def _refined(pictures, i, x, y, h, per_step, window):
+    """Inverse z-depth of the best place within a step of step h, and the likeness there."""
+    fine = np.empty(2 * FINE + 1, np.float32)
+    top = FINE
+    for f in range(2 * FINE + 1):
+        s = max(0.0, (h + (f - FINE) / FINE) * per_step)
+        fine[f] = _alike(pictures, i, x, y, s, window)
+        if fine[f] > fine[top]:
+            top = f
+    shift = 0.0
+    if 0 < top < 2 * FINE and fine[top - 1] > NONE and fine[top + 1] > NONE:
+        bend = fine[top - 1] - 2 * fine[top] + fine[top + 1]
+        if bend < -1e-6:  # flat: 0/0
+            shift = 0.5 * (fine[top - 1] - fine[top + 1]) / bend
+    return np.float32(max(0.0, (h + (top - FINE + shift) / FINE) * per_step)), fine[top]
+
+
+@njit(cache=True, fastmath=_FAST)
+def _look(pictures, i, x, y):
+    """Grey level of picture i, between its pixels; NaN where it shows nothing."""
+    width, height = pictures.size[i, 0], pictures.size[i, 1]
+    x, y = x - 0.5, y - 0.5
+    if not (x >= 0 and y >= 0 and x <= width - 1 and y <= height - 1 and min(width, height) > 1):
+        return np.float32(np.nan)
+    column, row = min(int(x), width - 2), min(int(y), height - 2)
+    u, v = x - column, y - row
+    at = pictures.start[i] + row * width + column
+    grey = pictures.grey
+    a, b, c, d = grey[at], grey[at + 1], grey[at + width], grey[at + width + 1]
+    if a == UNSEEN or b == UNSEEN or c == UNSEEN or d == UNSEEN:
+        return np.float32(np.nan)
+    upper, lower = (1 - u) * a + u * b, (1 - u) * c + u * d
+    return np.float32((1 - v) * upper + v * lower)
+
+
+@njit(cache=True, fastmath=_FAST)
+def _take_window(pictures, i, x, y, window):
+    """Fills `window` with what is about a pixel, less its mean and of length 1; False if flat."""
+    total, at = 0.0, 0
+    for row in range(-SIDE, SIDE + 1):
+        for column in range(-SIDE, SIDE + 1):
+            window[at] = _look(pictures, i, x + column, y + row)
+            total += window[at]
+            at += 1
+    mean, squared = total / at, 0.0
+    for k in range(at):
+        window[k] -= mean
+        squared += window[k] ** 2
+    if not squared > at * LEAST_CONTRAST**2:
+        return False
+    for k in range(at):
+        window[k] /= np.sqrt(squared)
+    return True
+
+
+@njit(cache=True, fastmath=_FAST)
+def _direction(pictures, i, k, x, y, s):
+    """A d + s b of a pixel of picture i, in the frame of its neighbour k."""
+    fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
+    dx, dy = (x - pictures.intrinsics[i, 2]) / fx, (y - pictures.intrinsics[i, 3]) / fy
+    a, b = pictures.turn[i, k], pictures.shift[i, k]
+    return (
+        a[0, 0] * dx + a[0, 1] * dy + a[0, 2] + s * b[0],
+        a[1, 0] * dx + a[1, 1] * dy + a[1, 2] + s * b[1],
+        a[2, 0] * dx + a[2, 1] * dy + a[2, 2] + s * b[2],
+    )
+
+
+@njit(cache=True, fastmath=_FAST)
+def _steps(pictures, i, x, y):
+    """How many distances are tried, by how far the projection moves from the last to the first."""
+    length = 0.0
+    for k in range(pictures.others.shape[1]):
+        j = pictures.others[i, k]
+        if j < 0:
+            continue
+        far = _direction(pictures, i, k, x, y, 0.0)
+        near = _direction(pictures, i, k, x, y, pictures.most[i])
+        if far[2] <= 1e-3 or near[2] <= 1e-3:  # passes the camera: over all of the picture
+            return MOST_STEPS
+        fx, fy = pictures.intrinsics[j, 0], pictures.intrinsics[j, 1]
+        across = fx * (near[0] / near[2] - far[0] / far[2])
+        down = fy * (near[1] / near[2] - far[1] / far[2])
+        length = max(length, np.sqrt(across * across + down * down))
+    return min(MOST_STEPS, int(length / STEP) + 2 * APART)
+
+
+@njit(cache=True, fastmath=_FAST)
+def _alike(pictures, i, x, y, s, window):
+    """Mean likeness to the two neighbours that are most alike at inverse z-depth s."""
+    first, second = np.float32(NONE), np.float32(NONE)
+    fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
+    for k in range(pictures.others.shape[1]):
+        j = pictures.others[i, k]
+        if j < 0:
+            continue
+        middle = _direction(pictures, i, k, x, y, s)
+        a, own = pictures.turn[i, k], pictures.intrinsics[j]
+        total, squared, both, at = 0.0, 0.0, 0.0, 0
+        seen = True
+        for row in range(-SIDE, SIDE + 1):
+            for column in range(-SIDE, SIDE + 1):
+                u, v = column / fx, row / fy
+                z = middle[2] + a[2, 0] * u + a[2, 1] * v
+                if z <= 1e-3:  # beside or behind the camera: x/z has no meaning
+                    seen = False
+                    break
+                to_x = own[0] * (middle[0] + a[0, 0] * u + a[0, 1] * v) / z + own[2]
+                to_y = own[1] * (middle[1] + a[1, 0] * u + a[1, 1] * v) / z + own[3]
+                grey = _look(pictures, j, to_x, to_y)
+                total += grey
+                squared += grey * grey
+                both += grey * window[at]
+                at += 1
+            if not seen:
+                break
+        variance = squared - total * total / max(at, 1)
+        if not seen or not variance > at * LEAST_CONTRAST**2:  # NaN where not shown
+            continue
+        own_likeness = np.float32(both / np.sqrt(variance))
+        if own_likeness > first:
+            first, second = own_likeness, first
+        elif own_likeness > second:
+            second = own_likeness
+    return np.float32(NONE) if second == NONE else np.float32(0.5) * (first + second)
