@@ -28,6 +28,7 @@ CAPTURES = {
     "kitti_drive": {"level": "0.3 m", "least_water": 0.05, "least_snow": 0.05, "downscale": 2},
     "fox": {"level": "0.3 m", "least_water": 0.02, "least_snow": 0.0, "downscale": 1},
 }
+WALL = "fox"  # hangs on one: in its picture hardly anything lies level
 FLAGS = {
     "smog": ["--smog.visibility", f"{VISIBILITY} m"],
     "snow": ["--snow.depth", f"{SNOW} m"],
@@ -166,8 +167,9 @@ def test_snow_lies_as_deep_as_asked_for(fitted, rendered):
     layers = rendered["snow"]
     assert (layers["snow_thickness"][layers["mask_snow"] == 0] == 0).all()
     snowy = layers["mask_snow"] > 0.5  # a short fit's surfaces are soft and shine through
-    if CAPTURES[fitted[0]]["least_snow"] == 0:
-        pytest.skip("a wall: hardly anything lies level in this picture")
+    if fitted[0] == WALL:
+        assert snowy.mean() < 0.02, "hardly anything lies level"
+        return
     assert snowy.mean() > CAPTURES[fitted[0]]["least_snow"]
     # Within 10 % over known planes (test_snow.py); here the ground is rough and soft.
     assert np.median(layers["snow_thickness"][snowy]) == pytest.approx(SNOW, rel=0.45)
@@ -175,6 +177,8 @@ def test_snow_lies_as_deep_as_asked_for(fitted, rendered):
 
 def test_sheltered_places_stay_bare(fitted, rendered):
     """Surfaces seen in the picture, and whether matter stands straight above them."""
+    if fitted[0] == WALL:
+        pytest.skip("a wall: no snow in the open to compare with")
     import torch
 
     from climatenerf.field.checkpoint import load_field
