@@ -74,7 +74,7 @@ def test_sky_and_what_masks_hide_is_not_asked():
     place = pixels.place_towards(found.image, found.rays_d)
     assert place[:, 0].min() > 0.5 and place[:, 1].min() > 1 / 3
     assert len(found.depth) > 0.05 * ASKED
-    pictures = pictures_of(pixels, np.full(5, 1.5), np.full(5, 4.0))
+    pictures = pictures_of(pixels, np.full((5, 9), 1.5), np.full((5, 9), 4.0))
     shown = pictures.grey.reshape(5, 72, 96)
     assert (shown[:, :, :48] == kernels.UNSEEN).all() and (shown[:, :, 48:] > 0).all()
 
@@ -107,7 +107,7 @@ def looked_up(image, at):
 def test_likeness_is_that_of_the_slow_twin():
     grey, c2w = pattern(), poses(40, distance=4.0)[:5]
     pixels = photos(PLAIN, lambda i, t, x: grey(x), c2w=c2w)
-    near, middle = np.full(5, 1.0), np.full(5, 4.0)
+    near, middle = np.full((5, 9), 1.0), np.full((5, 9), 4.0)
     pictures = pictures_of(pixels, near, middle)
     images = [
         pictures.grey[start : start + 96 * 72].reshape(72, 96).astype(float)
@@ -120,8 +120,10 @@ def test_likeness_is_that_of_the_slow_twin():
         window = np.empty(25, np.float32)
         if not kernels._take_window(pictures, i, np.float32(x), np.float32(y), window):
             continue
-        ours = kernels._alike(pictures, i, np.float32(x), np.float32(y), s, window)
-        js = [j for j in pictures.others[i] if j >= 0]
+        tile = kernels._tile(pictures, i, x, y)
+        assert tile == 3 * int(y / 24) + int(x / 32)
+        ours = kernels._alike(pictures, i, tile, np.float32(x), np.float32(y), s, window)
+        js = [j for j in pictures.others[i, tile] if j >= 0]
         each = [slow_likeness(PLAIN, c2w, images, i, j, x, y, s) for j in js]
         best = sorted(value for value in each if np.isfinite(value))[-2:]
         if len(best) < 2:
@@ -137,10 +139,15 @@ def test_neighbours_look_the_same_way_from_the_side():
     turned = c2w[0].copy()
     turned[:3, 0], turned[:3, 2] = -turned[:3, 0], -turned[:3, 2]
     c2w = np.concatenate([c2w, turned[None]])
-    found = neighbours(c2w, [PLAIN] * 10, np.full(10, 4.0))
+    middle = np.full((10, 9), 4.0)
+    found = neighbours(c2w, [PLAIN] * 10, middle)
     assert (found[9] == -1).all(), "it looks the other way"
-    assert sorted(found[4]) == [2, 3, 5, 6], "4 and 8 degrees to either side"
-    assert (neighbours(c2w[:1], [PLAIN], np.full(1, 4.0)) == -1).all()
+    assert sorted(found[4, 4]) == [2, 3, 5, 6], "4 and 8 degrees to either side"
+    assert (neighbours(c2w[:1], [PLAIN], middle[:1]) == -1).all()
+    middle[4, 4] = 8.0
+    wider = neighbours(c2w, [PLAIN] * 10, middle)
+    assert sorted(wider[4, 4]) == [1, 2, 6, 7], "what is far, from farther apart"
+    assert (wider[4, 3] == found[4, 3]).all() and (found[4, 3] != found[4, 5]).any()
 
 
 def test_the_street_s_distances_are_found(monkeypatch):

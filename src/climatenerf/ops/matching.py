@@ -18,6 +18,7 @@ FINE = 8  # smaller steps to either side of the best one
 APART = 3  # steps from the best one that count as another place
 LEAST_CONTRAST = 4.0  # standard deviation of a window, 8-bit levels
 UNSEEN = 0  # the level of a pixel that a picture does not show
+TILES = 3  # along each side of a picture: each has neighbours of its own
 NONE = -2.0  # a likeness that is not known
 HOPELESS = 0.5  # a likeness at whole steps that no smaller step makes a good one
 # NaN keeps its meaning: it stands for what a picture does not show.
@@ -35,13 +36,13 @@ class Pictures(NamedTuple):
     """Width and height, px."""
     intrinsics: Float32[np.ndarray, "v 4"]
     """fx, fy, cx, cy, px."""
-    others: Int[np.ndarray, "v k"]
-    """The neighbours that each is compared with; -1: none."""
-    turn: Float32[np.ndarray, "v k 3 3"]
+    others: Int[np.ndarray, "v tiles k"]
+    """The neighbours that each tile of it is compared with; -1: none."""
+    turn: Float32[np.ndarray, "v tiles k 3 3"]
     """A: from the picture's camera frame to a neighbour's."""
-    shift: Float32[np.ndarray, "v k 3"]
+    shift: Float32[np.ndarray, "v tiles k 3"]
     """b: the picture's eye in a neighbour's frame, m."""
-    most: Float32[np.ndarray, "v"]
+    most: Float32[np.ndarray, "v tiles"]
     """The largest inverse z-depth that is tried, 1/m; the least is 0."""
 
 
@@ -65,12 +66,13 @@ def match(
         found[p, 0], found[p, 1], found[p, 2] = 0.0, NONE, NONE
         if not _take_window(pictures, i, x, y, window):
             continue
-        steps = _steps(pictures, i, x, y)
-        per_step = pictures.most[i] / (steps - 1)
+        tile = _tile(pictures, i, x, y)
+        steps = _steps(pictures, i, tile, x, y)
+        per_step = pictures.most[i, tile] / (steps - 1)
         likeness = np.empty(steps, np.float32)
         best = 0
         for h in range(steps):
-            likeness[h] = _alike(pictures, i, x, y, h * per_step, window)
+            likeness[h] = _alike(pictures, i, tile, x, y, h * per_step, window)
             if likeness[h] > likeness[best]:
                 best = h
         if likeness[best] < HOPELESS:
@@ -80,20 +82,20 @@ def match(
             apart = abs(h - best) >= APART and likeness[h] > NONE
             if apart and (second < 0 or likeness[h] > likeness[second]):
                 second = h
-        found[p, 0], found[p, 1] = _refined(pictures, i, x, y, best, per_step, window)
+        found[p, 0], found[p, 1] = _refined(pictures, i, tile, x, y, best, per_step, window)
         if second >= 0:  # as finely, or it would look less alike than it is
-            _, found[p, 2] = _refined(pictures, i, x, y, second, per_step, window)
+            _, found[p, 2] = _refined(pictures, i, tile, x, y, second, per_step, window)
     return found
 
 
 @njit(cache=True, fastmath=_FAST)
-def _refined(pictures, i, x, y, h, per_step, window):
+def _refined(pictures, i, tile, x, y, h, per_step, window):
     """Inverse z-depth of the best place within a step of step h, and the likeness there."""
     fine = np.empty(2 * FINE + 1, np.float32)
     top = FINE
     for f in range(2 * FINE + 1):
         s = max(0.0, (h + (f - FINE) / FINE) * per_step)
-        fine[f] = _alike(pictures, i, x, y, s, window)
+        fine[f] = _alike(pictures, i, tile, x, y, s, window)
         if fine[f] > fine[top]:
             top = f
     shift = 0.0
@@ -123,6 +125,14 @@ def _look(pictures, i, x, y):
 
 
 @njit(cache=True, fastmath=_FAST)
+def _tile(pictures, i, x, y):
+    """Number of the tile of picture i, row by row, in which a pixel lies."""
+    column = min(max(int(TILES * x / pictures.size[i, 0]), 0), TILES - 1)
+    row = min(max(int(TILES * y / pictures.size[i, 1]), 0), TILES - 1)
+    return TILES * row + column
+
+
+@njit(cache=True, fastmath=_FAST)
 def _take_window(pictures, i, x, y, window):
     """Fills `window` with what is about a pixel, less its mean and of length 1; False if flat."""
     total, at = 0.0, 0
@@ -143,11 +153,11 @@ def _take_window(pictures, i, x, y, window):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _direction(pictures, i, k, x, y, s):
+def _direction(pictures, i, tile, k, x, y, s):
     """A d + s b of a pixel of picture i, in the frame of its neighbour k."""
     fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
     dx, dy = (x - pictures.intrinsics[i, 2]) / fx, (y - pictures.intrinsics[i, 3]) / fy
-    a, b = pictures.turn[i, k], pictures.shift[i, k]
+    a, b = pictures.turn[i, tile, k], pictures.shift[i, tile, k]
     return (
         a[0, 0] * dx + a[0, 1] * dy + a[0, 2] + s * b[0],
         a[1, 0] * dx + a[1, 1] * dy + a[1, 2] + s * b[1],
@@ -156,15 +166,15 @@ def _direction(pictures, i, k, x, y, s):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _steps(pictures, i, x, y):
+def _steps(pictures, i, tile, x, y):
     """How many distances are tried, by how far the projection moves from the last to the first."""
     length = 0.0
-    for k in range(pictures.others.shape[1]):
-        j = pictures.others[i, k]
+    for k in range(pictures.others.shape[2]):
+        j = pictures.others[i, tile, k]
         if j < 0:
             continue
-        far = _direction(pictures, i, k, x, y, 0.0)
-        near = _direction(pictures, i, k, x, y, pictures.most[i])
+        far = _direction(pictures, i, tile, k, x, y, 0.0)
+        near = _direction(pictures, i, tile, k, x, y, pictures.most[i, tile])
         if far[2] <= 1e-3 or near[2] <= 1e-3:  # passes the camera: over all of the picture
             return MOST_STEPS
         fx, fy = pictures.intrinsics[j, 0], pictures.intrinsics[j, 1]
@@ -175,16 +185,16 @@ def _steps(pictures, i, x, y):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _alike(pictures, i, x, y, s, window):
+def _alike(pictures, i, tile, x, y, s, window):
     """Mean likeness to the two neighbours that are most alike at inverse z-depth s."""
     first, second = np.float32(NONE), np.float32(NONE)
     fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
-    for k in range(pictures.others.shape[1]):
-        j = pictures.others[i, k]
+    for k in range(pictures.others.shape[2]):
+        j = pictures.others[i, tile, k]
         if j < 0:
             continue
-        middle = _direction(pictures, i, k, x, y, s)
-        a, own = pictures.turn[i, k], pictures.intrinsics[j]
+        middle = _direction(pictures, i, tile, k, x, y, s)
+        a, own = pictures.turn[i, tile, k], pictures.intrinsics[j]
         total, squared, both, at = 0.0, 0.0, 0.0, 0
         seen = True
         for row in range(-SIDE, SIDE + 1):

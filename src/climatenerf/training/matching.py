@@ -5,11 +5,13 @@ Curless & Seitz 2006, "Multi-View Stereo Revisited"); what two of them show alik
 and at no other, is kept as a measured point of the photo.
 """
 
+from itertools import islice
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from climatenerf.ops.matching import UNSEEN, Pictures, match
+from climatenerf.ops.matching import TILES, UNSEEN, Pictures, match
 from climatenerf.ops.placing import array_of, placed
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import SKY
@@ -26,6 +28,7 @@ NEARER = 0.5  # of the nearest point's distance: nothing is looked for before it
 LEAST_LIKENESS = 0.8
 SAME_PLACE = 0.02  # of the distance from a neighbour that finds it too
 LEAST_LEAD = 0.05  # of it over that at any other distance
+LEAST_POINTS = 20  # of a photo or a tile, which tell its distances
 WIDE = 0.1  # least cosine from a camera's axis: beyond it no pinhole sees a pixel
 WEIGHTS = (0.299, 0.587, 0.114)  # of grey (Rec. 601)
 
@@ -44,8 +47,7 @@ def match_photos(
         typical: nearest and typical distance (m) where no points do.
         seed: of the pixels that are chosen.
     """
-    count = pixels.c2w.shape[0]
-    near, middle = distances(points, count, typical)
+    near, middle = distances(pixels, points, typical)
     pictures = pictures_of(pixels, near, middle)
     windows = min(WINDOWS, pixels.rgb.shape[0] // PIXELS)
     pixel = pixels.anywhere(windows, torch.Generator().manual_seed(seed))
@@ -58,8 +60,9 @@ def match_photos(
     of, local = array_of(image), array_of(d).astype(np.float64)
     ahead = local[:, 2] > WIDE
     of, local = of[ahead], local[ahead] / local[ahead, 2:]
-    found = match(pictures, of, _pixels(pictures, of, local))
-    sure = _sure(pictures, of, found)
+    pixel = _pixels(pictures, of, local)
+    found = match(pictures, of, pixel)
+    sure = _sure(pictures, of, pixel, found)
     of, local, z = of[sure], local[sure], 1 / found[sure, 0]
     kept = seen_back(pictures, of, local * z[:, None])
     if not kept.any():
@@ -79,14 +82,18 @@ def seen_back(
 ) -> Bool[np.ndarray, "n"]:
     """Whether a neighbour, searching in its turn, finds places x (in camera frames), too."""
     kept = np.zeros(len(of), bool)
+    place = _pixels(pictures, of, x / x[:, 2:]) / pictures.size[of]
+    tile = _tiles(place)
     for k in range(2):
-        j = pictures.others[of, k]
-        there = np.einsum("nij,nj->ni", pictures.turn[of, k], x) + pictures.shift[of, k]
+        j = pictures.others[of, tile, k]
+        turn, shift = pictures.turn[of, tile, k], pictures.shift[of, tile, k]
+        there = np.einsum("nij,nj->ni", turn, x) + shift
         some = np.flatnonzero(~kept & (j >= 0) & (there[:, 2] > 0))
         z = there[some, 2]
-        found = match(pictures, j[some], _pixels(pictures, j[some], there[some] / z[:, None]))
+        pixel = _pixels(pictures, j[some], there[some] / z[:, None])
+        found = match(pictures, j[some], pixel)
         again = np.abs(found[:, 0] * z - 1) < SAME_PLACE
-        kept[some] = again & _sure(pictures, j[some], found)
+        kept[some] = again & _sure(pictures, j[some], pixel, found)
     return kept
 
 
@@ -98,31 +105,49 @@ def _pixels(
     return (local[:, :2] * own[:, :2] + own[:, 2:]).astype(np.float32)
 
 
+def _tiles(place: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+    """Numbers of the tiles in which places (x, y in [0,1]) of pictures lie."""
+    column, row = np.clip((TILES * place).astype(int), 0, TILES - 1).T
+    return TILES * row + column
+
+
 def _sure(
-    pictures: Pictures, of: Int[np.ndarray, "n"], found: Float32[np.ndarray, "n 3"]
+    pictures: Pictures,
+    of: Int[np.ndarray, "n"],
+    pixel: Float32[np.ndarray, "n 2"],
+    found: Float32[np.ndarray, "n 3"],
 ) -> Bool[np.ndarray, "n"]:
     """Whether windows were found alike in one place alone, and not at an end of the search."""
     inverse, likeness, second = found.T
+    most = pictures.most[of, _tiles(pixel / pictures.size[of])]
     alike = (likeness > LEAST_LIKENESS) & (likeness - second > LEAST_LEAD)
-    return alike & (inverse > 0) & (inverse < pictures.most[of])
+    return alike & (inverse > 0) & (inverse < most)
 
 
 def distances(
-    points: PointRays | None, count: int, typical: tuple[float, float]
-) -> tuple[Float[np.ndarray, "v"], Float[np.ndarray, "v"]]:
-    """The nearest distance and the median one (m) that each photo shows."""
-    near, middle = np.full(count, typical[0]), np.full(count, typical[1])
+    pixels: TrainingPixels, points: PointRays | None, typical: tuple[float, float]
+) -> tuple[Float[np.ndarray, "v tiles"], Float[np.ndarray, "v tiles"]]:
+    """The nearest distance (m) that each tile of the photos may show, and the median one."""
+    count = pixels.c2w.shape[0]
+    near, middle = (np.full((count, TILES**2), each) for each in typical)
     if points is not None:
         depth, image = array_of(points.depth), array_of(points.image)
+        place = array_of(pixels.place_towards(points.image, points.rays_d))
+        tile = _tiles(np.nan_to_num(place))
         near[:], middle[:] = np.quantile(depth, [0.02, 0.5])
-        for i in np.flatnonzero(np.bincount(image, minlength=count) >= 20):
-            near[i], middle[i] = np.quantile(depth[image == i], [0.02, 0.5])
+        for i in np.flatnonzero(np.bincount(image, minlength=count) >= LEAST_POINTS):
+            own, where = depth[image == i], tile[image == i]
+            near[i], middle[i] = np.quantile(own, [0.02, 0.5])
+            for j in np.flatnonzero(np.bincount(where, minlength=TILES**2) >= LEAST_POINTS):
+                near[i, j], middle[i, j] = np.quantile(own[where == j], [0.02, 0.5])
         near *= NEARER
     return near, middle
 
 
 def pictures_of(
-    pixels: TrainingPixels, near: Float[np.ndarray, "v"], middle: Float[np.ndarray, "v"]
+    pixels: TrainingPixels,
+    near: Float[np.ndarray, "v tiles"],
+    middle: Float[np.ndarray, "v tiles"],
 ) -> Pictures:
     """The photos in grey, without distortion, and how each is seen by its neighbours."""
     c2w = array_of(pixels.c2w).astype(np.float64)
@@ -137,8 +162,7 @@ def pictures_of(
     grey, _ = in_one_row(shapes, straight, np.uint8, UNSEEN)
     others = neighbours(c2w, pixels.cameras, middle)
     known = np.maximum(others, 0)
-    back = np.linalg.inv(c2w)[known]  # [v k 4 4]
-    between = back @ c2w[:, None]
+    between = np.linalg.inv(c2w)[known] @ c2w[:, None, None]  # [v tiles k 4 4]
     return Pictures(
         np.asarray(grey),
         starts[:-1],
@@ -182,22 +206,32 @@ def _levels(grey: Float32[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
 
 
 def neighbours(
-    c2w: Float[np.ndarray, "v 4 4"], cameras: list[Camera], middle: Float[np.ndarray, "v"]
-) -> Int[np.ndarray, "v k"]:
-    """The photos that see the middle of each from the side, best first; -1 where there is none."""
-    found = np.full((len(c2w), NEIGHBOURS), -1)
+    c2w: Float[np.ndarray, "v 4 4"], cameras: list[Camera], middle: Float[np.ndarray, "v tiles"]
+) -> Int[np.ndarray, "v tiles k"]:
+    """The photos that see the middle of each photo's tiles from the side, best first; -1: none.
+
+    What is far asks for a wider base than what is near, and what a border shows for other photos
+    than the middle.
+    """
+    found = np.full((len(c2w), TILES**2, NEIGHBOURS), -1)
     eyes, axes = c2w[:, :3, 3], c2w[:, :3, 2]
-    for i in range(len(c2w)):
-        place = eyes[i] + middle[i] * axes[i]
-        to = place - eyes
-        length = np.linalg.norm(to, axis=-1)
-        cosine = (to @ axes[i]) / np.maximum(length, 1e-9)  # a camera right there: 0/0
-        angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        fits = (angle > ANGLES[0]) & (angle < ANGLES[1]) & (axes @ axes[i] > FACING)
-        fits[i] = False
-        rated = np.abs(np.log(np.maximum(angle, 1e-3) / BEST_ANGLE))  # the photo itself: log 0
-        order = [j for j in np.argsort(rated) if fits[j] and _shows(cameras[j], c2w[j], place)]
-        found[i, : len(order[:NEIGHBOURS])] = order[:NEIGHBOURS]
+    for i, own in enumerate(cameras):
+        same_way = axes @ axes[i] > FACING
+        same_way[i] = False
+        for tile in range(TILES**2):
+            x = (tile % TILES + 0.5) / TILES * own.width
+            y = (tile // TILES + 0.5) / TILES * own.height
+            local = np.array([(x - own.cx) / own.fx, (y - own.cy) / own.fy, 1.0])
+            d = c2w[i, :3, :3] @ local / np.linalg.norm(local)
+            place = eyes[i] + middle[i, tile] * d
+            to = place - eyes
+            cosine = (to @ d) / np.maximum(np.linalg.norm(to, axis=-1), 1e-9)  # right there: 0/0
+            angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+            fits = (angle > ANGLES[0]) & (angle < ANGLES[1]) & same_way
+            rated = np.abs(np.log(np.maximum(angle, 1e-3) / BEST_ANGLE))  # 0 degrees: log 0
+            shown = (j for j in np.argsort(rated) if fits[j] and _shows(cameras[j], c2w[j], place))
+            best = list(islice(shown, NEIGHBOURS))
+            found[i, tile, : len(best)] = best
     return found
 
 
