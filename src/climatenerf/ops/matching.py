@@ -19,6 +19,7 @@ APART = 3  # steps from the best one that count as another place
 LEAST_CONTRAST = 4.0  # standard deviation of a window, 8-bit levels
 UNSEEN = 0  # the level of a pixel that a picture does not show
 TILES = 3  # along each side of a picture: each has neighbours of its own
+STEEP = 20.0  # times a window's reach in depth that it must be away: 1/z is taken from a series
 NONE = -2.0  # a likeness that is not known
 HOPELESS = 0.5  # a likeness at whole steps that no smaller step makes a good one
 # NaN keeps its meaning: it stands for what a picture does not show.
@@ -110,18 +111,28 @@ def _refined(pictures, i, tile, x, y, h, per_step, window):
 def _look(pictures, i, x, y):
     """Grey level of picture i, between its pixels; NaN where it shows nothing."""
     width, height = pictures.size[i, 0], pictures.size[i, 1]
-    x, y = x - 0.5, y - 0.5
-    if not (x >= 0 and y >= 0 and x <= width - 1 and y <= height - 1 and min(width, height) > 1):
+    if not (x >= 0.5 and y >= 0.5 and x <= width - 0.5 and y <= height - 0.5):
         return np.float32(np.nan)
-    column, row = min(int(x), width - 2), min(int(y), height - 2)
-    u, v = x - column, y - row
+    return _between(pictures, i, x, y) if min(width, height) > 1 else np.float32(np.nan)
+
+
+@njit(cache=True, fastmath=_FAST)
+def _between(pictures, i, x, y):
+    """The same of a place that is known to lie between middles of pixels."""
+    width, height = pictures.size[i, 0], pictures.size[i, 1]
+    x, y = np.float32(x - 0.5), np.float32(y - 0.5)
+    # Rounding may bring a place past the first or the last.
+    column = max(0, min(int(x), width - 2))
+    row = max(0, min(int(y), height - 2))
+    u, v = x - np.float32(column), y - np.float32(row)
     at = pictures.start[i] + row * width + column
     grey = pictures.grey
     a, b, c, d = grey[at], grey[at + 1], grey[at + width], grey[at + width + 1]
     if a == UNSEEN or b == UNSEEN or c == UNSEEN or d == UNSEEN:
         return np.float32(np.nan)
-    upper, lower = (1 - u) * a + u * b, (1 - u) * c + u * d
-    return np.float32((1 - v) * upper + v * lower)
+    one = np.float32(1.0)
+    upper, lower = (one - u) * a + u * b, (one - u) * c + u * d
+    return (one - v) * upper + v * lower
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -185,6 +196,20 @@ def _steps(pictures, i, tile, x, y):
 
 
 @njit(cache=True, fastmath=_FAST)
+def _holds(pictures, j, z, nearer, middle, beside, axis):
+    """Whether picture j shows all that is within `beside` of the middle, times z within `nearer`.
+
+    Along one axis (0: x), lengths times z. Rather no than yes, by less than a pixel.
+    """
+    last, centre = pictures.size[j, axis], pictures.intrinsics[j, 2 + axis]
+    nearest, farthest = z - nearer, z + nearer
+    least, most = middle - beside, middle + beside
+    start = least / (nearest if least < 0 else farthest) + centre
+    end = most / (farthest if most < 0 else nearest) + centre
+    return last > 1 and start >= 0.5 and end <= last - 0.5
+
+
+@njit(cache=True, fastmath=_FAST)
 def _alike(pictures, i, tile, x, y, s, window):
     """Mean likeness to the two neighbours that are most alike at inverse z-depth s."""
     first, second = np.float32(NONE), np.float32(NONE)
@@ -195,26 +220,33 @@ def _alike(pictures, i, tile, x, y, s, window):
             continue
         middle = _direction(pictures, i, tile, k, x, y, s)
         a, own = pictures.turn[i, tile, k], pictures.intrinsics[j]
-        total, squared, both, at = 0.0, 0.0, 0.0, 0
-        seen = True
+        turn_u, turn_v = a[2, 0] / fx, a[2, 1] / fy  # along the window's rows and columns
+        nearer = SIDE * (abs(turn_u) + abs(turn_v))
+        if middle[2] <= max(np.float32(1e-3), STEEP * nearer):  # beside or behind the camera
+            continue
+        x_0, x_u, x_v = own[0] * middle[0], own[0] * a[0, 0] / fx, own[0] * a[0, 1] / fy
+        y_0, y_u, y_v = own[1] * middle[1], own[1] * a[1, 0] / fx, own[1] * a[1, 1] / fy
+        if not _holds(pictures, j, middle[2], nearer, x_0, SIDE * (abs(x_u) + abs(x_v)), 0):
+            continue
+        if not _holds(pictures, j, middle[2], nearer, y_0, SIDE * (abs(y_u) + abs(y_v)), 1):
+            continue
+        total, squared, both, at = np.float32(0), np.float32(0), np.float32(0), 0
+        one, per_z = np.float32(1.0), np.float32(1.0) / middle[2]
+        turn_u, turn_v = turn_u * per_z, turn_v * per_z
         for row in range(-SIDE, SIDE + 1):
             for column in range(-SIDE, SIDE + 1):
-                u, v = column / fx, row / fy
-                z = middle[2] + a[2, 0] * u + a[2, 1] * v
-                if z <= 1e-3:  # beside or behind the camera: x/z has no meaning
-                    seen = False
-                    break
-                to_x = own[0] * (middle[0] + a[0, 0] * u + a[0, 1] * v) / z + own[2]
-                to_y = own[1] * (middle[1] + a[1, 0] * u + a[1, 1] * v) / z + own[3]
-                grey = _look(pictures, j, to_x, to_y)
+                u, v = np.float32(column), np.float32(row)
+                farther = turn_u * u + turn_v * v
+                inverse = (one - farther + farther * farther) * per_z  # 1/z
+                to_x = (x_0 + x_u * u + x_v * v) * inverse + own[2]
+                to_y = (y_0 + y_u * u + y_v * v) * inverse + own[3]
+                grey = _between(pictures, j, to_x, to_y)
                 total += grey
                 squared += grey * grey
                 both += grey * window[at]
                 at += 1
-            if not seen:
-                break
-        variance = squared - total * total / max(at, 1)
-        if not seen or not variance > at * LEAST_CONTRAST**2:  # NaN where not shown
+        variance = squared - total * total / at
+        if not variance > at * LEAST_CONTRAST**2:  # NaN where not shown
             continue
         own_likeness = np.float32(both / np.sqrt(variance))
         if own_likeness > first:
