@@ -2,9 +2,9 @@
 
 python benchmarks/floaters.py RUN
 
-Floaters (`geometry.floater_mass`) of the test views' pixels, shared out by how many of the fitted
-photos show the place that a pixel truly shows, by whether an edge of depth is in the pixel or right
-beside it, and by distance. What hardly any photo shows has a depth that no photo can tell: only a
+Floaters (`floater_mass` in reports) of the test views' pixels, shared out by how many of the fitted
+photos show the place that a pixel truly shows, by whether a pixel beside it shows what is nearer,
+and by distance. What hardly any photo shows has a depth that no photo can tell: only a
 prior could. Needs `pip install ".[street]"`.
 """
 
@@ -17,7 +17,7 @@ import common
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import minimum_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from climatenerf.evaluation import geometry
 from climatenerf.evaluation.reference import Truth, read_reference
@@ -27,14 +27,14 @@ from climatenerf.scene import load_scene
 from climatenerf.scene.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
-SAME = 0.02  # of the distance: a photo shows a place if what it shows there is no farther off
+SAME = 0.02  # of the distance: a photo shows a place that lies in the range of its 3x3 pixels there
 EDGE = 0.1  # of the distance, and m: a pixel beside one that is so much nearer is at an edge
 PHOTOS = (0, 1, 2, 3, 5, 9, 17)  # from so many photos on
 METRES = (0, 20, 60)
 
 
 def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
-    """Traced ray lengths (m) of every fitted photo's pixels; 0 in the sky."""
+    """Traced ray lengths (m) of every fitted photo's pixels; +inf in the sky."""
     import mitsuba as mi
 
     sys.path.insert(0, str(ROOT))
@@ -48,7 +48,8 @@ def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
         for view in scene.of_split("train"):
             camera = scene.cameras[view.camera]
             seen = render_view(street, view.c2w, camera.width, camera.height, 1, 0, asked)
-            found.append(np.asarray(seen)[..., -1])
+            depth = np.asarray(seen)[..., -1]
+            found.append(np.where(depth > 0, depth, np.inf))
     return found
 
 
@@ -65,7 +66,9 @@ def times_shown(
         inside = ((place >= 0) & (place < (camera.width, camera.height))).all(-1)
         ahead, (column, row) = ahead[inside], place[inside].T
         way = np.linalg.norm(local[ahead], axis=-1)
-        count[ahead] += np.abs(depth[row, column] / way - 1) < SAME
+        farthest = maximum_filter(np.where(np.isinf(depth), 0.0, depth), 3)
+        least, most = minimum_filter(depth, 3)[row, column], farthest[row, column]
+        count[ahead] += (way > (1 - SAME) * least) & (way < (1 + SAME) * most)
     return count
 
 

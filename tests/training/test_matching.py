@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 import torch
 from test_witness import poses
-from toy_photos import BENT, PLAIN, pattern, photos, rows_of_cameras
+from toy_photos import BENT, PLAIN, pattern, photos, rows_of_cameras, wall
 
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.ops import matching as kernels
 from climatenerf.scene import read_scene
+from climatenerf.scene.cameras import Camera
 from climatenerf.scene.images import load_image
 from climatenerf.training import matching
-from climatenerf.training.matching import match_photos, neighbours, pictures_of
+from climatenerf.training.matching import distances, match_photos, neighbours, pictures_of
 from climatenerf.training.pixels import TrainingPixels
-from climatenerf.training.points import find_point_rays
+from climatenerf.training.points import PointRays, find_point_rays
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "street"
 ASKED = 5 * 96 * 72 // matching.PIXELS  # windows of five photos
@@ -79,18 +80,18 @@ def test_sky_and_what_masks_hide_is_not_asked():
     assert (shown[:, :, :48] == kernels.UNSEEN).all() and (shown[:, :, 48:] > 0).all()
 
 
-def slow_likeness(camera, c2w, images, i, j, x, y, s):
-    """Correlation of two windows by way of the world, one pixel at a time; NaN outside."""
+def slow_likeness(cameras, c2w, images, i, j, x, y, s):
+    """Correlation of two windows by way of the world, pixel by pixel; NaN outside or if flat."""
     own, other = [], []
     for row in range(-kernels.SIDE, kernels.SIDE + 1):
         for column in range(-kernels.SIDE, kernels.SIDE + 1):
             at = np.array([x + column, y + row])
             own.append(looked_up(images[i], at))
-            local = np.linalg.inv(camera.matrix) @ np.array([*at, 1.0]) / s
+            local = np.linalg.inv(cameras[i].matrix) @ np.array([*at, 1.0]) / s
             world = c2w[i][:3, :3] @ local + c2w[i][:3, 3]
             there = c2w[j][:3, :3].T @ (world - c2w[j][:3, 3])
-            other.append(looked_up(images[j], camera.project(there[None])[0]))
-    return np.corrcoef(own, other)[0, 1]
+            other.append(looked_up(images[j], cameras[j].project(there[None])[0]))
+    return np.corrcoef(own, other)[0, 1] if np.std(other) > kernels.LEAST_CONTRAST else np.nan
 
 
 def looked_up(image, at):
@@ -104,27 +105,48 @@ def looked_up(image, at):
     return (1 - v) * upper + v * ((1 - u) * image[j + 1, i] + u * image[j + 1, i + 1])
 
 
-def test_likeness_is_that_of_the_slow_twin():
+def unlike_cameras():
+    """Photos of the wall in two sizes, their cameras pitched and rolled as well as turned."""
     grey, c2w = pattern(), poses(40, distance=4.0)[:5]
-    pixels = photos(PLAIN, lambda i, t, x: grey(x), c2w=c2w)
+    small = Camera(64, 60, 70.0, 66.0, 30.0, 31.0)
+    images = []
+    for i, pose in enumerate(c2w):
+        pose[:3, :3] = pose[:3, :3] @ turned(0.1 * (i - 2), 0.15 * (-1) ** i)
+        level = grey(wall((PLAIN, small)[i % 2], pose)[1])
+        images.append(np.repeat((255 * level + 0.5).astype(np.uint8)[..., None], 3, -1))
+    return TrainingPixels([PLAIN, small], [0, 1, 0, 1, 0], c2w, images), c2w
+
+
+def turned(pitch, roll):
+    """Rotation about x and then z."""
+    a, b, c, d = np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    about_x = np.array([[1.0, 0, 0], [0, a, -b], [0, b, a]])
+    return about_x @ np.array([[c, -d, 0], [d, c, 0], [0, 0, 1.0]])
+
+
+def test_likeness_is_that_of_the_slow_twin():
+    pixels, c2w = unlike_cameras()
     near, middle = np.full((5, 9), 1.0), np.full((5, 9), 4.0)
     pictures = pictures_of(pixels, near, middle)
+    cameras = pixels.cameras
     images = [
-        pictures.grey[start : start + 96 * 72].reshape(72, 96).astype(float)
-        for start in pictures.start
+        pictures.grey[start : start + c.width * c.height].reshape(c.height, c.width).astype(float)
+        for start, c in zip(pictures.start, cameras, strict=True)
     ]
     random, compared = np.random.default_rng(0), 0
-    for _ in range(60):
+    for _ in range(120):
         i, s = int(random.integers(5)), float(random.uniform(0.1, 0.5))
-        x, y = random.uniform(3, 93), random.uniform(3, 69)
+        width, height = cameras[i].width, cameras[i].height
+        x, y = random.uniform(3, width - 3), random.uniform(3, height - 3)
         window = np.empty(25, np.float32)
         if not kernels._take_window(pictures, i, np.float32(x), np.float32(y), window):
             continue
         tile = kernels._tile(pictures, i, x, y)
-        assert tile == 3 * int(y / 24) + int(x / 32)
+        assert tile == 3 * int(3 * y / height) + int(3 * x / width)
+        assert tile == matching._tiles(np.array([[x / width, y / height]]))[0]
         ours = kernels._alike(pictures, i, tile, np.float32(x), np.float32(y), s, window)
         js = [j for j in pictures.others[i, tile] if j >= 0]
-        each = [slow_likeness(PLAIN, c2w, images, i, j, x, y, s) for j in js]
+        each = [slow_likeness(cameras, c2w, images, i, j, x, y, s) for j in js]
         best = sorted(value for value in each if np.isfinite(value))[-2:]
         if len(best) < 2:
             assert ours == kernels.NONE
@@ -132,6 +154,30 @@ def test_likeness_is_that_of_the_slow_twin():
             compared += 1
             assert ours == pytest.approx(np.mean(best), abs=2e-3)
     assert compared > 20
+
+
+def test_each_ninth_of_a_photo_has_distances_of_its_own():
+    pixels = photos(PLAIN, lambda i, t, x: np.full(t.shape, 0.5))
+    place = np.array([(16.0, 12.0)] * 30 + [(80.0, 12.0)] * 30 + [(48.0, 60.0)] * 5 + [(0.0, 0.0)])
+    local = np.concatenate([(place - (48, 36)) / 90, np.ones((66, 1))], -1)
+    local[-1] = (9.0, 0.0, 1.0)  # outside: in no tile, whatever its number would be
+    depth = np.repeat([2.0, 8.0, 1.0, 1.0], [30, 30, 5, 1])
+    local /= np.linalg.norm(local, axis=-1, keepdims=True)
+    turn = pixels.c2w[1, :3, :3].numpy()
+    points = PointRays(
+        torch.zeros(66, 3),
+        torch.from_numpy((local @ turn.T).astype(np.float32)),
+        torch.from_numpy(depth.astype(np.float32)),
+        torch.ones(66, dtype=torch.long),
+    )
+    near, middle = distances(pixels, points, TYPICAL)
+    assert middle[1, 0] == 2.0 and middle[1, 2] == 8.0
+    assert near[1, 0] == pytest.approx(0.5 * 2.0 * local[0, 2], rel=1e-5), "z-depth, with a margin"
+    assert near[1, 2] == pytest.approx(0.5 * 8.0 * local[30, 2], rel=1e-5)
+    assert (middle[1, [1, 3, 7]] == np.median(depth)).all(), "few points: the photo's"
+    assert (middle[0] == np.median(depth)).all(), "a photo without points: that of all"
+    near, middle = distances(pixels, None, TYPICAL)
+    assert (near == TYPICAL[0]).all() and (middle == TYPICAL[1]).all()
 
 
 def test_neighbours_look_the_same_way_from_the_side():

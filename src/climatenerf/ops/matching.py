@@ -38,7 +38,8 @@ class Pictures(NamedTuple):
     intrinsics: Float32[np.ndarray, "v 4"]
     """fx, fy, cx, cy, px."""
     others: Int[np.ndarray, "v tiles k"]
-    """The neighbours that each tile of it is compared with; -1: none."""
+    """The neighbours with which what lies in a tile is compared, -1: none. There are TILES² of
+    them, row by row."""
     turn: Float32[np.ndarray, "v tiles k 3 3"]
     """A: from the picture's camera frame to a neighbour's."""
     shift: Float32[np.ndarray, "v tiles k 3"]
@@ -110,18 +111,15 @@ def _refined(pictures, i, tile, x, y, h, per_step, window):
 @njit(cache=True, fastmath=_FAST)
 def _look(pictures, i, x, y):
     """Grey level of picture i, between its pixels; NaN where it shows nothing."""
-    width, height = pictures.size[i, 0], pictures.size[i, 1]
-    if not (x >= 0.5 and y >= 0.5 and x <= width - 0.5 and y <= height - 0.5):
-        return np.float32(np.nan)
-    return _between(pictures, i, x, y) if min(width, height) > 1 else np.float32(np.nan)
+    return _between(pictures, i, x, y) if _shows(pictures, i, x, y) else np.float32(np.nan)
 
 
 @njit(cache=True, fastmath=_FAST)
 def _between(pictures, i, x, y):
-    """The same of a place that is known to lie between middles of pixels."""
+    """Grey level at a place that lies between middles of pixels; NaN where one is not shown."""
     width, height = pictures.size[i, 0], pictures.size[i, 1]
     x, y = np.float32(x - 0.5), np.float32(y - 0.5)
-    # Rounding may bring a place past the first or the last.
+    # Rounding, and the series of 1/z, may bring a place past the first or the last.
     column = max(0, min(int(x), width - 2))
     row = max(0, min(int(y), height - 2))
     u, v = x - np.float32(column), y - np.float32(row)
@@ -196,17 +194,24 @@ def _steps(pictures, i, tile, x, y):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _holds(pictures, j, z, nearer, middle, beside, axis):
-    """Whether picture j shows all that is within `beside` of the middle, times z within `nearer`.
+def _shows(pictures, i, x, y):
+    """Whether a place lies between middles of picture i's pixels."""
+    width, height = pictures.size[i, 0], pictures.size[i, 1]
+    inside = x >= 0.5 and y >= 0.5 and x <= width - 0.5 and y <= height - 0.5
+    return inside and min(width, height) > 1
 
-    Along one axis (0: x), lengths times z. Rather no than yes, by less than a pixel.
+
+@njit(cache=True, fastmath=_FAST)
+def _projected(xs, ys, zs, column, row):
+    """Where a window's pixel comes to lie from the neighbour's centre: x/z and y/z.
+
+    Each is a value at the window's middle and its changes along rows and columns; of z 1/z, and
+    relative changes, which are so small that a series of 1/z does.
     """
-    last, centre = pictures.size[j, axis], pictures.intrinsics[j, 2 + axis]
-    nearest, farthest = z - nearer, z + nearer
-    least, most = middle - beside, middle + beside
-    start = least / (nearest if least < 0 else farthest) + centre
-    end = most / (farthest if most < 0 else nearest) + centre
-    return last > 1 and start >= 0.5 and end <= last - 0.5
+    u, v = np.float32(column), np.float32(row)
+    change = zs[1] * u + zs[2] * v
+    inverse = (np.float32(1.0) - change + change * change) * zs[0]
+    return (xs[0] + xs[1] * u + xs[2] * v) * inverse, (ys[0] + ys[1] * u + ys[2] * v) * inverse
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -218,29 +223,29 @@ def _alike(pictures, i, tile, x, y, s, window):
         j = pictures.others[i, tile, k]
         if j < 0:
             continue
-        middle = _direction(pictures, i, tile, k, x, y, s)
+        middle = _direction(pictures, i, tile, k, x, y, np.float32(s))
         a, own = pictures.turn[i, tile, k], pictures.intrinsics[j]
         turn_u, turn_v = a[2, 0] / fx, a[2, 1] / fy  # along the window's rows and columns
-        nearer = SIDE * (abs(turn_u) + abs(turn_v))
-        if middle[2] <= max(np.float32(1e-3), STEEP * nearer):  # beside or behind the camera
+        reach = SIDE * (abs(turn_u) + abs(turn_v))
+        # Beside or behind the camera, or turned far.
+        if middle[2] <= max(np.float32(1e-3), STEEP * reach):
             continue
-        x_0, x_u, x_v = own[0] * middle[0], own[0] * a[0, 0] / fx, own[0] * a[0, 1] / fy
-        y_0, y_u, y_v = own[1] * middle[1], own[1] * a[1, 0] / fx, own[1] * a[1, 1] / fy
-        if not _holds(pictures, j, middle[2], nearer, x_0, SIDE * (abs(x_u) + abs(x_v)), 0):
-            continue
-        if not _holds(pictures, j, middle[2], nearer, y_0, SIDE * (abs(y_u) + abs(y_v)), 1):
+        xs = own[0] * middle[0], own[0] * a[0, 0] / fx, own[0] * a[0, 1] / fy
+        ys = own[1] * middle[1], own[1] * a[1, 0] / fx, own[1] * a[1, 1] / fy
+        per_z = np.float32(1.0) / middle[2]
+        zs = per_z, turn_u * per_z, turn_v * per_z
+        inside = True  # with its corners, the whole window
+        for row in (-SIDE, SIDE):
+            for column in (-SIDE, SIDE):
+                to_x, to_y = _projected(xs, ys, zs, column, row)
+                inside &= _shows(pictures, j, to_x + own[2], to_y + own[3])
+        if not inside:
             continue
         total, squared, both, at = np.float32(0), np.float32(0), np.float32(0), 0
-        one, per_z = np.float32(1.0), np.float32(1.0) / middle[2]
-        turn_u, turn_v = turn_u * per_z, turn_v * per_z
         for row in range(-SIDE, SIDE + 1):
             for column in range(-SIDE, SIDE + 1):
-                u, v = np.float32(column), np.float32(row)
-                farther = turn_u * u + turn_v * v
-                inverse = (one - farther + farther * farther) * per_z  # 1/z
-                to_x = (x_0 + x_u * u + x_v * v) * inverse + own[2]
-                to_y = (y_0 + y_u * u + y_v * v) * inverse + own[3]
-                grey = _between(pictures, j, to_x, to_y)
+                to_x, to_y = _projected(xs, ys, zs, column, row)
+                grey = _between(pictures, j, to_x + own[2], to_y + own[3])
                 total += grey
                 squared += grey * grey
                 both += grey * window[at]

@@ -111,6 +111,17 @@ def _tiles(place: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
     return TILES * row + column
 
 
+def _tiles_towards(
+    pixels: TrainingPixels, image: Int[np.ndarray, "n"], local: Float[np.ndarray, "n 3"]
+) -> Int[np.ndarray, "n"]:
+    """The tiles in which straightened photos show directions; -1 outside."""
+    shape = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in pixels.cameras])[image]
+    z = np.maximum(local[:, 2:], WIDE)
+    place = (local[:, :2] / z * shape[:, :2] + shape[:, 2:4]) / shape[:, 4:]
+    inside = (local[:, 2] > WIDE) & ((place >= 0) & (place < 1)).all(-1)
+    return np.where(inside, _tiles(place), -1)
+
+
 def _sure(
     pictures: Pictures,
     of: Int[np.ndarray, "n"],
@@ -127,19 +138,24 @@ def _sure(
 def distances(
     pixels: TrainingPixels, points: PointRays | None, typical: tuple[float, float]
 ) -> tuple[Float[np.ndarray, "v tiles"], Float[np.ndarray, "v tiles"]]:
-    """The nearest distance (m) that each tile of the photos may show, and the median one."""
+    """The nearest z-depth (m) that each tile of the photos may show, and the median ray length."""
     count = pixels.c2w.shape[0]
     near, middle = (np.full((count, TILES**2), each) for each in typical)
     if points is not None:
-        depth, image = array_of(points.depth), array_of(points.image)
-        place = array_of(pixels.place_towards(points.image, points.rays_d))
-        tile = _tiles(np.nan_to_num(place))
-        near[:], middle[:] = np.quantile(depth, [0.02, 0.5])
+        image = array_of(points.image)
+        turn = array_of(pixels.c2w).astype(np.float64)[image, :3, :3]
+        local = np.einsum("nij,ni->nj", turn, array_of(points.rays_d))
+        depth = array_of(points.depth)
+        z = np.maximum(depth * local[:, 2], 0.0)
+        tile = _tiles_towards(pixels, image, local)
+        near[:], middle[:] = np.quantile(z, 0.02), np.median(depth)
         for i in np.flatnonzero(np.bincount(image, minlength=count) >= LEAST_POINTS):
-            own, where = depth[image == i], tile[image == i]
-            near[i], middle[i] = np.quantile(own, [0.02, 0.5])
-            for j in np.flatnonzero(np.bincount(where, minlength=TILES**2) >= LEAST_POINTS):
-                near[i, j], middle[i, j] = np.quantile(own[where == j], [0.02, 0.5])
+            own = image == i
+            near[i], middle[i] = np.quantile(z[own], 0.02), np.median(depth[own])
+            for j in range(TILES**2):
+                some = own & (tile == j)
+                if some.sum() >= LEAST_POINTS:
+                    near[i, j], middle[i, j] = np.quantile(z[some], 0.02), np.median(depth[some])
         near *= NEARER
     return near, middle
 
