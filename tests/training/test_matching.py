@@ -158,23 +158,25 @@ def test_likeness_is_that_of_the_slow_twin():
 
 def test_each_ninth_of_a_photo_has_distances_of_its_own():
     pixels = photos(PLAIN, lambda i, t, x: np.full(t.shape, 0.5))
-    place = np.array([(16.0, 12.0)] * 30 + [(80.0, 12.0)] * 30 + [(48.0, 60.0)] * 5 + [(0.0, 0.0)])
-    local = np.concatenate([(place - (48, 36)) / 90, np.ones((66, 1))], -1)
-    local[-1] = (9.0, 0.0, 1.0)  # outside: in no tile, whatever its number would be
-    depth = np.repeat([2.0, 8.0, 1.0, 1.0], [30, 30, 5, 1])
+    place = np.array(
+        [(16.0, 12.0)] * 30 + [(80.0, 12.0)] * 30 + [(48.0, 60.0)] * 5 + [(0.0, 0.0)] * 30
+    )
+    local = np.concatenate([(place - (48, 36)) / 90, np.ones((95, 1))], -1)
+    local[-30:] = (9.0, 0.0, 1.0)  # outside: in no tile, though the last is the nearest
+    depth = np.repeat([2.0, 8.0, 1.0, 1.0], [30, 30, 5, 30])
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
     turn = pixels.c2w[1, :3, :3].numpy()
     points = PointRays(
-        torch.zeros(66, 3),
+        torch.zeros(95, 3),
         torch.from_numpy((local @ turn.T).astype(np.float32)),
         torch.from_numpy(depth.astype(np.float32)),
-        torch.ones(66, dtype=torch.long),
+        torch.ones(95, dtype=torch.long),
     )
     near, middle = distances(pixels, points, TYPICAL)
     assert middle[1, 0] == 2.0 and middle[1, 2] == 8.0
     assert near[1, 0] == pytest.approx(0.5 * 2.0 * local[0, 2], rel=1e-5), "z-depth, with a margin"
     assert near[1, 2] == pytest.approx(0.5 * 8.0 * local[30, 2], rel=1e-5)
-    assert (middle[1, [1, 3, 7]] == np.median(depth)).all(), "few points: the photo's"
+    assert (middle[1, [1, 3, 5, 7]] == np.median(depth)).all(), "few points: the photo's"
     assert (middle[0] == np.median(depth)).all(), "a photo without points: that of all"
     near, middle = distances(pixels, None, TYPICAL)
     assert (near == TYPICAL[0]).all() and (middle == TYPICAL[1]).all()
