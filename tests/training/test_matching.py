@@ -162,7 +162,7 @@ def test_each_ninth_of_a_photo_has_distances_of_its_own():
         [(16.0, 12.0)] * 30 + [(80.0, 12.0)] * 30 + [(48.0, 60.0)] * 5 + [(0.0, 0.0)] * 30
     )
     local = np.concatenate([(place - (48, 36)) / 90, np.ones((95, 1))], -1)
-    local[-30:] = (9.0, 0.0, 1.0)  # outside: in no tile, though the last is the nearest
+    local[-30:] = (9.0, 0.0, -1.0)  # behind: in no tile, though these are the nearest
     depth = np.repeat([2.0, 8.0, 1.0, 1.0], [30, 30, 5, 30])
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
     turn = pixels.c2w[1, :3, :3].numpy()
@@ -178,6 +178,7 @@ def test_each_ninth_of_a_photo_has_distances_of_its_own():
     assert near[1, 2] == pytest.approx(0.5 * 8.0 * local[30, 2], rel=1e-5)
     assert (middle[1, [1, 3, 5, 7]] == np.median(depth)).all(), "few points: the photo's"
     assert (middle[0] == np.median(depth)).all(), "a photo without points: that of all"
+    assert (near > 0).all(), "its inverse is searched"
     near, middle = distances(pixels, None, TYPICAL)
     assert (near == TYPICAL[0]).all() and (middle == TYPICAL[1]).all()
 

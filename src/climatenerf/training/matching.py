@@ -146,7 +146,7 @@ def distances(
         turn = array_of(pixels.c2w).astype(np.float64)[image, :3, :3]
         local = np.einsum("nij,ni->nj", turn, array_of(points.rays_d))
         depth = array_of(points.depth)
-        z = np.maximum(depth * local[:, 2], 0.0)
+        z = depth * np.maximum(local[:, 2], WIDE)  # behind a fisheye: else 1/0
         tile = _tiles_towards(pixels, image, local)
         near[:], middle[:] = np.quantile(z, 0.02), np.median(depth)
         for i in np.flatnonzero(np.bincount(image, minlength=count) >= LEAST_POINTS):
