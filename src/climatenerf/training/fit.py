@@ -110,7 +110,7 @@ class Fitting:
             {"params": _of(named, "view_net"), "shares": VIEW_SHARES},
             {"params": _of(named, "sky_net"), "shares": sky_shares},
             {"params": _of(named, "embeddings"), "shares": EMBEDDING_SHARES},
-            {"params": list(self.masks.parameters()), "shares": (0.0, 1.0)},
+            {"params": list(self.masks.parameters()), "shares": MASK_SHARES},
             {"params": list(self.poses.parameters()), "shares": (0.0, POSE_SHARE)},
         ]
         # 1e-15: a gradient that was always 0 has moments of 0, 0/0.
@@ -562,6 +562,9 @@ VIEW_SHARES = (0.0, 1.0)
 # Of appearance vectors. They begin with the view's: alone they would take up what the direction
 # explains better, and frames in their mean would be off in colour.
 EMBEDDING_SHARES = (0.0, 0.02)
+# Of masks. They run against the field, which builds what a single photo shows of haze; slow ones
+# lose.
+MASK_SHARES = (0.0, 10.0)
 # Matter nearer than this to a camera (grid units) is not believed at first: what stands near is
 # seen from elsewhere too, and a wall before each camera would satisfy every photo.
 FIRST_NEAR = 0.6
