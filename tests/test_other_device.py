@@ -81,6 +81,7 @@ def test_the_toy_device_refuses_to_meet_the_cpu():
         there + torch.ones(3)
 
 
+@pytest.mark.slow
 def test_a_fit_is_the_same_on_both(runs):
     _, folder = runs
     ours, theirs = load_field(folder / "cpu"), load_field(folder / "toy")
@@ -92,6 +93,7 @@ def test_a_fit_is_the_same_on_both(runs):
     assert abs(found[0] - found[1]) < 0.05, found
 
 
+@pytest.mark.slow
 def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
     """Sky, ground, points, relative depth, moving cameras, normals that move matter."""
     scene, _ = runs

@@ -262,6 +262,7 @@ def test_marching(generator, monkeypatch, skip, share):
     assert agree >= n - 1 and offsets[-1] > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stop", "least"), [(1e-3, 1e-4), (0.4, 0.03)])
 def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least):
     """One launch against marching, encoding, networks and compositing on the CPU."""
@@ -336,7 +337,8 @@ def test_adam_leaves_entries_without_gradient_alone(generator):
     assert torch.equal(ours.cpu()[~some], start[~some])
 
 
-@pytest.mark.parametrize("card", [pytest.param("80", marks=pytest.mark.slow), "90"])
+@pytest.mark.slow
+@pytest.mark.parametrize("card", ["80", "90"])
 def test_all_kernels_compile_for_cuda(card, tmp_path):
     """Triton brings all that it takes; no GPU is needed."""
     environment = {**os.environ, "TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}

@@ -195,6 +195,7 @@ def test_near_matter_is_believed_later(scene):
     assert fitting.near() == fitting.field.near
 
 
+@pytest.mark.slow
 def test_rays_below_the_horizon_end_on_matter(scene):
     """They do even where nothing else asks for it: with no colour to explain."""
     left = {}
@@ -211,6 +212,7 @@ def test_rays_below_the_horizon_end_on_matter(scene):
     assert left[1.0] < 0.5 * left[0.0], left
 
 
+@pytest.mark.slow
 def test_points_put_matter_where_they_are(scene):
     """A hundred points on the box's sides, each shown by the views that look at that side."""
     rng = np.random.default_rng(0)

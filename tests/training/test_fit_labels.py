@@ -33,6 +33,7 @@ def opacity(fitting):
     return float((1 - left).mean())
 
 
+@pytest.mark.slow
 def test_pixels_labelled_sky_lose_their_matter(scene):
     fitting = begin(scene, steps=100, losses=Losses(sky=10.0))
     fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), SKY, dtype=torch.uint8)
@@ -133,6 +134,7 @@ def test_an_opaque_sky_has_its_photos_colour(scene):
         assert (sum(slopes) > 0) == opaque
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("spared", "steps"), [(False, 40), (True, 80)])
 def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spared, steps):
     """Without points as depth, which would do the same: by the map of the ground alone.
@@ -235,6 +237,7 @@ def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypat
     assert not fitting.cells_of_points(24).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", [True, False])
 def test_the_sky_goes_on_where_no_photo_looked(scene, label, monkeypatch):
     """It begins as noise, or black, which upwards only the fill can take away."""
