@@ -50,9 +50,9 @@ def without_people(scene: Scene, folder: Path) -> Scene:
 
 
 def people(scene: Scene) -> list[Bool[np.ndarray, "h w"]]:
-    """The pixels of each fitted photo that show people."""
-    labels = [load_labels(view, scene) for view in scene.of_split("train")]
-    return [MERGED[each] == PERSON for each in labels if each is not None]
+    """The pixels of each fitted photo that show people; all photos have labels."""
+    labels = (load_labels(view, scene) for view in scene.of_split("train"))
+    return [np.equal(MERGED[each], PERSON) for each in labels]
 
 
 def fit(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:

@@ -69,7 +69,7 @@ def test_unknown_models_are_refused_before_the_fit(capture, fitted, capsys):
 
 
 def test_networks_of_the_user_s(capture, fitted, tmp_path, capsys):
-    pytest.importorskip("transformers", reason="pip install climatenerf[perception]")
+    pytest.importorskip("transformers", reason="pip install .[perception]")
     from perception import networks
 
     labels = networks.save_segformer(tmp_path / "segformer")

@@ -86,6 +86,20 @@ def test_depth_errors_are_those_put_in():
     assert geometry.depth_scores([nothing], (truth,))["depth_abs_rel"] == pytest.approx(1.0)
 
 
+def test_holes_in_the_ground_are_those_put_in():
+    truth, leaves = truth_of(), truth_of(label=LEAVES)
+    ground = np.argwhere(truth.depth < geometry.FARTHEST)
+    depth = 1.2 * truth.depth
+    for row, column in ground[:30]:
+        depth[row, column] = 1.6 * truth.depth[row, column]
+    depth[tuple(ground[30])] = np.inf
+    assert geometry.ground_holes([depth], (truth,)) == pytest.approx(31 / len(ground))
+    # Of two views, one of which has no ground.
+    both = geometry.ground_holes([depth, depth], (truth, leaves))
+    assert both == pytest.approx(31 / len(ground))
+    assert geometry.ground_holes([depth], (leaves,)) == 0
+
+
 def test_normals_turned_by_ten_degrees_are_ten_degrees_off():
     truth = truth_of()
     a = np.deg2rad(10.0)

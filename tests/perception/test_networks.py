@@ -8,7 +8,7 @@ from climatenerf.perception import models
 from climatenerf.perception.monocular import load_depth
 from climatenerf.perception.segmentation import CITYSCAPES, load_segmentation, train_ids
 
-pytest.importorskip("transformers", reason="pip install climatenerf[perception]")
+pytest.importorskip("transformers", reason="pip install .[perception]")
 from perception import networks
 
 
@@ -85,7 +85,7 @@ def test_what_cannot_be_loaded_is_said_in_a_sentence(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="cannot be loaded"):
         load_segmentation(str(tmp_path / "net"))
     monkeypatch.setattr(models.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r'pip install "climatenerf\[perception\]"'):
+    with pytest.raises(UserError, match=r'pip install "\.\[perception\]"'):
         load_depth(str(tmp_path / "depth"))
 
 

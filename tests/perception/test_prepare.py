@@ -166,7 +166,7 @@ def test_photos_that_differ_by_suffix_alone_have_files_of_their_own(capture):
 
 
 def test_a_network_takes_the_place_of_what_another_made(capture, tmp_path):
-    pytest.importorskip("transformers", reason="pip install climatenerf[perception]")
+    pytest.importorskip("transformers", reason="pip install .[perception]")
     from perception import networks
 
     one = str(networks.save_segformer(tmp_path / "segformer-tiny"))
@@ -184,7 +184,7 @@ def test_a_network_takes_the_place_of_what_another_made(capture, tmp_path):
 
 
 def test_depth_is_made_and_read(capture, tmp_path):
-    pytest.importorskip("transformers", reason="pip install climatenerf[perception]")
+    pytest.importorskip("transformers", reason="pip install .[perception]")
     from perception import networks
 
     model = str(networks.save_depth_anything(tmp_path / "depth-anything-v2-small"))

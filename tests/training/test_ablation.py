@@ -9,10 +9,10 @@ from toy_scene import TINY, make_scene
 
 from climatenerf.errors import UserError
 from climatenerf.evaluation.reference import read_reference
-from climatenerf.evaluation.scores import Place
+from climatenerf.evaluation.scores import Dry, Place
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.presets import PRESETS, FieldSize
-from climatenerf.scene import load_scene, read_scene
+from climatenerf.scene import Camera, load_scene, read_scene
 from climatenerf.training import ablation
 from climatenerf.training import run as run_module
 from climatenerf.training.settings import PAPER, FitSettings, Losses, settings_of
@@ -37,6 +37,28 @@ def differences(one, other):
         for f in dataclasses.fields(Losses)
         if getattr(one.losses, f.name) != getattr(other.losses, f.name)
     }
+
+
+def test_slopes_are_the_density_s_at_the_surfaces_in_the_camera_s_axes():
+    """A density that rises to the right of a world x: where the rays end, and 0 in the sky."""
+
+    class Slanted:
+        def to_grid(self, x):
+            return x
+
+        def density_normal(self, q):
+            return torch.stack([q[:, 0].sign(), torch.zeros(len(q)), torch.zeros(len(q))], dim=-1)
+
+    camera = Camera(2, 1, 1.0, 1.0, 1.0, 0.5)
+    c2w = np.eye(4)
+    c2w[:3, :3] = [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]  # its x axis is the world's y
+    c2w[:3, 3] = (-1.0, 0.0, 0.0)
+    rays = np.array([[[1.0, 0, 0], [1.0, 0, 0]]])
+    for depth, along in ((3.0, 1.0), (0.5, -1.0)):
+        depths = np.array([[depth, np.inf]])
+        dry = Dry(np.zeros((1, 2, 3)), depths, np.zeros((1, 2, 3)), rays, c2w, camera)
+        found = ablation.slope_normals(Slanted(), dry)
+        assert np.allclose(found, [[[0.0, -along, 0.0], [0.0, 0.0, 0.0]]]), found
 
 
 def test_each_row_leaves_out_just_what_it_says():
@@ -170,7 +192,7 @@ def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
     # What is shown is far smoother than what the density alone would give.
     assert found["normal_median_deg"] < 0.6 * found["slope_median_deg"]
     assert found["open_sky"] > 0.95 and found["sky_empty_fraction"] > 0.9
-    # Upwards all round, and down from below the ground, as water reflects: nothing is black.
+    # Upwards all round, where reflections go: nothing is black.
     photos = np.concatenate([truth.clean.reshape(-1, 3) for truth in place.reference.truths])
     least = 0.25 * np.median(photos.mean(-1))
     angle, up = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0.05, 1.0, 20))

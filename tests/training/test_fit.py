@@ -315,7 +315,8 @@ def test_exposures_do_not_become_floaters(tmp_path):
 def test_someone_in_one_photo_leaves_the_scene(tmp_path):
     """A magenta figure stands before the box in one photo: its mask finds it, and nothing else.
 
-    With labels and points, which keep such a figure from being built of haze; none names it.
+    With labels and points, as `capture` gives them; no label names it. Without any, a field may be
+    quicker than the mask, and build the figure of haze.
     """
     scene, labels = labelled(make_scene(tmp_path))
     view = scene.of_split("train")[3]

@@ -1,16 +1,19 @@
 import torch
 
 from climatenerf.training import losses
+from climatenerf.training.fit import MASK_SHARES
+from climatenerf.training.settings import FitSettings, Losses
 from climatenerf.training.transients import TransientMasks
 
-PRICE = 0.02
+PRICE = Losses().transient
+RATE = MASK_SHARES[1] * FitSettings().net_rate
 
 
 def train(error_at, images=4, steps=600):
     """Masks of images whose squared error at (image, place) is given."""
     torch.manual_seed(0)
     masks = TransientMasks(images)
-    adam = torch.optim.Adam(masks.parameters(), lr=1e-2)
+    adam = torch.optim.Adam(masks.parameters(), lr=RATE)
     for _ in range(steps):
         image, place = torch.randint(images, (1024,)), torch.rand(1024, 2)
         error = error_at(image, place)

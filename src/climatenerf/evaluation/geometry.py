@@ -15,6 +15,7 @@ from climatenerf.scene.classes import (
     VEGETATION,
 )
 
+HOLE = 1.5  # times the true distance: ground seen beyond that is missing
 FARTHEST = 50.0  # m: beyond it photos of a walk say little about distance
 MARGIN, MARGIN_SHARE = 0.1, 0.05  # m, and of the depth: matter this close before a surface is its
 EMPTY = 0.99  # transmittance of what counts as empty sky
@@ -70,6 +71,21 @@ def ground_or_roof(truth: Truth) -> Bool[np.ndarray, "h w"]:
     up = truth.c2w[2, :3]  # in the camera's axes
     roof = (kind == BUILDING) & (truth.normal @ up > TALLEST_ROOF)
     return (kind == ROAD) | (kind == TERRAIN) | roof
+
+
+def ground_holes(depth: list[np.ndarray], truths: tuple[Truth, ...]) -> float:
+    """Share of road and terrain nearer than `FARTHEST` that is seen through.
+
+    Args:
+        depth: ray lengths of the field, in true metres; +inf where nothing is.
+        truths: the same views.
+    """
+    seen_through = []
+    for own, truth in zip(depth, truths, strict=True):
+        ground = np.isin(MERGED[truth.label], (ROAD, TERRAIN)) & (truth.depth < FARTHEST)
+        seen_through.append(own[ground] > HOLE * truth.depth[ground])
+    found = np.concatenate(seen_through)
+    return float(found.sum() / max(len(found), 1))  # 1: no ground, 0/0
 
 
 def free_space(truth: Truth) -> Float[np.ndarray, "h w"]:

@@ -57,7 +57,7 @@ def check_name(name: str) -> None:
     if importlib.util.find_spec("transformers") is None:
         raise UserError(
             f"the model {name} needs the transformers package; install it with"
-            ' pip install "climatenerf[perception]"'
+            ' pip install ".[perception]"'
         )
     if not Path(name).expanduser().is_dir() and not re.fullmatch(r"[\w-][\w.-]*/[\w.-]+", name):
         raise UserError(

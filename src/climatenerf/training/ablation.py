@@ -34,7 +34,6 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.field import Field
 from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
-from climatenerf.scene.classes import MERGED, ROAD, TERRAIN
 from climatenerf.storage import make_folder, read_json, write_bytes, write_json
 from climatenerf.training.fit import Report
 from climatenerf.training.folder import OPTIMISER
@@ -44,7 +43,6 @@ from climatenerf.training.settings import FitSettings, Losses
 SCHEMA_VERSION = 1
 FILE_NAME, TEXT_NAME, SHEET = "ablation.json", "ablation.md", "ablation.jpg"
 WEATHERS = ("smog-mid", "flood-low", "snow-deep")
-HOLE = 1.5  # times the true distance: ground seen beyond that is missing
 CELL = 256  # pixels of a picture's width
 MEASURED = {
     "psnr": "clean, dB",
@@ -220,12 +218,7 @@ def measure_row(
     scores |= {"slope_median_deg": slopes["normal_median_deg"]}
     if settings.losses.classes:
         scores |= {"miou": label_scores(place)["miou"]}
-    ground, holes = 0, 0
-    for each, truth in zip(dry, truths, strict=True):
-        level = np.isin(MERGED[truth.label], (ROAD, TERRAIN)) & (truth.depth < geometry.FARTHEST)
-        ground += level.sum()
-        holes += (each.depth[level] > HOLE * scale * truth.depth[level]).sum()
-    scores["ground_holes"] = float(holes / max(ground, 1))
+    scores["ground_holes"] = geometry.ground_holes([each.depth / scale for each in dry], truths)
     pictures = [clean[0], depth_picture(dry[0].depth), normal_picture(dry[0].normal)]
     for kind in place.reference.weathers:
         if kind.name in WEATHERS:

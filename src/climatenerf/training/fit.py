@@ -562,8 +562,8 @@ VIEW_SHARES = (0.0, 1.0)
 # Of appearance vectors. They begin with the view's: alone they would take up what the direction
 # explains better, and frames in their mean would be off in colour.
 EMBEDDING_SHARES = (0.0, 0.02)
-# Of masks. They run against the field, which builds what a single photo shows of haze; slow ones
-# lose.
+# Of masks. They race the field, which otherwise explains what one photo shows by haze before that
+# camera.
 MASK_SHARES = (0.0, 10.0)
 # Matter nearer than this to a camera (grid units) is not believed at first: what stands near is
 # seen from elsewhere too, and a wall before each camera would satisfy every photo.
