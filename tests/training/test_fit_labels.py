@@ -271,7 +271,7 @@ def test_the_sky_goes_on_where_no_photo_looked(scene, label, monkeypatch):
 
 def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
     full = with_labels(scene, np.asarray)
-    assert full.field.occupancy.barred.any() and full.knows_sky and full.fill is not None
+    assert full.field.occupancy.barred.any() and full.knows_sky
     assert not with_labels(scene, np.asarray, carve=False).field.occupancy.barred.any()
     bare = with_labels(scene, np.asarray, sky_labels=False)
     assert not bare.knows_sky and bare.pixels.witness is None

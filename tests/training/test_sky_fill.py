@@ -50,7 +50,6 @@ def test_directions_are_unit_and_cover_the_sky_evenly():
 
 def test_what_is_seen_stays_and_gaps_lie_between():
     fill = fill_sky(pixels([60, 200]), torch.Generator().manual_seed(0))
-    assert fill is not None
     dark, bright = (float(decode_srgb(torch.tensor(v / 255))) for v in (60, 200))
     seen = fill.colour[~fill.unseen]
     assert 0.02 < (~fill.unseen).float().mean() < 0.6
@@ -77,7 +76,7 @@ def test_where_no_label_tells_sky_all_that_is_above_the_horizon_stands_for_it():
     assert MERGED[0] != MERGED[SKY_ID]
     fill = fill_sky(pixels([100, 100], label=0), torch.Generator())
     grey = float(decode_srgb(torch.tensor(100 / 255)))
-    assert fill is not None and fill.colour.numpy() == pytest.approx(grey, abs=1e-5)
+    assert fill.colour.numpy() == pytest.approx(grey, abs=1e-5)
     assert 0.3 < fill.unseen.float().mean() < 0.98
 
 
@@ -88,16 +87,22 @@ def test_where_labels_tell_sky_a_house_above_the_horizon_is_none():
     labelled.label[own[0][1] : own[1][1]] = MERGED[2]
     fill = fill_sky(labelled, torch.Generator().manual_seed(0))
     dark = float(decode_srgb(torch.tensor(60 / 255)))
-    assert fill is not None and fill.colour.numpy() == pytest.approx(dark, abs=1e-5)
+    assert fill.colour.numpy() == pytest.approx(dark, abs=1e-5)
 
 
-def test_photos_that_look_down_give_none():
-    low = pixels([100, 100], label=0)
+@pytest.mark.parametrize(("shown", "bright"), [(100, False), (230, True)])
+def test_photos_that_look_down_give_an_even_grey_sky_that_would_light_them(shown, bright):
+    """Lambertian ground of albedo .2 shows a fifth of the sky's radiance; white is the most."""
+    low = pixels([(shown, shown // 2, shown // 4)] * 2, label=0)
     low.c2w[:, 2] *= -1  # up is down: the cameras' axes sink by 30 degrees
     low.c2w[:, :3, 3] = 0
     batch = low.draw(1000, torch.Generator().manual_seed(0))
     assert batch.rays_d[:, 2].max() < LOWEST
-    assert fill_sky(low, torch.Generator()) is None
+    fill = fill_sky(low, torch.Generator())
+    r, g, b = (float(decode_srgb(torch.tensor(v / 255))) for v in (shown, shown // 2, shown // 4))
+    radiance = (0.2126 * r + 0.7152 * g + 0.0722 * b) / 0.2
+    assert fill.unseen.all() and (radiance > 1) == bright
+    assert torch.allclose(fill.colour, torch.full((ROWS, COLUMNS, 3), min(radiance, 1.0)))
 
 
 def test_spreading_keeps_an_even_sky_even():

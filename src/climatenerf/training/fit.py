@@ -226,7 +226,7 @@ class Fitting:
         loss = loss + self.surface_loss(
             batch, u[seen], ray, share[seen].detach(), samples, kept[seen]
         )
-        if settings.losses.sky_fill and self.fill is not None:
+        if settings.losses.sky_fill:
             d, colour = self.fill.draw(SKY_LOOKS, self.generator)
             shown = field.sky_colour(d, field.mean_embedding.detach().expand(d.shape[0], -1))
             apart = losses.colour_error(shown, encode_srgb(colour)).sum() / SKY_LOOKS

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from climatenerf.field.colour_space import decode_srgb
+from climatenerf.field.colour_space import decode_srgb, luma
 from climatenerf.ops.placing import uniform
 from climatenerf.scene.classes import SKY
 from climatenerf.training.pixels import TrainingPixels
@@ -19,6 +19,7 @@ from climatenerf.training.pixels import TrainingPixels
 ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of its sine, azimuth
 LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
 LOOKS = 400_000  # pixels that are looked at, or four times all there are
+ALBEDO = 0.2  # of common ground: soil .05 to .40, grass .16 to .26, asphalt .05 to .20 (Oke 1987)
 LEAST_LOOKS = 3  # of them for a cell to be seen: a single one may be labelled wrongly
 SPREADS = 400  # rounds of spreading, over some 20 cells; what lies farther stays near the mean
 
@@ -51,18 +52,18 @@ def direction(row: Float[Tensor, "n"], column: Float[Tensor, "n"]) -> Float[Tens
     return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=-1)
 
 
-def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | None:
-    """The sky of all photos on a map, and its gaps filled; None if hardly a photo looks there.
+def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill:
+    """The sky of all photos on a map, and its gaps filled.
 
     Where no label tells sky, whatever photos show above the horizon stands for it: indoors, rays
-    that leave through walls that nobody photographed find a wall's light, not night.
+    that leave through walls that nobody photographed find a wall's light, not night. Where all
+    photos look down it is an even grey sky, as bright as what lights ground like theirs: ground of
+    albedo ρ that reflects in all directions alike shows ρ times the radiance of such a sky.
     """
     batch = pixels.draw(min(LOOKS, 4 * pixels.rgb.shape[0]), generator)
     sky = batch.rays_d[:, 2] > LOWEST
     if pixels.knows_sky:
         sky &= batch.label == SKY
-    if not bool(sky.any()):
-        return None
     d, colour = batch.rays_d[sky], decode_srgb(batch.rgb[sky])
     row = ((d[:, 2] - LOWEST) / (1 - LOWEST) * ROWS).long().clamp(0, ROWS - 1)
     turn = torch.atan2(d[:, 1], d[:, 0]) / (2 * np.pi) % 1.0
@@ -72,7 +73,8 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill | No
     count = torch.bincount(cell, minlength=ROWS * COLUMNS).float()
     seen = (count >= LEAST_LOOKS).view(ROWS, COLUMNS)
     if not bool(seen.any()):
-        return None
+        ground = luma(decode_srgb(batch.rgb)).mean()
+        return SkyFill((ground / ALBEDO).clamp_max(1.0).expand(ROWS, COLUMNS, 3), ~seen)
     known = (total / count.clamp_min(1)[:, None]).view(ROWS, COLUMNS, 3)
     return SkyFill(spread(known, seen), ~seen)
 
