@@ -94,6 +94,8 @@ def test_holes_in_the_ground_are_those_put_in():
         depth[row, column] = 1.6 * truth.depth[row, column]
     depth[tuple(ground[30])] = np.inf
     assert geometry.ground_holes([depth], (truth,)) == pytest.approx(31 / len(ground))
+    lawn = truth_of(label=TERRAIN)
+    assert geometry.ground_holes([depth], (lawn,)) == pytest.approx(31 / len(ground))
     # Of two views, one of which has no ground.
     both = geometry.ground_holes([depth, depth], (truth, leaves))
     assert both == pytest.approx(31 / len(ground))

@@ -40,11 +40,11 @@ def differences(one, other):
 
 
 def test_slopes_are_the_density_s_at_the_surfaces_in_the_camera_s_axes():
-    """A density that rises to the right of a world x: where the rays end, and 0 in the sky."""
+    """Matter about the plane x = 2: where the rays end, in the field's units; 0 in the sky."""
 
     class Slanted:
         def to_grid(self, x):
-            return x
+            return x - 2
 
         def density_normal(self, q):
             return torch.stack([q[:, 0].sign(), torch.zeros(len(q)), torch.zeros(len(q))], dim=-1)
@@ -54,7 +54,7 @@ def test_slopes_are_the_density_s_at_the_surfaces_in_the_camera_s_axes():
     c2w[:3, :3] = [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]  # its x axis is the world's y
     c2w[:3, 3] = (-1.0, 0.0, 0.0)
     rays = np.array([[[1.0, 0, 0], [1.0, 0, 0]]])
-    for depth, along in ((3.0, 1.0), (0.5, -1.0)):
+    for depth, along in ((4.0, 1.0), (2.0, -1.0)):
         depths = np.array([[depth, np.inf]])
         dry = Dry(np.zeros((1, 2, 3)), depths, np.zeros((1, 2, 3)), rays, c2w, camera)
         found = ablation.slope_normals(Slanted(), dry)

@@ -4,7 +4,8 @@ import torch
 
 from climatenerf.field.colour_space import decode_srgb
 from climatenerf.scene.cameras import Camera
-from climatenerf.scene.classes import MERGED
+from climatenerf.scene.classes import MERGED, SKY
+from climatenerf.training import sky_fill
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.sky_fill import (
     COLUMNS,
@@ -103,6 +104,17 @@ def test_photos_that_look_down_give_an_even_grey_sky_that_would_light_them(shown
     radiance = (0.2126 * r + 0.7152 * g + 0.0722 * b) / 0.2
     assert fill.unseen.all() and (radiance > 1) == bright
     assert torch.allclose(fill.colour, torch.full((ROWS, COLUMNS, 3), min(radiance, 1.0)))
+
+
+def test_where_hardly_a_pixel_is_labelled_sky_what_is_above_stands_for_it(monkeypatch):
+    """A lamp that a network takes for sky, in a room whose walls are grey."""
+    monkeypatch.setattr(sky_fill, "LOOKS", 600)  # a quarter of the pixels
+    room = pixels([100, 100], label=0)
+    room.label[:2] = SKY
+    assert room.knows_sky
+    fill = fill_sky(room, torch.Generator().manual_seed(0))
+    wall = float(decode_srgb(torch.tensor(100 / 255)))
+    assert fill.colour.numpy() == pytest.approx(wall, abs=1e-5) and not fill.unseen.all()
 
 
 def test_spreading_keeps_an_even_sky_even():

@@ -14,7 +14,7 @@ from torch import Tensor
 from climatenerf.field.colour_space import decode_srgb, luma
 from climatenerf.ops.placing import uniform
 from climatenerf.scene.classes import SKY
-from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.pixels import Batch, TrainingPixels
 
 ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of its sine, azimuth
 LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
@@ -57,14 +57,28 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill:
 
     Where no label tells sky, whatever photos show above the horizon stands for it: indoors, rays
     that leave through walls that nobody photographed find a wall's light, not night. Where all
-    photos look down it is an even grey sky, as bright as what lights ground like theirs: ground of
-    albedo ρ that reflects in all directions alike shows ρ times the radiance of such a sky.
+    photos look down it is an even grey sky, as bright as what lights ground like theirs, white at
+    most: ground of albedo ρ that reflects in all directions alike shows ρ times the radiance of
+    such a sky.
     """
     batch = pixels.draw(min(LOOKS, 4 * pixels.rgb.shape[0]), generator)
-    sky = batch.rays_d[:, 2] > LOWEST
-    if pixels.knows_sky:
-        sky &= batch.label == SKY
-    d, colour = batch.rays_d[sky], decode_srgb(batch.rgb[sky])
+    above = batch.rays_d[:, 2] > LOWEST
+    labelled = above & (batch.label == SKY)
+    known, seen = looked_at(batch, labelled if pixels.knows_sky else above)
+    if not bool(seen.any()):
+        # A few pixels that a network took for sky, in a room perhaps: what is above, then.
+        known, seen = looked_at(batch, above)
+    if not bool(seen.any()):
+        ground = luma(decode_srgb(batch.rgb)).mean()
+        return SkyFill((ground / ALBEDO).clamp_max(1.0).expand(ROWS, COLUMNS, 3), ~seen)
+    return SkyFill(spread(known, seen), ~seen)
+
+
+def looked_at(
+    batch: Batch, which: Bool[Tensor, "n"]
+) -> tuple[Float[Tensor, "rows columns 3"], Bool[Tensor, "rows columns"]]:
+    """Mean linear colours of some rays on the map, and the cells that enough of them look at."""
+    d, colour = batch.rays_d[which], decode_srgb(batch.rgb[which])
     row = ((d[:, 2] - LOWEST) / (1 - LOWEST) * ROWS).long().clamp(0, ROWS - 1)
     turn = torch.atan2(d[:, 1], d[:, 0]) / (2 * np.pi) % 1.0
     column = (turn * COLUMNS).long().clamp(0, COLUMNS - 1)
@@ -72,11 +86,8 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill:
     total = torch.zeros(ROWS * COLUMNS, 3).index_add(0, cell, colour)
     count = torch.bincount(cell, minlength=ROWS * COLUMNS).float()
     seen = (count >= LEAST_LOOKS).view(ROWS, COLUMNS)
-    if not bool(seen.any()):
-        ground = luma(decode_srgb(batch.rgb)).mean()
-        return SkyFill((ground / ALBEDO).clamp_max(1.0).expand(ROWS, COLUMNS, 3), ~seen)
-    known = (total / count.clamp_min(1)[:, None]).view(ROWS, COLUMNS, 3)
-    return SkyFill(spread(known, seen), ~seen)
+    # 1: a cell that nothing looks at, 0/0.
+    return (total / count.clamp_min(1)[:, None]).view(ROWS, COLUMNS, 3), seen
 
 
 def spread(
