@@ -288,20 +288,19 @@ class Fitting:
         return losses.masked_colour_loss(error, mask, prices), stays
 
     def cells_of_points(self, images: int) -> Bool[Tensor, "images cells cells"]:
-        """Where in each image sparse points lie on what it labels person or vehicle.
+        """Where in each image sparse or matched points lie on what it labels person or vehicle.
 
         A point is found by several photos in one place: a parked car, or a cairn that a network
         takes for a person.
         """
         still = torch.zeros(images, STILL_CELLS, STILL_CELLS, dtype=torch.bool)
-        if self.points is None:
-            return still
-        image, d = self.points.image, self.points.rays_d
-        label = self.pixels.label_towards(image, d)
-        own = (label == PERSON) | (label == VEHICLE)
-        place = self.pixels.place_towards(image[own], d[own])
-        cell = (place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
-        still[image[own], cell[:, 1], cell[:, 0]] = True
+        for points in self.measured:
+            image, d = points.image, points.rays_d
+            label = self.pixels.label_towards(image, d)
+            own = (label == PERSON) | (label == VEHICLE)
+            place = self.pixels.place_towards(image[own], d[own])
+            cell = (place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
+            still[image[own], cell[:, 1], cell[:, 0]] = True
         return still
 
     def geometry_loss(
