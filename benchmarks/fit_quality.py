@@ -4,7 +4,9 @@ python benchmarks/fit_quality.py --minutes 5 --captures fox ditch stone_sign kit
 python benchmarks/fit_quality.py --minutes 5 15 --captures fox --seed 1
 
 Captures are names in ../shared/data or folders, fitted at their stored size by the command line in
-a process of their own. Held-out PSNR, SSIM and colour-corrected PSNR in the mean appearance.
+a process of their own. Held-out PSNR, SSIM and colour-corrected PSNR, as `fit` measures them; and
+PSNR in the mean appearance of all photos instead of that of those nearby. With `--holdout NAME` one
+photo is held out instead of every eighth.
 """
 
 import argparse
@@ -15,7 +17,17 @@ from pathlib import Path
 
 from common import CAPTURES, command, report
 
+from climatenerf.field.checkpoint import load_field
+from climatenerf.scene import load_scene
+from climatenerf.training.run import evaluate
+
 KEYS = ("psnr", "psnr_cc", "ssim", "seconds", "steps", "samples")
+
+
+def in_mean_appearance(run: Path, downscale: int) -> float:
+    """PSNR over the held-out photos, all shown in the fitted photos' mean exposure and light."""
+    field, scene = load_field(run), load_scene(run)
+    return evaluate(field, scene, downscale, lambda done, of: None, nearby=False)["psnr"]
 
 
 def main() -> None:
@@ -23,6 +35,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, nargs="+", default=[5.0])
     parser.add_argument("--captures", nargs="+", default=["fox"])
     parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--holdout", help="photo to hold out; default: every eighth")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, help="folder for the runs; default: thrown away")
     options = parser.parse_args()
@@ -34,12 +47,14 @@ def main() -> None:
                 run = (options.keep or Path(temporary)) / f"{folder.name}-{minutes:g}min"
                 words = ["fit", str(folder), "-o", str(run), "--minutes", str(minutes)]
                 words += ["--downscale", str(options.downscale), "--seed", str(options.seed)]
+                words += ["--holdout", options.holdout] if options.holdout else []
                 start = time.perf_counter()
                 command(*words)
                 metrics = json.loads((run / "metrics.json").read_text())
                 row = {"capture": folder.name, "minutes": minutes, "downscale": options.downscale}
                 row |= {key: metrics[key] for key in KEYS}
                 row["wall_seconds"] = time.perf_counter() - start
+                row["psnr_mean_appearance"] = in_mean_appearance(run, options.downscale)
                 psnrs = sorted(view["psnr"] for view in metrics["views"].values())
                 row["psnr_of_views"] = psnrs
                 rows.append(row)

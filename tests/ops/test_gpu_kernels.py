@@ -277,7 +277,7 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
     by(cpu, monkeypatch)
-    field.shown = 1
+    field.shown = field.embeddings[[1]].detach()
     real = field.composited(o, d, near, 4.0, stop)
     assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.4).sum() > 3, (
         "some see matter, one does not"

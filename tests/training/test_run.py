@@ -14,6 +14,7 @@ from climatenerf.evaluation.metrics import psnr_cc
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
+from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.view import render_view
 from climatenerf.scene import load_scene
 from climatenerf.scene.classes import BUILDING, SKY, VEGETATION
@@ -97,6 +98,8 @@ def test_a_run_folder_has_everything(toy, tmp_path):
     assert preview.size == (64, 24)
     field = load_field(tmp_path / "run")
     view = scene.of_split("heldout")[0]
+    photos = np.stack([scene.c2w_world(v) for v in scene.of_split("train")])
+    field.shown = nearby_appearance(field, photos, scene.c2w_world(view))
     picture = render_view(field, scene.cameras[0], scene.c2w_world(view))
     truth = np.asarray(Image.open(view.path)) / 255
     found = -10 * np.log10(np.mean((picture - truth) ** 2))
@@ -122,6 +125,29 @@ def test_what_a_mask_hides_does_not_count_in_the_score(toy, tmp_path):
     assert found[view.name]["psnr_cc"] == pytest.approx(corrected, abs=1e-3)
     assert found[view.name]["ssim"] > metrics["views"][view.name]["ssim"]
     assert other.name not in found and len(found) == 3
+
+
+def test_a_held_out_photo_is_shown_as_photos_from_about_there(toy, tmp_path):
+    """The further north a photo looks, the higher the numbers of its appearance."""
+    scene = toy
+    fitted(scene, tmp_path / "run", steps=2)
+    field = load_field(tmp_path / "run")
+    train = [scene.c2w_world(view) for view in scene.of_split("train")]
+    field.embeddings.requires_grad_(False)
+    field.embeddings[:] = torch.tensor([[c2w[1, 2]] for c2w in train])
+    seen = []
+
+    def told(done, of):
+        seen.append(float(field.shown_embedding.mean()))
+
+    evaluate(field, scene, 1, told)
+    wanted = [scene.c2w_world(view)[1, 2] for view in scene.of_split("heldout")]
+    assert np.ptp(wanted) > 0.5
+    assert np.allclose(seen, wanted, atol=0.1), (seen, wanted)
+    assert field.shown is None, "frames are rendered in the mean, as before"
+    seen.clear()
+    evaluate(field, scene, 1, told, nearby=False)
+    assert np.ptp(seen) == 0
 
 
 def test_nothing_held_out_means_no_quality(scene, tmp_path):

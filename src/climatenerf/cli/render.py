@@ -104,7 +104,8 @@ def render_run(
     field = load_field(options.run)
     check_config(options.run)
     scene = load_scene(options.run)
-    field.shown = appearance_of(options.appearance, scene)
+    shown = appearance_of(options.appearance, scene)
+    field.shown = None if shown is None else field.embeddings[[shown]].detach()
     if not field.knows_classes:
         if "label" in options.layers:
             raise UserError(
@@ -120,7 +121,14 @@ def render_run(
     check_place(options.out, len(path))
     stage = prepare_stage(field, scene, weather, path, fps)
     movie = render_movie(
-        stage, path, fps, options.out, options.supersample, layers, options.layer_format
+        stage,
+        path,
+        fps,
+        options.out,
+        options.supersample,
+        layers,
+        options.layer_format,
+        shown=shown,
     )
     progress.result(f"movie: {movie}")
     return 0
@@ -213,8 +221,12 @@ def render_movie(
     layers: Sequence[str] = (),
     formats: Sequence[Literal["npz", "png", "exr"]] = ("npz",),
     title: str = "render",
+    shown: int | None = None,
 ) -> Path:
-    """Writes out/frames/*.png, out/movie.mp4, the layers and the sidecar; returns the movie."""
+    """Writes out/frames/*.png, out/movie.mp4, the layers and the sidecar; returns the movie.
+
+    `shown` is the training view whose appearance the field shows, as the sidecar tells.
+    """
     from climatenerf.render.frame import render_frame
     from climatenerf.render.layers import SIMULATED, FrameRecord, save_layers, write_sidecar
     from climatenerf.render.movie import MovieWriter, write_png
@@ -224,7 +236,7 @@ def render_movie(
     before = files_of_render(out)
     records: list[FrameRecord] = []
     about: dict[str, Any] = {"path": path.name, "notes": list(path.notes), "fps": fps}
-    about["appearance_of_training_view"] = stage.field.shown  # null: the mean
+    about["appearance_of_training_view"] = shown  # null: the mean
     about |= {"supersample": supersample, "frames_wanted": len(path)}
     if stage.waves is not None:
         about["significant_wave_height_m"] = stage.waves.significant_height

@@ -122,7 +122,7 @@ class Field(nn.Module):
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
         # Whether normals and classes were learned: an untrained head says nothing.
         self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))
-        self.shown: int | None = None
+        self.shown: Float[Tensor, "1 e"] | None = None
         # Coarse to begin with; `Occupancy.refine` halves the cells later.
         self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
 
@@ -145,8 +145,8 @@ class Field(nn.Module):
 
     @property
     def shown_embedding(self) -> Float[Tensor, "1 e"]:
-        """The appearance in which frames are rendered: of the image `shown`, or the mean."""
-        return self.mean_embedding if self.shown is None else self.embeddings[[self.shown]]
+        """The appearance in which frames are rendered: `shown`, or the mean."""
+        return self.mean_embedding if self.shown is None else self.shown
 
     @property
     def knows_normals(self) -> bool:

@@ -17,6 +17,7 @@ from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.extent import find_extent
 from climatenerf.field.field import Field
 from climatenerf.ops.placing import array_of, placed
+from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.view import render_view
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.images import (
@@ -186,22 +187,32 @@ def masked_fraction(fitting: Fitting) -> float | None:
 
 
 def evaluate(
-    field: Field, scene: Scene, downscale: int, evaluated: Callable[[int, int], None]
+    field: Field,
+    scene: Scene,
+    downscale: int,
+    evaluated: Callable[[int, int], None],
+    nearby: bool = True,
 ) -> dict:
-    """PSNR, SSIM and colour-corrected PSNR of the held-out views, in the mean appearance.
+    """PSNR, SSIM and colour-corrected PSNR of the held-out views.
 
-    Of the pixels that a view's mask leaves; in the windows of SSIM the photo stands for the others.
-    A view that is masked as a whole is left out.
+    Each is shown in the appearance of the fitted photos taken from about there, or all in the mean;
+    nothing is learned from the held-out photos themselves. Of the pixels that a view's mask leaves;
+    in the windows of SSIM the photo stands for the others. A view that is masked as a whole is left
+    out.
     """
     rows = {}
     views = scene.of_split("heldout")
+    photos = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
+    before = field.shown
     for index, view in enumerate(views):
         truth = load_image(view, scene, downscale).astype(np.float32) / 255
         usable = load_mask(view, scene, downscale)
         usable = np.ones(truth.shape[:2], bool) if usable is None else usable
         if usable.any():
             camera = downscaled_camera(scene.cameras[view.camera], downscale)
-            picture = render_view(field, camera, scene.c2w_world(view))
+            c2w = scene.c2w_world(view)
+            field.shown = nearby_appearance(field, photos, c2w) if nearby else None
+            picture = render_view(field, camera, c2w)
             shown, wanted = picture[usable][:, None], truth[usable][:, None]
             rows[view.name] = {
                 "psnr": psnr(shown, wanted),
@@ -209,6 +220,7 @@ def evaluate(
                 "psnr_cc": psnr_cc(shown, wanted),
             }
         evaluated(index + 1, len(views))
+    field.shown = before
     if not rows:
         return {"psnr": None, "ssim": None, "psnr_cc": None, "views": {}}
     means = {
