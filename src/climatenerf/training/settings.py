@@ -55,6 +55,8 @@ class FitSettings:
     """Learning rate of networks, sky and appearance at the start."""
     final_rate: float = 0.1
     """Both rates end at this share of their start."""
+    decay: float = 0.5
+    """The appearance grid's values fall by this times their learning rate a step; 0: never."""
     losses: Losses = field(default_factory=Losses)
     appearance: bool = True
     """A vector for each image takes up its exposure and light."""
@@ -89,6 +91,7 @@ PAPER = FitSettings(
         normals=7e-4,
     ),
     opaque_sky=True,
+    decay=0.0,
     carve=False,
     match=False,
     crowded=0.0,
