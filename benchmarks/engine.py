@@ -229,7 +229,7 @@ def time_to_psnr(
 
     def look(report: Report) -> None:
         if report.seconds >= every * (len(curve) + 1) or report.progress >= 1:
-            found = evaluate(fitting.field, scene, downscale, lambda done, total: None)
+            found = evaluate(fitting.field, scene, downscale, lambda done, total: None, False)
             curve.append(
                 {
                     "seconds": report.seconds,

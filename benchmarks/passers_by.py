@@ -94,7 +94,7 @@ def main() -> None:
             fitting = fit(given, settings, options.downscale)
             marked = [masked(fitting, i, each.shape) for i, each in enumerate(shown)]
             person, mask = np.concatenate(shown), np.concatenate(marked)
-            scores = evaluate(fitting.field, scene, options.downscale, lambda *_: None)
+            scores = evaluate(fitting.field, scene, options.downscale, lambda *_: None, False)
             found[row] = {
                 "people_pixels": float(person.mean()),
                 "people_masked": float(mask[person].mean()) if person.any() else None,

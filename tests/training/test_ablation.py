@@ -76,7 +76,7 @@ def test_each_row_leaves_out_just_what_it_says():
     }
     plain = rows["plain NGP"]
     assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
-    assert not plain.sky_labels and not plain.match
+    assert not plain.sky_labels and not plain.match and plain.decay == 0 < full.decay
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 
@@ -92,7 +92,7 @@ def test_the_papers_weights_are_the_papers():
     """Its print 3^{-4} and so on is 3e-4: the first public code has these."""
     weights = PAPER.losses
     assert (weights.classes, weights.normals, weights.distortion) == (4e-2, 7e-4, 3e-4)
-    assert (weights.sky, weights.opacity) == (1e-1, 2e-4)
+    assert (weights.sky, weights.opacity, PAPER.decay) == (1e-1, 2e-4, 0.0)
     assert settings_of("paper") is PAPER and settings_of("cpu").losses == Losses()
     assert settings_of("gpu").preset == "gpu"
 

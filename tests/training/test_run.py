@@ -22,6 +22,7 @@ from climatenerf.scene.scene import with_split
 from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.training import carving as carving_module
 from climatenerf.training import run as run_module
+from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.points import PointRays
 from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
 from climatenerf.training.settings import PAPER, FitSettings, Losses
@@ -118,7 +119,8 @@ def test_what_a_mask_hides_does_not_count_in_the_score(toy, tmp_path):
     Image.fromarray(0 * mask).save(tmp_path / "none.png")
     masks = {view.name: tmp_path / "half.png", other.name: tmp_path / "none.png"}
     views = [dataclasses.replace(v, mask_path=masks.get(v.name)) for v in scene.views]
-    found = evaluate(field, dataclasses.replace(scene, views=tuple(views)), 1, nothing)["views"]
+    masked = dataclasses.replace(scene, views=tuple(views))
+    found = evaluate(field, masked, 1, nothing, nearby=False)["views"]
     wanted = -10 * np.log10(np.mean((picture - truth)[:, :20] ** 2))
     assert found[view.name]["psnr"] == pytest.approx(wanted, abs=1e-3)
     corrected = psnr_cc(picture[:, :20], truth[:, :20].astype(np.float32))
@@ -545,3 +547,19 @@ def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
         run = tmp_path / str(index)
         run_module.fit_scene(scene, run, settings, 1, False, lambda _: None, lambda *_: None)
     assert asked == [5] and measured == [1, 0, 0]
+
+
+def test_the_appearance_grid_alone_decays(toy, tmp_path, monkeypatch):
+    seen = []
+
+    def watched(tables, decays):
+        seen.append([(table.shape, decay) for table, decay in zip(tables, decays, strict=True)])
+        return GridAdam(tables, decays)
+
+    monkeypatch.setattr("climatenerf.training.fit.GridAdam", watched)
+    fitted(toy, tmp_path / "run", steps=1)
+    field = load_field(tmp_path / "run")
+    grids = (field.geometry_grid, field.appearance_grid, field.sky_grid, field.surface_grid)
+    shares = (0.0, FitSettings().decay, 0.0, 0.0)
+    assert seen[-1] == [(grid.shape, share) for grid, share in zip(grids, shares, strict=True)]
+    assert read_json(tmp_path / "run" / "metrics.json")["heldout_appearance"] == "nearby"

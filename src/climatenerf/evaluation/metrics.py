@@ -59,8 +59,8 @@ def ssim(rendered: Picture, photo: Picture) -> float:
 def psnr_cc(rendered: Picture, photo: Picture) -> float:
     """PSNR in dB after the affine colour map that fits the photo best (see `colour_corrected`).
 
-    It leaves out what a photo's own exposure and white balance do, which no held-out view can
-    know. Report it beside `psnr`, never instead of it.
+    It leaves out what a photo's own exposure and white balance do, which a held-out
+    view can know from photos nearby at most. Report it beside `psnr`, never instead of it.
     """
     return psnr(colour_corrected(rendered, photo), photo)
 

@@ -54,6 +54,7 @@ class Field(nn.Module):
     centre: Tensor
     geometry_resolutions: Tensor
     appearance_resolutions: Tensor
+    shown: Float[Tensor, "1 e"] | None
     surface_resolutions: Tensor
     sky_resolutions: Tensor
     learned: Tensor
@@ -122,7 +123,8 @@ class Field(nn.Module):
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
         # Whether normals and classes were learned: an untrained head says nothing.
         self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))
-        self.shown: Float[Tensor, "1 e"] | None = None
+        # A buffer moves with the field; of the frames, not of the run, so it is not saved.
+        self.register_buffer("shown", None, persistent=False)
         # Coarse to begin with; `Occupancy.refine` halves the cells later.
         self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
 

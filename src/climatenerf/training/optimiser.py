@@ -1,4 +1,4 @@
-"""Adam for hash grids: most rows get no gradient in a step, and those are left alone."""
+"""Adam for hash grids: most rows get no gradient in a step, and Adam leaves those alone."""
 
 from collections.abc import Iterable, Sequence
 

@@ -223,7 +223,8 @@ def evaluate(
     field.shown = before
     if not rows:
         return {"psnr": None, "ssim": None, "psnr_cc": None, "views": {}}
-    means = {
+    means: dict = {"heldout_appearance": "nearby" if nearby else "mean"}
+    means |= {
         key: float(np.mean([row[key] for row in rows.values()]))
         for key in ("psnr", "ssim", "psnr_cc")
     }
