@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
 from climatenerf.cli.render import LAYER_NAMES, appearance_of
+from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.scene import load_scene
 from climatenerf.storage import read_safetensors, write_safetensors
 from climatenerf.training.settings import PAPER, Losses
@@ -462,6 +464,27 @@ def test_appearances_are_counted_among_the_training_photos(run_folder):
     assert scene.views[0].name not in names, "held out, so that places differ"
     assert [appearance_of(name, scene) for name in names] == list(range(len(names)))
     assert appearance_of("mean", scene) is None
+
+
+def test_frames_are_in_the_appearance_of_the_photo_that_is_named(run_folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(run_folder, run)
+    field, train = load_field(run), load_scene(run).of_split("train")
+    with torch.no_grad():
+        field.embeddings.normal_(generator=torch.Generator().manual_seed(0))
+        field.view_net[0].normal_(generator=torch.Generator().manual_seed(1))
+    save_field(field, run)
+    frames, told = [], []
+    for name in ("mean", train[2].name, train[3].name):
+        out = tmp_path / name
+        words = ["--path", "still", "--frames", "1", "--size", "64x36", "--appearance", name]
+        assert status("render", run, "-o", out, *words) == 0
+        frames.append(np.asarray(Image.open(out / "frames" / "0000.png")).astype(int))
+        sidecar = json.loads((out / "movie.json").read_text())
+        told.append(sidecar["appearance_of_training_view"])
+    assert told == [None, 2, 3]
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert np.abs(frames[one] - frames[other]).mean() > 1
 
 
 @pytest.mark.parametrize("value", ["10 kg", "half a metre", "0.5"])

@@ -101,7 +101,7 @@ class Fitting:
         self.field.sky_grid.requires_grad_(self.knows_sky)
         grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
         grids += [self.field.surface_grid] if size.surface_levels else []
-        # With the geometry's, too, the reference street had a twentieth less of its sky empty.
+        # With the geometry's the reference street had a twentieth less of its sky empty.
         decays = [settings.decay if grid is self.field.appearance_grid else 0.0 for grid in grids]
         self.grid_adam = GridAdam(grids, decays)
         named = dict(self.field.named_parameters())
