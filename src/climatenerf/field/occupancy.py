@@ -14,6 +14,7 @@ from climatenerf.ops import dispatch
 from climatenerf.ops.placing import integers, uniform
 
 OPACITY = 0.3  # of a crossed cell
+FOR_MEAN = 100_000  # cells from which the cascades' mean densities are told, about
 
 DensityAt = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 
@@ -83,13 +84,15 @@ class Occupancy(torch.nn.Module):
         if fraction >= 1:
             cells = torch.arange(total)
         else:
-            # Half anywhere, half occupied ones found by drawing until enough are met: listing all
-            # occupied cells would cost more than looking at these.
-            count = int(total * fraction / 2)
-            anywhere = integers(generator, 0, total, count)
-            drawn = integers(generator, 0, total, 4 * count)
-            known = drawn[held[drawn] > 0][:count]
-            cells = torch.cat([anywhere, known, self._neighbours(known[::2], generator)])
+            # Half anywhere, half occupied ones found by looking at more until enough are met:
+            # listing all occupied cells would cost more than looking at these.
+            count = max(1, int(total * fraction / 2))
+            anywhere = self._spread(count, generator)
+            drawn = self._spread(4 * count, generator)
+            known = drawn[held[drawn] > 0]
+            known = known[:: max(1, known.shape[0] // count)]
+            half = integers(generator, 0, max(1, known.shape[0]), known.shape[0] // 2)
+            cells = torch.cat([anywhere, known, self._neighbours(known[half], generator)])
         centre, size = self.cell_centres(cells)
         offset = uniform(generator, *centre.shape) - 0.5
         seen = density_at(centre + offset * size[:, None])
@@ -97,10 +100,18 @@ class Occupancy(torch.nn.Module):
         if fraction >= 1:
             self._threshold()
         else:
-            some = integers(generator, 0, total, 100_000)
-            threshold = self._thresholds(some)
+            threshold = self._thresholds(anywhere[:: max(1, count // FOR_MEAN)])
             dense = flat[cells] * size > threshold[cells // self.side**3]
             held[cells] = (dense & ~self.barred.view(-1)[cells]).to(torch.uint8)
+
+    def _spread(self, count: int, generator: torch.Generator) -> Int[Tensor, "n"]:
+        """About `count` cells at equal distances from a random one on.
+
+        In order: of as many random ones nearly each would be waited for, in hundreds of megabytes.
+        """
+        total = self.density.numel()
+        step = max(1, total // count)
+        return torch.arange(0, total - step + 1, step) + integers(generator, 0, step, 1)
 
     def _neighbours(self, cells: Int[Tensor, "n"], generator: torch.Generator) -> Int[Tensor, "n"]:
         """A cell next to each: holes in surfaces lie beside what is known, and close this way."""
