@@ -4,8 +4,9 @@ python benchmarks/floaters.py RUN
 
 Floaters (`floater_mass` in reports) of the test views' pixels, shared out by how many of the fitted
 photos show the place that a pixel truly shows, by whether a pixel beside it shows what is nearer,
-and by distance. What hardly any photo shows has a depth that no photo can tell: only a
-prior could. Needs `pip install ".[street]"`.
+by distance, and by how much of its own light a pixel loses: haze takes a little of many, a surface
+in the wrong place all of some. What hardly any photo shows has a depth that no photo can tell: only
+a prior could. Needs `pip install ".[street]"`.
 """
 
 import argparse
@@ -31,6 +32,7 @@ SAME = 0.02  # of the distance: a photo shows a place that lies in the range of 
 EDGE = 0.1  # of the distance, and m: a pixel beside one that is so much nearer is at an edge
 PHOTOS = (0, 1, 2, 3, 5, 9, 17)  # from so many photos on
 METRES = (0, 20, 60)
+LOST = (0, 0.1, 0.7)
 
 
 def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
@@ -118,6 +120,10 @@ def main() -> None:
             "metres": {
                 f"from {least}": shares(lost, (way >= least) & (way < most))
                 for least, most in zip(METRES, (*METRES[1:], np.inf), strict=True)
+            },
+            "lost": {
+                f"from {least}": shares(lost, (lost >= least) & (lost < most))
+                for least, most in zip(LOST, (*LOST[1:], np.inf), strict=True)
             },
         },
         0,
