@@ -13,7 +13,8 @@ class FieldSize:
     """Cells across the contracted cube (4 grid units) at the finest level."""
     geometry_hidden: int = 32
     appearance_levels: int = 12
-    appearance_log2_rows: int = 17
+    appearance_log2_rows: int = 19
+    """Fewer have less to paint with: foliage stays blurred (docs/decisions.md)."""
     appearance_finest: int = 4096
     colour_hidden: int = 64
     surface_levels: int = 8
@@ -43,7 +44,6 @@ PRESETS = {
         geometry_log2_rows=19,
         geometry_hidden=64,
         appearance_levels=16,
-        appearance_log2_rows=19,
         surface_log2_rows=17,
     ),
     # Supplement, "Training Details": 16 levels of 2^19 for density, 32 of 2^21 for the rest.

@@ -16,9 +16,9 @@ from climatenerf.scene.cameras import Camera
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
 GPU_RAYS_AT_ONCE = 2**16  # there each launch costs; a wet ray sends five, all traced together
-# Of the finest step. Measured on the street after 3 minutes: steps of 1, 1.5, 2 and 3 give 24.86,
-# 24.84, 24.79 and 24.66 dB at half size, and 2 takes 0.6 of the time of 1.
-RENDER_STEP = 2.0
+# Of the step that fits end with. Longer ones meet what is thin and dense by chance: with .5, 1, 1.5
+# and 2 fox has 30.66, 30.56, 29.98 and 29.01 dB (`benchmarks/render_step.py`).
+RENDER_STEP = 1.0
 
 
 def camera_rays(

@@ -1,20 +1,25 @@
-"""What decay of the appearance grid, and scores in the exposure of photos nearby, do to a fit.
+"""What the appearance grid, and whose exposure scores are in, do to the score of a fit.
 
-python benchmarks/decay.py --captures fox stone_sign --steps 700 --decays 0 0.5
+python benchmarks/appearance_grid.py --captures fox --steps 700 --decays 0 0.5
+python benchmarks/appearance_grid.py --captures stone_sign --downscale 2 --steps 4000 --rows 17 19
 
-Captures are names in ../shared/data or folders. Fits of as many steps with each decay, one after
-the other, every eighth photo held out; of each the held-out PSNR as `fit` measures it, the same in
-the mean appearance of all fitted photos, and after the affine colour map that fits best.
+Captures are names in ../shared/data or folders. Fits of as many steps with each decay and with
+tables of each number of rows (its logarithm), one after the other, every eighth photo held out; of
+each the held-out PSNR as `fit` measures it, the same in the mean appearance of all fitted photos,
+and after the affine colour map that fits best.
 """
 
 import argparse
 import sys
 import tempfile
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 from common import CAPTURES, report
 
 from climatenerf.field.checkpoint import load_field
+from climatenerf.field.presets import PRESETS
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.training.run import evaluate, fit_scene
 from climatenerf.training.settings import FitSettings
@@ -26,15 +31,19 @@ def main() -> None:
     parser.add_argument("--captures", nargs="+", default=["fox"])
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--steps", type=int, default=700)
-    parser.add_argument("--decays", type=float, nargs="+", default=[0.0, 0.5])
+    parser.add_argument("--decays", type=float, nargs="+", default=[FitSettings().decay])
+    parser.add_argument(
+        "--rows", type=int, nargs="+", default=[PRESETS["cpu"].appearance_log2_rows]
+    )
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as work:
         for capture in options.captures:
             folder = Path(capture) if Path(capture).is_dir() else CAPTURES / capture
-            for decay in options.decays:
-                run = Path(work) / f"{folder.name}-{decay:g}"
+            for decay, log2_rows in product(options.decays, options.rows):
+                run = Path(work) / f"{folder.name}-{decay:g}-{log2_rows}"
+                PRESETS["cpu"] = replace(PRESETS["cpu"], appearance_log2_rows=log2_rows)
                 settings = FitSettings(
                     minutes=None, steps=options.steps, decay=decay, seed=options.seed
                 )
@@ -50,11 +59,14 @@ def main() -> None:
                 in_mean = evaluate(
                     load_field(run), load_scene(run), options.downscale, lambda *_: None, False
                 )
-                row = {"capture": folder.name, "decay": decay, "steps": options.steps}
+                row = {"capture": folder.name, "decay": decay, "log2_rows": log2_rows}
+                row["steps"] = options.steps
                 row |= {key: scores[key] for key in ("psnr", "psnr_cc", "ssim", "seconds")}
                 rows.append(row | {"psnr_mean_appearance": in_mean["psnr"]})
                 print(rows[-1], file=sys.stderr)
-    report("held-out quality by decay and by whose exposure is shown", rows, options.seed)
+    report(
+        "held-out quality by the appearance grid and by whose exposure is shown", rows, options.seed
+    )
 
 
 if __name__ == "__main__":

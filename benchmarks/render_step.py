@@ -1,0 +1,42 @@
+"""What longer marching steps cost in truth, and what shorter ones cost in time.
+
+python benchmarks/render_step.py RUN --steps 0.5 1 1.5 2
+
+Held-out PSNR and SSIM of a run, as `fit` measures them, when its views are rendered in steps of so
+many times the finest one of a fit, and the seconds that all of its held-out views take.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import common
+
+from climatenerf.field.checkpoint import load_field
+from climatenerf.render import view
+from climatenerf.scene import load_scene
+from climatenerf.training.run import evaluate
+
+
+def main() -> None:
+    """Renders the held-out views once for each step."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--steps", type=float, nargs="+", default=[0.5, 1.0, 1.5, 2.0])
+    options = parser.parse_args()
+    field, scene = load_field(options.run), load_scene(options.run)
+    downscale = json.loads((options.run / "config.json").read_text())["downscale"]
+    evaluate(field, scene, downscale, lambda *_: None)  # compiles, or reads what is compiled
+    found = {}
+    for step in options.steps:
+        view.RENDER_STEP = step
+        start = time.perf_counter()
+        scores = evaluate(field, scene, downscale, lambda *_: None)
+        found[f"{step:g}"] = {key: scores[key] for key in ("psnr", "psnr_cc", "ssim")}
+        found[f"{step:g}"]["seconds"] = time.perf_counter() - start
+    common.report("held-out quality by the marching step of rendering", found)
+
+
+if __name__ == "__main__":
+    main()
