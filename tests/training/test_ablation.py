@@ -77,6 +77,7 @@ def test_each_row_leaves_out_just_what_it_says():
     plain = rows["plain NGP"]
     assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
     assert not plain.sky_labels and not plain.match and plain.decay == 0 < full.decay
+    assert not plain.cautious and not plain.crowded
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 

@@ -193,6 +193,16 @@ def test_near_matter_is_believed_later(scene):
     assert fitting.near() == pytest.approx(fit.FIRST_NEAR * fitting.field.unit)
     fitting.steps = 50
     assert fitting.near() == fitting.field.near
+    assert begin(scene, steps=100, cautious=False).near() == fitting.field.near
+
+
+def test_colours_may_depend_on_the_view_from_the_first_step(scene):
+    """As in a plain NGP, which the ablation compares with and the paper starts from."""
+    for cautious in (True, False):
+        fitting = begin(scene, steps=100, cautious=cautious)
+        before = fitting.field.view_net[0].detach().clone()
+        fitting.step(fitting.pixels.draw(256, fitting.generator))
+        assert torch.equal(fitting.field.view_net[0].detach(), before) == cautious
 
 
 @pytest.mark.slow

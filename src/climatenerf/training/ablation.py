@@ -76,6 +76,7 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         carve=False,
         match=False,
         crowded=0.0,
+        cautious=False,
         decay=0.0,
     )
     return {

@@ -66,7 +66,7 @@ class Fitting:
         """Begins with an untrained field; a few of the points matched (`matching`) are wrong."""
         torch.manual_seed(settings.seed)
         self.points = points
-        self.first_near = FIRST_NEAR * extent.unit
+        self.first_near = FIRST_NEAR * extent.unit if settings.cautious else 0.0
         if points is not None:  # a street that was driven along lies nearer than that
             nearest = float(np.quantile(array_of(points.depth), 0.02))
             self.first_near = min(self.first_near, nearest / 2)
@@ -109,7 +109,7 @@ class Fitting:
         groups = [
             {"params": _of(named, "geometry_net", "colour_net"), "shares": (1.0, 1.0)},
             {"params": _of(named, "surface_net"), "shares": (1.0, 1.0)},
-            {"params": _of(named, "view_net"), "shares": VIEW_SHARES},
+            {"params": _of(named, "view_net"), "shares": VIEW_SHARES[settings.cautious]},
             {"params": _of(named, "sky_net"), "shares": sky_shares},
             {"params": _of(named, "embeddings"), "shares": EMBEDDING_SHARES},
             {"params": list(self.masks.parameters()), "shares": MASK_SHARES},
@@ -557,9 +557,9 @@ def scale_gradient(value: Float[Tensor, "*n"], factor: Float[Tensor, "*n"]) -> F
 # The sky's share before and after surfaces are found, where no labels tell it from matter: it may
 # not paint the view before there is matter.
 SKY_SHARES = (0.03, 0.3)
-# The same of the view's: as long as colours depend on place alone, matter before one camera cannot
-# show that camera its photo.
-VIEW_SHARES = (0.0, 1.0)
+# The same of the view's, by `FitSettings.cautious`: as long as colours depend on place alone,
+# matter before one camera cannot show that camera its photo.
+VIEW_SHARES = {True: (0.0, 1.0), False: (1.0, 1.0)}
 # Of appearance vectors. They begin with the view's: alone they would take up what the direction
 # explains better, and frames in their mean would be off in colour.
 EMBEDDING_SHARES = (0.0, 0.02)

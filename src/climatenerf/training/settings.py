@@ -68,6 +68,9 @@ class FitSettings:
     """Photos are searched for what their neighbours show alike, as more measured points."""
     crowded: float = 3.0
     """Gradients shrink within this many times the nearest distance to a camera; 0: nowhere."""
+    cautious: bool = True
+    """Colours depend on the view, and matter right before cameras is believed, once a quarter of
+    the fit is over; False: from the first step, as in a plain NGP."""
     opaque_sky: bool = False
     """The paper's sky loss: sky rays end on matter far away, instead of on none."""
     refine_poses: bool = False
@@ -95,6 +98,7 @@ PAPER = FitSettings(
     carve=False,
     match=False,
     crowded=0.0,
+    cautious=False,
 )
 """The paper's (supplement, "Training Details"), whose print "3^{-4}" is a mis-set 3e-4."""
 
