@@ -406,6 +406,9 @@ def test_a_truncated_picture(tmp_path, capsys, keep):
     [
         ["--minutes", "0"],
         ["--minutes", "nan"],
+        ["--minutes", "inf"],
+        ["--loss", "sky=nan"],
+        ["--loss", "sky=inf"],
         ["--steps", "0"],
         ["--downscale", "0"],
         ["--downscale", "2"],  # 16 x 12: too small to measure

@@ -7,7 +7,12 @@ from PIL import Image
 
 from climatenerf.errors import UserError
 from climatenerf.scene import Camera, Scene, View, load_image
-from climatenerf.scene.images import downscaled_camera, load_relative_depth, picture_header
+from climatenerf.scene.images import (
+    downscaled_camera,
+    load_depth,
+    load_relative_depth,
+    picture_header,
+)
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
 
@@ -185,3 +190,16 @@ def test_measured_depth_serves_as_relative_depth_unless_there_is_such(tmp_path):
     (tmp_path / "depth_relative").mkdir()
     np.savez(tmp_path / "depth_relative" / "a.npz", inverse_depth=np.full((24, 32), 7.0))
     assert (load_relative_depth(view, scene) == 7).all()
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz"])
+def test_measured_depth_by_another_name_is_one_sentence(tmp_path, suffix):
+    view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
+    path = tmp_path / f"a{suffix}"
+    with path.open("wb") as file:
+        (np.savez if suffix == ".npy" else np.save)(file, np.ones((24, 32)))
+    with pytest.raises(UserError, match=f"depth .*no {suffix[1:].upper()}.*replace it"):
+        load_depth(dataclasses.replace(view, depth_path=path), scene)
+    with path.open("wb") as file:
+        (np.save if suffix == ".npy" else np.savez)(file, np.full((24, 32), 2.0))
+    assert (load_depth(dataclasses.replace(view, depth_path=path), scene) == 2).all()

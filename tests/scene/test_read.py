@@ -44,6 +44,26 @@ def test_everything_held_out(tmp_path):
         read_scene(tmp_path, holdout=",".join(names_of(3)))
 
 
+def test_one_picture_is_too_few_to_fit(tmp_path):
+    make(tmp_path, 3)
+    with pytest.raises(UserError, match="no depth.*hold out fewer"):
+        read_scene(tmp_path, holdout="000.png,001.png")
+
+
+def test_files_that_belong_to_no_picture_are_told_of(tmp_path):
+    make(tmp_path)
+    assert not any("masks" in w for w in read_scene(tmp_path).warnings)
+    (tmp_path / "masks").mkdir()
+    for name in names_of(9)[:2]:
+        Image.new("L", (32, 24), 255).save(tmp_path / "masks" / name)
+    Image.new("L", (32, 24), 255).save(tmp_path / "masks" / "002.jpg")
+    (told,) = [w for w in read_scene(tmp_path).warnings if "masks" in w]
+    assert told.startswith("2 of 9 pictures") and "called like its picture, and is PNG" in told
+    for name in names_of(9):
+        Image.new("L", (32, 24), 255).save(tmp_path / "masks" / name)
+    assert not any("masks" in w for w in read_scene(tmp_path).warnings)
+
+
 def test_missing_pictures_are_counted_once(tmp_path):
     make(tmp_path, 9)
     for name in names_of(9)[2:6]:

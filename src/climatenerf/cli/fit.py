@@ -77,7 +77,8 @@ class Fit:
 def run(options: Fit) -> int:
     """Reads the capture, fits, and says where the run is and how good."""
     settings = fit_settings(options)  # what is wrong with it is to be known before photos are read
-    if any(limit is not None and not limit > 0 for limit in (settings.minutes, settings.steps)):
+    limits = [each for each in (settings.minutes, settings.steps) if each is not None]
+    if not all(0 < limit < float("inf") for limit in limits):
         raise UserError("--minutes and --steps must be above 0; try --minutes 5")
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
@@ -121,8 +122,10 @@ def check_device(device: str) -> None:
 
 def with_perception(scene: Scene, options: Fit) -> Scene:
     """The scene with the labels, and the capture with the relative depths, that are asked for."""
-    from climatenerf.perception import prepare_depth, prepare_labels
+    from climatenerf.perception import check_depth_model, prepare_depth, prepare_labels
 
+    if options.mono_depth not in (None, "none"):
+        check_depth_model(options.mono_depth)  # labels may take minutes to make
     scene = prepare_labels(scene, options.labels, options.out, progress.track, progress.say)
     if options.mono_depth not in (None, "none"):
         prepare_depth(scene, options.mono_depth, progress.track, progress.say)

@@ -128,11 +128,20 @@ def prepare_depth(scene: Scene, model: str, track: Track, say: Say) -> dict[str,
     Raises:
         UserError: The network cannot be used, or its files cannot be written.
     """
-    source = _monocular(scene, DEPTH_ANYTHING if model == "depth-anything" else model)
+    source = _monocular(scene, _depth_model(model))
     folder = scene.root / DEPTHS
     if not _writable(folder):
         raise _read_only(folder)
     return _prepare(scene, source, folder, track, say)
+
+
+def check_depth_model(model: str) -> None:
+    """Refuses what cannot be a network for `prepare_depth`, before anything is loaded."""
+    check_name(_depth_model(model))
+
+
+def _depth_model(model: str) -> str:
+    return DEPTH_ANYTHING if model == "depth-anything" else model
 
 
 def _simple(scene: Scene) -> Source:

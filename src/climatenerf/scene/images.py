@@ -33,6 +33,7 @@ _ON_EDGE = (5, 6, 7, 8)  # tags that exchange width and height
 _SHOWN_UP = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 _ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
 _BAD_IMAGE = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+_BAD_ARRAY = (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error)
 
 
 _LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
@@ -164,22 +165,14 @@ def load_relative_depth(
         depth = load_depth(view, scene, downscale)
         return None if depth is None else 1.0 / depth
     try:
-        data = np.load(path)
-        if not isinstance(data, np.lib.npyio.NpzFile):
-            raise ValueError("it is no NPZ")
-        with data:
-            values = data[data.files[0]]
+        values = _array_of(path)
         if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
             raise ValueError("it must hold real numbers")
         if values.ndim != 2 or not values.size:
             raise ValueError("it must have height x width numbers")
         relative = Image.fromarray(values.astype(np.float32))
-    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error) as error:
-        # Numbers are never stored as Python objects, and those are not to be trusted.
-        reason = "it holds no numbers" if "pickle" in str(error) else error
-        raise UserError(
-            f"The relative depth {path} cannot be read ({reason}); replace it."
-        ) from None
+    except _BAD_ARRAY as error:
+        raise _no_array("relative depth", path, error) from None
     full = scene.cameras[view.camera]
     _check_shape(values, full, path)
     camera = downscaled_camera(full, downscale)
@@ -231,25 +224,40 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
         UserError: The file cannot be read or holds no such picture.
     """
     try:
-        if path.suffix == ".npy":
-            depth = np.load(path)
-        elif path.suffix == ".npz":
-            with np.load(path) as data:
-                depth = data[data.files[0]]
+        if path.suffix in (".npy", ".npz"):
+            depth = _array_of(path)
         else:
             depth = np.asarray(_opened(path)) / 1000
             if depth.ndim == 2 and _opened(path).mode == "L":
                 raise UserError(
                     f"The depth {path} has 8 bits; give 16-bit PNG (millimetres), NPY or NPZ (m)."
                 )
-    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"The depth {path} cannot be read ({error}); replace it.") from None
+    except _BAD_ARRAY as error:
+        raise _no_array("depth", path, error) from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
         depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
     if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.number) or not depth.size:
         raise UserError(f"The depth {path} is no picture of numbers; it must have height x width.")
     depth = depth.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+
+
+def _array_of(path: Path) -> np.ndarray:
+    """The numbers of an NPY, or of the first array of an NPZ."""
+    data = np.load(path)
+    packed = isinstance(data, np.lib.npyio.NpzFile)
+    if packed != (path.suffix == ".npz"):
+        raise ValueError(f"it is no {path.suffix[1:].upper()}")
+    if not packed:
+        return data
+    with data:
+        return data[data.files[0]]
+
+
+def _no_array(kind: str, path: Path, error: Exception) -> UserError:
+    # Numbers are never stored as Python objects, and those are not to be trusted.
+    reason = "it holds no numbers" if "pickle" in str(error) else error
+    return UserError(f"The {kind} {path} cannot be read ({reason}); replace it.")
 
 
 def downscaled_camera(camera: Camera, downscale: int) -> Camera:

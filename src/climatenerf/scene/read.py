@@ -84,7 +84,9 @@ def read_scene(
             f"--frames picks frames of a KITTI-360 drive, which {path} is not; omit it."
         )
     capture = _check_images(capture)
-    views = _split(_find_extras(capture), capture.own_split, holdout, capture.root)
+    views = _find_extras(capture)
+    capture = replace(capture, warnings=(*capture.warnings, *_unmatched(capture.root, views)))
+    views = _split(views, capture.own_split, holdout, capture.root)
     if scene is not None and not relevel:
         kept = tuple(dict.fromkeys((*scene.warnings, *capture.warnings)))
         return replace(
@@ -242,19 +244,39 @@ def _find_extras(capture: Capture) -> tuple[View, ...]:
     return tuple(out)
 
 
+def _unmatched(root: Path, views: tuple[View, ...]) -> list[str]:
+    """Warns of folders whose files belong to some of the photos only, or to none."""
+    out = []
+    for folder, paths, kinds in (
+        ("labels", [v.label_path for v in views], "PNG"),
+        ("masks", [v.mask_path for v in views], "PNG"),
+        ("depth", [v.depth_path for v in views], "NPZ, NPY or PNG"),
+    ):
+        own = sum(path is not None for path in paths)
+        if own < len(views) and (root / folder).is_dir() and any((root / folder).iterdir()):
+            out.append(
+                f"{own} of {len(views)} pictures have a file in {folder}/; one that counts is"
+                f" called like its picture, and is {kinds}."
+            )
+    return out
+
+
 def _split(
     views: tuple[View, ...], own_split: bool, holdout: str | None, root: Path
 ) -> tuple[View, ...]:
-    if holdout is None:
-        if own_split and any(v.split == "train" for v in views):
-            return views
+    if holdout is None and own_split and any(v.split == "train" for v in views):
+        heldout = {v.name for v in views if v.split != "train"}
+    elif holdout is None:
         heldout = {v.name for v in views[::HOLDOUT_EVERY]}
     elif holdout.strip() == "0":
         heldout = set()
     else:
         heldout = _named(views, [n.strip() for n in holdout.split(",") if n.strip()], root)
-    if len(heldout) == len(views):
+    left = len(views) - len(heldout)
+    if left == 0:
         raise UserError("All pictures are held out, so none is left to fit; hold out fewer.")
+    if left == 1:
+        raise UserError("One picture alone, which tells no depth, is left to fit; hold out fewer.")
     return with_split(Scene(root, "", (), views), heldout).views
 
 
