@@ -19,13 +19,14 @@ from typing import Any
 
 import common
 import torch
-from engine import begin, drawn, our_step, time_to_psnr, twin_step
+from engine import drawn, our_step, time_to_psnr, twin_step
 from frame_time import frames
 
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import on
 from climatenerf.scene import load_scene
+from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings, settings_of
 
 GOALS = (20, 22, 24, 25)  # dB
@@ -45,7 +46,7 @@ def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
 
 def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
     """Samples a second of a step, ours and eager PyTorch's, on the same field and rays."""
-    fitting = begin(load_scene(run), FitSettings(seed=seed), 1)
+    fitting = begin(load_scene(run), FitSettings(seed=seed, match=False), 1)
     fitting.field = load_field(run).requires_grad_()
     at = drawn(fitting, samples)
     size, found = at.samples.t.shape[0], {}

@@ -19,16 +19,13 @@ import torch
 from jaxtyping import Bool
 from PIL import Image
 
-from climatenerf.field.extent import find_extent
 from climatenerf.scene import read_scene
 from climatenerf.scene.classes import MERGED, PERSON, UNKNOWN
 from climatenerf.scene.images import load_labels
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene
 from climatenerf.training.fit import Fitting
-from climatenerf.training.matching import match_photos
-from climatenerf.training.points import find_point_rays
-from climatenerf.training.run import evaluate, load_pixels
+from climatenerf.training.run import evaluate
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.transients import MASKED
 
@@ -57,11 +54,7 @@ def people(scene: Scene) -> list[Bool[np.ndarray, "h w"]]:
 
 def fit(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
     """A fit of the scene, as `climatenerf fit` makes it."""
-    pixels = load_pixels(scene, downscale)
-    poses = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
-    extent, points = find_extent(poses, scene.points_world()), find_point_rays(scene)
-    matched = match_photos(pixels, points, (extent.near, extent.unit), settings.seed)
-    fitting = Fitting(pixels, len(poses), extent, settings, points, matched)
+    fitting = begin(scene, settings, downscale)
     fitting.run(lambda _: None)
     fitting.field.occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
     return fitting

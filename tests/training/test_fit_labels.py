@@ -213,6 +213,10 @@ def test_a_single_class_is_not_learned(scene, kept, told):
     """As the fall-back's labels are, sky and terrain: all else would be called terrain too."""
     fitting = with_labels(scene, lambda ids: np.where(np.isin(ids, (*kept, 10)), ids, 255))
     assert fitting.field.knows_classes == told
+    before = fitting.field.surface_net[-2].detach().clone()
+    fitting.step(fitting.pixels.draw(1024, fitting.generator))
+    moved = fitting.field.surface_net[-2].detach() != before
+    assert bool(moved[:, 3:].any()) == told and bool(moved[:, :3].any()), "normals are learned"
 
 
 def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypatch):

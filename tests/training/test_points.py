@@ -3,9 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from toy_scene import CAMERA, make_scene
 
-from climatenerf.training.points import find_point_rays
+from climatenerf.training.points import find_point_rays, shown_points
+from climatenerf.training.run import load_pixels
 
 
 @pytest.fixture
@@ -51,3 +53,29 @@ def test_without_knowledge_of_who_sees_what_there_are_none(scene):
     assert find_point_rays(replace(scene, points=None)) is None
     nothing = tuple(replace(v, seen=np.empty(0, int)) for v in scene.views)
     assert find_point_rays(replace(scene, views=nothing)) is None
+
+
+def test_what_a_mask_hides_is_no_measured_depth(scene, tmp_path):
+    """A mirror's points lie behind it: where it is masked they tell nothing of the wall."""
+    every = find_point_rays(scene)
+    views = scene.of_split("train")
+    view = next(v for v in views if len(v.seen) == 3)
+    c2w, points = scene.c2w_world(view), scene.points_world()[view.seen]
+    column = CAMERA.project((points - c2w[:3, 3]) @ c2w[:3, :3])[:, 0]
+    border = int(np.sort(column)[1])  # between the leftmost and the others
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[:, : border - 1] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    masked = tuple(
+        replace(v, mask_path=tmp_path / "mask.png") if v.name == view.name else v
+        for v in scene.views
+    )
+    masked = replace(scene, views=masked)
+    found = shown_points(masked, load_pixels(masked, 1))
+    image = [v.name for v in views].index(view.name)
+    assert (every.image == image).sum() == 3 and (found.image == image).sum() == 2
+    assert (found.image != image).sum() == (every.image != image).sum()
+    left = points[np.argmin(column)]
+    ends = found.ends[found.image == image].numpy()
+    assert np.linalg.norm(ends - left, axis=-1).min() > 0.1
+    assert shown_points(scene, load_pixels(scene, 1)).depth.shape == every.depth.shape

@@ -213,9 +213,9 @@ def begin(scene, **settings):
     poses = np.stack([scene.c2w_world(v) for v in views])
     chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
     extent = run_module.find_extent(poses, None)
-    points = run_module.find_point_rays(scene)
-    settings = FitSettings(**chosen)
-    return run_module.Fitting(load_pixels(scene, 1), len(views), extent, settings, points)
+    pixels, settings = load_pixels(scene, 1), FitSettings(**chosen)
+    points = run_module.shown_points(scene, pixels)
+    return run_module.Fitting(pixels, len(views), extent, settings, points)
 
 
 def assert_same(a, b):
@@ -351,6 +351,19 @@ def test_photos_from_one_spot_are_refused(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_photos_from_one_spot_are_refused_in_metres_that_are_guessed_from_them(scene, tmp_path):
+    """Turned on a tripod, apart by rounding alone: metres are then of how far they are apart."""
+    random, views = np.random.default_rng(0), []
+    for view in scene.views:
+        pose = view.c2w.copy()
+        pose[:3, 3] = scene.views[0].c2w[:3, 3] + 1e-9 * random.standard_normal(3)
+        views.append(dataclasses.replace(view, c2w=pose))
+    apart = np.diag([1e9, 1e9, 1e9, 1.0])
+    scene = dataclasses.replace(scene, views=tuple(views), world_from_input=apart)
+    with pytest.raises(UserError, match="from one spot.*walk"):
+        fitted(scene, tmp_path / "run")
+
+
 def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     points = np.array([[0.0, -0.6, 0.6], [0.6, 0.0, 0.8]])
     views = [dataclasses.replace(view, seen=np.arange(2)) for view in scene.views]
@@ -440,6 +453,18 @@ def test_a_damaged_held_out_picture_is_found_before_fitting(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_a_damaged_mask_of_a_held_out_picture_is_found_before_fitting(scene, tmp_path):
+    view = scene.of_split("heldout")[0]
+    (tmp_path / "mask.png").write_bytes(b"no picture")
+    views = [
+        dataclasses.replace(v, mask_path=tmp_path / "mask.png") if v is view else v
+        for v in scene.views
+    ]
+    with pytest.raises(UserError, match="mask.png"):
+        fitted(dataclasses.replace(scene, views=tuple(views)), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_resuming_where_there_is_nothing(scene, tmp_path):
     with pytest.raises(UserError, match="no run to resume"):
         fitted(scene, tmp_path / "run", resume=True)
@@ -456,8 +481,12 @@ def test_resuming_with_other_photos_is_refused(scene, tmp_path, heldout):
 def test_resuming_with_another_size_is_refused(scene, tmp_path, monkeypatch):
     fitted(scene, tmp_path / "run", steps=2)
     monkeypatch.setitem(PRESETS, "tiny", dataclasses.replace(TINY, geometry_levels=5))
-    with pytest.raises(UserError, match="another preset"):
+    monkeypatch.setattr(run_module, "load_pixels", None)  # photos are not read for nothing
+    with pytest.raises(UserError, match="earlier version; it can be rendered but not resumed"):
         fitted(scene, tmp_path / "run", steps=4, resume=True)
+    monkeypatch.setitem(PRESETS, "small", PRESETS["tiny"])
+    with pytest.raises(UserError, match="with --preset tiny; resume it with the same"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True, preset="small")
 
 
 def test_a_run_from_a_newer_program_is_left_alone(scene, tmp_path):
@@ -561,5 +590,5 @@ def test_the_appearance_grid_alone_decays(toy, tmp_path, monkeypatch):
     field = load_field(tmp_path / "run")
     grids = (field.geometry_grid, field.appearance_grid, field.sky_grid, field.surface_grid)
     shares = (0.0, FitSettings().decay, 0.0, 0.0)
-    assert seen[-1] == [(grid.shape, share) for grid, share in zip(grids, shares, strict=True)]
+    assert seen[0] == [(grid.shape, share) for grid, share in zip(grids, shares, strict=True)]
     assert read_json(tmp_path / "run" / "metrics.json")["heldout_appearance"] == "nearby"

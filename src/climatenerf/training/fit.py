@@ -17,7 +17,7 @@ from torch import Tensor
 from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.extent import Extent
 from climatenerf.field.field import Field
-from climatenerf.field.presets import PRESETS
+from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.placing import array_of, placed, uniform
 from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
@@ -62,8 +62,9 @@ class Fitting:
         settings: FitSettings,
         points: PointRays | None = None,
         matched: PointRays | None = None,
+        size: FieldSize | None = None,
     ):
-        """Begins with an untrained field; a few of the points matched (`matching`) are wrong."""
+        """Begins with an untrained field (its size: the preset's); some of `matched` are wrong."""
         torch.manual_seed(settings.seed)
         self.points = points
         self.first_near = FIRST_NEAR * extent.unit if settings.cautious else 0.0
@@ -73,7 +74,7 @@ class Fitting:
         self.pixels = pixels
         self.extent = extent
         self.settings = settings
-        size = PRESETS[settings.preset]
+        size = size or PRESETS[settings.preset]
         self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near)
         self.masks, self.poses = TransientMasks(images), PoseCorrections(images)
         self.relative = RelativeDepth(images)
@@ -179,7 +180,8 @@ class Fitting:
         images = self.field.embeddings.shape[0]
         losses_ = replace(self.settings.losses, ground=0.0)
         quick = replace(self.settings, carve=False, losses=losses_)
-        twin = Fitting(self.pixels, images, self.extent, quick, self.points)
+        small = replace(self.field.size, geometry_log2_rows=10, appearance_log2_rows=10)
+        twin = Fitting(self.pixels, images, self.extent, quick, self.points, size=small)
         twin.step(twin.pixels.draw(16, twin.generator))
         twin.field.grid_density(torch.zeros(16, 3))
         twin.field.density_normal(torch.zeros(16, 3))
@@ -409,7 +411,7 @@ class Fitting:
         normal, logits = self.field.surface_at(u[some].detach())
         own, of = share[some], ray[some]
         loss = normal.sum() * 0.0
-        if weigh.classes and self.pixels.label is not None:
+        if weigh.classes and self.pixels.label is not None and self.field.knows_classes:
             target = self.solid_of[batch.label[:n].long()]
             composited = dispatch.accumulate(own, logits, offsets_of(of, n))
             loss = loss + weigh.classes * losses.class_loss(composited, target, target != UNKNOWN)

@@ -152,13 +152,10 @@ class TrainingPixels:
             out[some[placed(inside)]] = placed(place[inside].astype(np.float32))
         return out
 
-    def label_towards(
+    def pixel_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
-    ) -> UInt8[Tensor, "n"]:
-        """Merged class that an image's label has in a direction; unknown outside the picture."""
-        out = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
-        if self.label is None:
-            return out
+    ) -> tuple[Bool[Tensor, "n"], Int[Tensor, "k"]]:
+        """Whether images show directions at all, and the pixels of those that they show."""
         place = self.place_towards(image, rays_d)
         inside = ~place[:, 0].isnan()
         image, place = image[inside], place[inside]
@@ -166,7 +163,26 @@ class TrainingPixels:
         # Rounding may bring the last pixel's border to 1.
         x = (place[:, 0] * width).long().minimum(width - 1)
         y = (place[:, 1] * height).long().minimum(height - 1)
-        out[inside] = self.label[self.pixel_start[image] + y * width + x]
+        return inside, self.pixel_start[image] + y * width + x
+
+    def label_towards(
+        self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
+    ) -> UInt8[Tensor, "n"]:
+        """Merged class that an image's label has in a direction; unknown outside the picture."""
+        out = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
+        if self.label is not None:
+            inside, pixel = self.pixel_towards(image, rays_d)
+            out[inside] = self.label[pixel]
+        return out
+
+    def usable_towards(
+        self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
+    ) -> Bool[Tensor, "n"]:
+        """Whether no mask hides what an image shows in a direction."""
+        out = torch.ones_like(image, dtype=torch.bool)
+        if self.usable is not None:
+            inside, pixel = self.pixel_towards(image, rays_d)
+            out[inside] = self.usable[pixel]
         return out
 
     @property

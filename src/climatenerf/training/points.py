@@ -10,6 +10,7 @@ from torch import Tensor
 
 from climatenerf.ops.placing import integers, placed
 from climatenerf.scene.scene import Scene
+from climatenerf.training.pixels import TrainingPixels
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,15 @@ def find_point_rays(scene: Scene) -> PointRays | None:
         depth=placed(depth[kept].astype(np.float32)),
         image=placed(np.concatenate(of)[kept].astype(np.int64)),
     )
+
+
+def shown_points(scene: Scene, pixels: TrainingPixels) -> PointRays | None:
+    """`find_point_rays` of what no mask hides: behind a mirror there is no wall at that depth."""
+    points = find_point_rays(scene)
+    if points is None:
+        return None
+    kept = pixels.usable_towards(points.image, points.rays_d)
+    return points.some(kept) if bool(kept.any()) else None
 
 
 def joined(some: Sequence[PointRays]) -> PointRays:

@@ -16,6 +16,7 @@ from climatenerf.evaluation.metrics import psnr, psnr_cc, ssim
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.extent import find_extent
 from climatenerf.field.field import Field
+from climatenerf.field.presets import PRESETS
 from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.view import render_view
@@ -41,7 +42,7 @@ from climatenerf.training.fit import REFINE_AT, Fitting, Report
 from climatenerf.training.folder import OPTIMISER, check_folder
 from climatenerf.training.matching import match_photos
 from climatenerf.training.pixels import TrainingPixels
-from climatenerf.training.points import find_point_rays
+from climatenerf.training.points import shown_points
 from climatenerf.training.settings import FitSettings
 
 SCHEMA_VERSION = 1
@@ -49,7 +50,9 @@ CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0
 PREVIEW_WIDTH = 240
 SMALLEST = 16  # pixels; the structural similarity looks at windows of 11
-ONE_SPOT = 1e-3  # m within which cameras are in one place
+ONE_SPOT = 1e-3  # m within which cameras are in one place,
+ROUNDING = 1e-6  # or units of the poses as given
+LEAST_SHARE = 1e-3  # of the pixels that masks must leave
 
 
 def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
@@ -75,10 +78,10 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         (load_mask(view, scene, downscale) for view in views),
         (load_relative_depth(view, scene, downscale) for view in views),
     )
-    if not pixels.share:
+    if pixels.share < LEAST_SHARE:
         raise UserError(
-            f"the masks of {scene.root} leave no pixel to learn from; what is to be ignored is"
-            " black in them, the rest white"
+            f"the masks of {scene.root} leave {pixels.share:.4%} of the pixels to learn from; what"
+            " is to be ignored is black in them, the rest white"
         )
     return pixels
 
@@ -110,20 +113,13 @@ def fit_scene(
     """
     check_folder(scene, run, resume)
     if resume:
+        check_resumable(run, settings)
         scene = in_frame_of(scene, run, downscale)
     for view in scene.of_split("heldout"):
-        load_image(view, scene, downscale)  # a damaged one is to be known now, not after the fit
-    pixels = load_pixels(scene, downscale)
-    views = scene.of_split("train")
-    poses = np.stack([scene.c2w_world(view) for view in views])
-    check_moves(poses)
-    extent = find_extent(poses, scene.points_world())
-    points = find_point_rays(scene)
-    matched = None
-    if settings.match and settings.losses.points:
-        known = pixels if settings.sky_labels else pixels.without_sky()
-        matched = match_photos(known, points, (extent.near, extent.unit), settings.seed)
-    fitting = Fitting(pixels, len(views), extent, settings, points, matched)
+        # Damaged ones are to be known now, not after the fit.
+        load_image(view, scene, downscale)
+        load_mask(view, scene, downscale)
+    fitting = begin(scene, settings, downscale)
     if resume:
         restore(fitting, run)
     make_folder(run / "previews")
@@ -159,7 +155,7 @@ def fit_scene(
         "samples": fitting.samples,
         "interrupted": interrupted,
         "downscale": downscale,
-        "train_views": len(views),
+        "train_views": len(scene.of_split("train")),
         "masked_fraction": masked_fraction(fitting),
     }
     write_json(run / "metrics.json", metrics)
@@ -168,11 +164,36 @@ def fit_scene(
     return metrics
 
 
-def check_moves(c2w: Float[np.ndarray, "v 4 4"]) -> None:
-    """Refuses cameras that all stand in one place: nothing can be told of depth there."""
+def begin(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
+    """A fit before its first step: photos are read, and matched with their neighbours.
+
+    Raises:
+        UserError: a photo cannot be read, or all are from one spot.
+    """
+    pixels = load_pixels(scene, downscale)
+    poses = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
+    check_moves(poses, scene.scale)
+    extent = find_extent(poses, scene.points_world())
+    points = shown_points(scene, pixels)
+    matched = None
+    if settings.match and settings.losses.points:
+        known = pixels if settings.sky_labels else pixels.without_sky()
+        matched = match_photos(known, points, (extent.near, extent.unit), settings.seed)
+    return Fitting(pixels, len(poses), extent, settings, points, matched)
+
+
+def check_moves(c2w: Float[np.ndarray, "v 4 4"], scale: float) -> None:
+    """Refuses cameras that all stand in one place: nothing can be told of depth there.
+
+    Metres may be guessed from how far the cameras are apart, so the poses' own unit counts as well.
+
+    Args:
+        c2w: world, m.
+        scale: metres per unit of the poses as they were given.
+    """
     eyes = c2w[:, :3, 3]
     spread = np.linalg.norm(eyes - eyes.mean(0), axis=-1).max()
-    if len(eyes) > 1 and spread < ONE_SPOT:
+    if spread < max(ONE_SPOT, ROUNDING * scale):
         raise UserError(
             f"all {len(eyes)} photos were taken from one spot (within {1000 * spread:.2g} mm), and"
             " tell nothing of depth; walk while you take them"
@@ -315,24 +336,37 @@ def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
     )
 
 
-def restore(fitting: Fitting, run: Path) -> None:
-    """Puts a checkpoint back into a fit of the same scene and settings."""
-    field = load_field(run)
-    before = check_config(run).get("settings") or {}
-    if "losses" not in before:
+def check_resumable(run: Path, settings: FitSettings) -> None:
+    """Refuses to go on with a fit that was begun in another way, before photos are read.
+
+    Raises:
+        UserError: in one sentence, what to do instead.
+    """
+    config = check_config(run)
+    before, size = config.get("settings") or {}, PRESETS[settings.preset]
+    if "losses" not in before or config.get("field") != dataclasses.asdict(size):
+        if before.get("preset", settings.preset) != settings.preset:
+            raise UserError(
+                f"{run} was fitted with --preset {before['preset']}; resume it with the same"
+            )
         raise UserError(
             f"{run} was fitted by an earlier version; it can be rendered but not resumed, fit anew"
             " into another folder"
         )
-    if before.get("refine_poses") and not fitting.settings.refine_poses:
+    if before.get("refine_poses") and not settings.refine_poses:
         raise UserError(
             f"{run} was fitted with --refine-poses; resume it with that, or its cameras would move"
             " back"
         )
+
+
+def restore(fitting: Fitting, run: Path) -> None:
+    """Puts a checkpoint back into a fit of the same scene and settings."""
+    field = load_field(run)
     if field.embeddings.shape != fitting.field.embeddings.shape or field.size != fitting.field.size:
         raise UserError(
-            f"{run} was fitted to other photos or with another preset; resume it with the same"
-            " scene, --holdout and --preset"
+            f"{run / 'field.safetensors'} is of another fit than its config.json; fit anew into"
+            " another folder"
         )
     fitting.field.occupancy = field.occupancy
     learned = fitting.field.learned.clone()
