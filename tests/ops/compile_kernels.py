@@ -14,7 +14,9 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.runtime import JITFunction
 
+from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.ops import gpu, gpu_network, gpu_render
+from climatenerf.scene.classes import SOLID
 
 CARD = GPUTarget("cuda", int(sys.argv[1]) if len(sys.argv) > 1 else 80, 32)
 
@@ -41,20 +43,28 @@ def net(levels: int, rows: int, hidden: int, outputs: int) -> tuple[torch.Tensor
     return *grid, w1, torch.zeros(hidden), w2, torch.zeros(outputs)
 
 
+def net_of(size: FieldSize, kind: str) -> tuple[torch.Tensor, ...]:
+    """An encoding of few rows, and the network on it, as a field of that size has them."""
+    if kind == "geometry":
+        return net(size.geometry_levels, 10, size.geometry_hidden, 1)
+    if kind == "colour":
+        return net(size.appearance_levels, 10, size.colour_hidden, 3)
+    levels = size.surface_levels or size.appearance_levels
+    return net(levels, 10, size.surface_hidden, 3 + len(SOLID))
+
+
 def compile_all() -> None:
     n, s = 8, 40
     real, whole, some = torch.zeros(n, 3), torch.zeros(n + 1, dtype=torch.long), torch.zeros(s)
     u, order = torch.zeros(s, 3), torch.zeros(s, dtype=torch.long)
     cells = torch.ones(2, 32, 32, 32, dtype=torch.uint8), torch.ones(2, 4, 4, 4, dtype=torch.uint8)
-    density, colour = net(12, 19, 64, 1), net(16, 19, 64, 3)
+    density = net_of(PRESETS["gpu"], "geometry")
     steps, room = (1 / 256, 1 / 160), torch.zeros(3, 1024, n)
     table, resolutions = density[:2]
     features = torch.zeros(24, s)
     gpu.hash_encode(u, table, resolutions, features)
     gpu.hash_encode_backward(u, features, resolutions, table)
     gpu.hash_encode_slopes(u, features, table, resolutions, u)
-    gpu.density_at(u, density, some)
-    gpu.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
     one = cells[0][:1, :12, :12, :12].contiguous()  # a single cascade without blocks
     gpu.march(real, real, real, (one, one), steps, 1e-3, density, room, whole[1:])
     gpu.pack(room, whole, torch.zeros(3, s))
@@ -67,15 +77,20 @@ def compile_all() -> None:
     gpu.distortion_backward(some, some, some, whole, real[:, 0], some)
     gpu.merge_order(some, whole, some, whole, whole, order)
     gpu.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
-    gpu_network.density_slopes(u, density, u)
-    rays = torch.zeros(n, 64), order
-    for layers, shared in ((density, None), (colour, rays), (net(8, 17, 32, 12), None)):
-        out = torch.zeros(s, layers[-1].shape[0])
-        gpu_network.network_forward(u, layers[:2], layers[2:], shared, out)
-        grads = layers[0], None if shared is None else shared[0], u if shared is None else None
-        gpu_network.network_backward(u, layers[:2], layers[2:], shared, out, grads)
-    gpu_render.composite((real, real), real, cells, steps, (1e-3, 1e-4), density, colour,
-                         rays[0], torch.zeros(n, 5))  # fmt: skip
+    for size in PRESETS.values():  # their widths are constants of the kernels
+        rays = torch.zeros(n, size.colour_hidden), order
+        for kind, shared in (("geometry", None), ("colour", rays), ("surface", None)):
+            layers = net_of(size, kind)
+            out = torch.zeros(s, layers[-1].shape[0])
+            gpu_network.network_forward(u, layers[:2], layers[2:], shared, out)
+            grads = layers[0], None if shared is None else shared[0], u if shared is None else None
+            gpu_network.network_backward(u, layers[:2], layers[2:], shared, out, grads)
+        density, colour = net_of(size, "geometry"), net_of(size, "colour")
+        gpu.density_at(u, density, some)
+        gpu.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
+        gpu_network.density_slopes(u, density, u)
+        gpu_render.composite((real, real), real, cells, steps, (1e-3, 1e-4), density, colour,
+                             rays[0], torch.zeros(n, 5))  # fmt: skip
 
 
 def main() -> None:

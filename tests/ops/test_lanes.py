@@ -2,6 +2,10 @@
 
 import copy
 import hashlib
+import os
+import platform
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -182,3 +186,39 @@ def test_lengths_and_their_gradients():
     (length(zero).sum() + unit(zero, 1e-6).sum()).backward()
     assert zero.grad is not None and torch.isfinite(zero.grad).all()
     assert (unit(zero) == 0).all()
+
+
+WIDTH = """
+import numpy as np
+from numba import njit
+from climatenerf.ops import lanes
+
+@njit
+def product(weight, rows, out, count):
+    lanes.add_product(weight, rows, out, count)
+
+product(np.ones((4, 2), np.float32), np.ones((2, 32), np.float32), np.ones((4, 32), np.float32), 2)
+(text,) = product.inspect_asm().values()
+print(next(width for width in ("zmm", "ymm", "xmm") if width in text))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="x86 processors' names")
+@pytest.mark.parametrize(("processor", "widest"), [("haswell", "ymm"), ("x86-64", "xmm")])
+def test_processors_with_shorter_vectors_compute_the_same(processor, widest, tmp_path):
+    """AVX2, and what every such processor has: all kernels against their twins, compiled for it."""
+    environment = {
+        **os.environ,
+        "NUMBA_CPU_NAME": processor,
+        "NUMBA_CPU_FEATURES": "",
+        "NUMBA_CACHE_DIR": str(tmp_path),
+    }
+    told = {"env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", WIDTH], **told)
+    assert done.stdout.strip() == widest, done.stderr[-2000:]
+    names = ("test_kernels.py", "test_lanes.py", "test_metaballs.py")
+    files = [str(Path(__file__).with_name(name)) for name in names]
+    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files]
+    done = subprocess.run(words, **told)
+    assert done.returncode == 0, done.stdout[-3000:]
