@@ -39,7 +39,26 @@ def render_frame(
         labels: also the layer `label`, of a field that has learned classes.
     """
     linear, layers = see_frame(world, camera, c2w, supersample, normals, labels)
-    return array_of((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8)), layers
+    return encoded_8bit(linear), layers
+
+
+def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Linear radiance as a screen shows it."""
+    return array_of((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8))
+
+
+def camera_rays_of(
+    camera: Camera, c2w: Float[np.ndarray, "4 4"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """What `trace` wants of a camera's pixels: origins, directions, angles, turns of gloss."""
+    rays_o, rays_d = camera_rays(camera, c2w)
+    # Solid angle's side at the image centre; towards the corners pixels see a little less.
+    angle = torch.full((rays_o.shape[0],), 1.0 / camera.fx)
+    row, column = torch.meshgrid(
+        torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
+    )
+    roll = pixel_roll(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
+    return rays_o, rays_d, angle, roll
 
 
 def see_frame(
@@ -53,12 +72,9 @@ def see_frame(
     """As `render_frame`, but the picture in linear light."""
     height, width = camera.height, camera.width
     fine = camera.resized(width * supersample, height * supersample)
-    rays_o, rays_d = camera_rays(fine, c2w)
-    # Solid angle's side at the image centre; towards the corners pixels see a little less.
-    angle = torch.full((rays_o.shape[0],), 1.0 / fine.fx)
-    row, column = torch.meshgrid(torch.arange(fine.height), torch.arange(fine.width), indexing="ij")
-    roll = pixel_roll(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
-    seen = trace(world, rays_o, rays_d, angle, roll)
+    rays = camera_rays_of(fine, c2w)
+    rays_d = rays[1]
+    seen = trace(world, *rays)
     linear = seen.rgb.view(height, supersample, width, supersample, 3).mean((1, 3))
     shape = (height, supersample, width, supersample)
     layers = {

@@ -1,0 +1,41 @@
+"""Frames that show early, on a street in closed form that is flooded and in smog."""
+
+import numpy as np
+from test_trace import CAMERA, flooded, looking, street
+
+from climatenerf.render import progressive
+from climatenerf.render.frame import render_frame
+from climatenerf.render.progressive import progressive_frames
+from climatenerf.render.world import World
+from climatenerf.scene.cameras import Camera
+from climatenerf.weather.parameters import Smog
+from climatenerf.weather.smog import medium
+
+WORLD = World(street(), air=medium(Smog(visibility=40.0), 0.0), water=flooded())
+POSE = looking((0.0, 1.0, -0.2))
+
+
+def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
+    traced = []
+
+    def counted(world, rays_o, *rest):
+        traced.append(len(rays_o))
+        return trace(world, rays_o, *rest)
+
+    trace = progressive.trace
+    monkeypatch.setattr(progressive, "trace", counted)
+    pictures = list(progressive_frames(WORLD, CAMERA, POSE))
+    frame, _ = render_frame(WORLD, CAMERA, POSE)
+    assert np.array_equal(pictures[-1], frame)
+    assert sum(traced) == CAMERA.width * CAMERA.height and traced[0] < sum(traced) / 15
+    for picture, spacing in zip(pictures, progressive.SPACINGS, strict=True):
+        known = frame[::spacing, ::spacing]
+        assert np.array_equal(picture[::spacing, ::spacing], known), "it stays as it is"
+        filled = known.repeat(spacing, 0).repeat(spacing, 1)
+        assert np.array_equal(picture, filled[: CAMERA.height, : CAMERA.width])
+
+
+def test_sides_that_no_spacing_divides():
+    camera = Camera(7, 5, 6.0, 6.0, 3.5, 2.5)
+    *_, last = progressive_frames(World(street()), camera, POSE)
+    assert np.array_equal(last, render_frame(World(street()), camera, POSE)[0])
