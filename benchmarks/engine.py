@@ -9,8 +9,8 @@ the same in eager PyTorch; the same under `torch.compile`. Every sample passes e
 three (density, colour, classes, normals and the normals' target); marching is in none of them.
 `frame`: seconds of a picture, as `frame_time.py`. `time_to_psnr`: seconds from nothing until the
 held-out photos of a capture reach so many dB in the mean appearance of all; reading and matching
-photos are counted, measuring is not. The peer's is of `peer_nerfacto.py`, run by the Python of its
-own environment, without its reading of photos; null: not within its minutes.
+photos are counted, measuring and compiling are not. The peer's is of `peer_nerfacto.py`, run by
+the Python of its own environment, without its reading of photos; null: not within its minutes.
 """
 
 import argparse

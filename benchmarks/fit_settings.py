@@ -35,7 +35,7 @@ VARIANTS = {
     "a least chance of 0.5": {"LEAST_CHANCE": 0.5},
     "near matter from the start": {"FIRST_NEAR": 0.0},
     "no pressure below the horizon": {"losses": Losses(solid=0.0)},
-    "colours by direction from the start": {"VIEW_SHARES": {True: (1.0, 1.0)}},
+    "colours by direction from the start": {"VIEW_SHARES": (1.0, 1.0)},
 }
 
 

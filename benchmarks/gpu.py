@@ -4,9 +4,10 @@ python benchmarks/gpu.py RUN --capture ../shared/data/fox
 
 `step`: million samples a second of one optimiser step on the field of RUN, every sample through
 every head, as in `engine.py`, beside eager PyTorch on the same device. `fit`: the capture from
-nothing: samples a second in practice, and seconds of fitting until the held-out photos reach so
-many dB (measuring them is not counted). `frames`: seconds and frames a second of a view of RUN in
-each size, clean and with water on about 40 % of it. Memory is each part's peak on the device.
+nothing: samples a second in practice, and seconds until the held-out photos reach so many dB
+(reading and matching photos are counted, measuring and compiling are not). `frames`: seconds and
+frames a second of a view of RUN in each size, clean and with water on about 40 % of it. Memory is
+each part's peak on the device.
 `--device cpu` tries the same without a GPU; its figures are the CPU's.
 """
 

@@ -25,7 +25,7 @@ from climatenerf.scene.images import load_labels
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene
 from climatenerf.training.fit import Fitting
-from climatenerf.training.run import evaluate
+from climatenerf.training.run import begin, evaluate
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.transients import MASKED
 

@@ -18,30 +18,30 @@ from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
 from climatenerf.cli.render import LAYER_NAMES, appearance_of
 from climatenerf.field.checkpoint import load_field, save_field
+from climatenerf.field.presets import PRESETS
 from climatenerf.scene import load_scene
 from climatenerf.storage import read_safetensors, write_safetensors
 from climatenerf.training.settings import PAPER, Losses
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
 SMALL = ["--size", "96x54", "--frames", "2"]
+FEW_ROWS = dataclasses.replace(
+    PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
+)
 
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
     """A short fit in small steps with small grids: a blurred street in some haze."""
     from climatenerf.cli import fit as cli_fit
-    from climatenerf.field.presets import PRESETS
     from climatenerf.training import run as run_module
     from climatenerf.training.settings import FitSettings
 
     folder = tmp_path_factory.mktemp("street") / "run"
-    small = dataclasses.replace(
-        PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
-    )
     settings = functools.partial(FitSettings, samples_per_step=2**14)
     words = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "cpu", small)
+        patch.setitem(PRESETS, "cpu", FEW_ROWS)
         patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0
@@ -119,7 +119,10 @@ def kept(folder):
         (["--downscale", "6", "--holdout", "0"], "other photos"),
     ],
 )
-def test_a_run_is_resumed_as_it_was_begun_or_not_at_all(run_folder, capsys, words, expected):
+def test_a_run_is_resumed_as_it_was_begun_or_not_at_all(
+    run_folder, capsys, monkeypatch, words, expected
+):
+    monkeypatch.setitem(PRESETS, "cpu", FEW_ROWS)
     before = kept(run_folder)
     said = complaint(capsys, "fit", STREET, "-o", run_folder, "--resume", *words)
     assert expected in said
@@ -426,6 +429,11 @@ def test_masks_that_leave_nothing(tmp_path, capsys):
     for i in range(6):
         path = tmp_path / "scene" / "masks" / f"{i}.png"
         Image.fromarray(np.zeros((24, 32), np.uint8)).save(path)
+    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
+    assert "masks" in said and not (tmp_path / "run").exists()
+    mask = np.zeros((24, 32), np.uint8)
+    mask[12, 16] = 255  # a pixel of one photo is as good as nothing
+    Image.fromarray(mask).save(tmp_path / "scene" / "masks" / "3.png")
     said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
     assert "masks" in said and not (tmp_path / "run").exists()
 

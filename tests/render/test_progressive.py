@@ -36,6 +36,7 @@ def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
 
 
 def test_sides_that_no_spacing_divides():
-    camera = Camera(7, 5, 6.0, 6.0, 3.5, 2.5)
-    *_, last = progressive_frames(World(street()), camera, POSE)
-    assert np.array_equal(last, render_frame(World(street()), camera, POSE)[0])
+    for width, height in ((7, 5), (2, 1)):
+        camera = Camera(width, height, 6.0, 6.0, width / 2, height / 2)
+        *_, last = progressive_frames(World(street()), camera, POSE)
+        assert np.array_equal(last, render_frame(World(street()), camera, POSE)[0])

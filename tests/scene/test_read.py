@@ -59,6 +59,13 @@ def test_files_that_belong_to_no_picture_are_told_of(tmp_path):
     Image.new("L", (32, 24), 255).save(tmp_path / "masks" / "002.jpg")
     (told,) = [w for w in read_scene(tmp_path).warnings if "masks" in w]
     assert told.startswith("2 of 9 pictures") and "called like its picture, and is PNG" in told
+    save_scene(read_scene(tmp_path, metric_input=True), tmp_path)
+    again = read_scene(tmp_path, camera_height=2.0).warnings
+    assert any("masks" in w for w in again), "also of a scene that is scaled anew"
+    (tmp_path / "scene.json").unlink()
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels" / "made_by.json").write_text("{}")
+    assert not any("labels" in w for w in read_scene(tmp_path).warnings)
     for name in names_of(9):
         Image.new("L", (32, 24), 255).save(tmp_path / "masks" / name)
     assert not any("masks" in w for w in read_scene(tmp_path).warnings)

@@ -58,7 +58,7 @@ def run(options: Evaluate) -> int:
     from climatenerf.field.checkpoint import load_field
     from climatenerf.scene import load_scene
     from climatenerf.storage import read_json
-    from climatenerf.training.run import check_config
+    from climatenerf.training.folder import check_config
 
     field = load_field(options.run)
     config = check_config(options.run)

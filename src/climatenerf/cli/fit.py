@@ -12,7 +12,7 @@ from climatenerf.errors import UserError
 from climatenerf.scene import Scene, read_scene
 from climatenerf.scene.known_length import FILE_NAME, apply_known_lengths, measure, read_marks
 from climatenerf.scene.scale import scale_warnings, scale_words
-from climatenerf.training.folder import check_folder
+from climatenerf.training.folder import check_folder, check_resumable
 from climatenerf.training.settings import FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
@@ -79,7 +79,7 @@ def run(options: Fit) -> int:
     settings = fit_settings(options)  # what is wrong with it is to be known before photos are read
     limits = [each for each in (settings.minutes, settings.steps) if each is not None]
     if not all(0 < limit < float("inf") for limit in limits):
-        raise UserError("--minutes and --steps must be above 0; try --minutes 5")
+        raise UserError("--minutes and --steps must be numbers above 0; try --minutes 5")
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
     given = options.camera_height is not None or options.metric_input or options.known_length
@@ -101,7 +101,10 @@ def run(options: Fit) -> int:
     for warning in dict.fromkeys((*scene.warnings, *scale_warnings(scene))):
         progress.warn(warning)
     progress.say(frame_line(scene))
-    check_folder(scene, options.out, options.resume)  # labels may take minutes to make
+    # Labels may take minutes to make.
+    check_folder(scene, options.out, options.resume)
+    if options.resume:
+        check_resumable(options.out, settings)
     scene = with_perception(scene, options)
     metrics = fit_with_bars(scene, options)
     if metrics["interrupted"]:

@@ -99,7 +99,7 @@ def render_run(
     from climatenerf.field.checkpoint import load_field
     from climatenerf.render.camera_path import camera_path
     from climatenerf.scene import load_scene
-    from climatenerf.training.run import check_config
+    from climatenerf.training.folder import check_config
 
     field = load_field(options.run)
     check_config(options.run)

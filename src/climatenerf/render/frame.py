@@ -47,7 +47,7 @@ def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return array_of((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8))
 
 
-def camera_rays_of(
+def traced_rays(
     camera: Camera, c2w: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
     """What `trace` wants of a camera's pixels: origins, directions, angles, turns of gloss."""
@@ -72,7 +72,7 @@ def see_frame(
     """As `render_frame`, but the picture in linear light."""
     height, width = camera.height, camera.width
     fine = camera.resized(width * supersample, height * supersample)
-    rays = camera_rays_of(fine, c2w)
+    rays = traced_rays(fine, c2w)
     rays_d = rays[1]
     seen = trace(world, *rays)
     linear = seen.rgb.view(height, supersample, width, supersample, 3).mean((1, 3))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from climatenerf.render.frame import camera_rays_of, encoded_8bit
+from climatenerf.render.frame import encoded_8bit, traced_rays
 from climatenerf.render.trace import trace
 from climatenerf.render.world import World
 from climatenerf.scene.cameras import Camera
@@ -23,10 +23,10 @@ def progressive_frames(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Display pictures (8 bit) of one camera, each finer than the one before, the last complete.
 
-    A pixel that is not known yet shows the nearest known one above and left of it. Arguments are
-    those of `render_frame`; the first picture comes after a sixteenth of the time.
+    A pixel that is not known yet shows the nearest known one above and left of it. World, camera
+    and c2w as in `render_frame`; one ray a pixel, no layers.
     """
-    rays = camera_rays_of(camera, c2w)
+    rays = traced_rays(camera, c2w)
     row, column = torch.meshgrid(
         torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
     )
@@ -35,6 +35,7 @@ def progressive_frames(
     for spacing in SPACINGS:
         asked = (row % spacing == 0) & (column % spacing == 0) & ~known
         some = asked.flatten().nonzero()[:, 0]
-        linear[asked] = trace(world, *(each[some] for each in rays)).rgb
-        known |= asked
+        if some.numel():
+            linear[asked] = trace(world, *(each[some] for each in rays)).rgb
+            known |= asked
         yield encoded_8bit(linear[row // spacing * spacing, column // spacing * spacing])

@@ -87,14 +87,15 @@ def read_scene(
     views = _find_extras(capture)
     capture = replace(capture, warnings=(*capture.warnings, *_unmatched(capture.root, views)))
     views = _split(views, capture.own_split, holdout, capture.root)
+    kept = () if scene is None else tuple(dict.fromkeys((*scene.warnings, *capture.warnings)))
     if scene is not None and not relevel:
-        kept = tuple(dict.fromkeys((*scene.warnings, *capture.warnings)))
         return replace(
             scene, cameras=capture.cameras, views=views, warnings=kept, label_space=space
         )
     if scene is not None and camera_height is not None:
         # Up and place are known already, maybe from what the pictures no longer tell.
-        known = replace(scene, cameras=capture.cameras, views=views, label_space=space)
+        changed = {"cameras": capture.cameras, "views": views, "label_space": space}
+        known = replace(scene, warnings=kept, **changed)
         scaled = by_camera_height(known, camera_height)
         if scaled is not None:
             return scaled
@@ -135,6 +136,10 @@ def _read_foreign(path: Path, frames: tuple[int, int] | None) -> Capture:
         f"{path} holds pictures but no poses in a known layout (scene.json, transforms.json, "
         "sparse/0/cameras.bin); run COLMAP on it first."
     )
+
+
+def _holds_files(folder: Path) -> bool:
+    return any(p.suffix.lower() in {*_SUFFIXES, ".npz", ".npy"} for p in folder.rglob("*"))
 
 
 def _has_pictures(folder: Path) -> bool:
@@ -253,10 +258,10 @@ def _unmatched(root: Path, views: tuple[View, ...]) -> list[str]:
         ("depth", [v.depth_path for v in views], "NPZ, NPY or PNG"),
     ):
         own = sum(path is not None for path in paths)
-        if own < len(views) and (root / folder).is_dir() and any((root / folder).iterdir()):
+        if own < len(views) and (root / folder).is_dir() and _holds_files(root / folder):
             out.append(
-                f"{own} of {len(views)} pictures have a file in {folder}/; one that counts is"
-                f" called like its picture, and is {kinds}."
+                f"{own} of {len(views)} pictures have {folder}, though there is a folder {folder}/;"
+                f" a file that counts is called like its picture, and is {kinds}."
             )
     return out
 

@@ -83,6 +83,7 @@ class Fitting:
             self.pixels = pixels = pixels.without_sky()
         self.knows_sky = pixels.knows_sky
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
+        view_shares = VIEW_SHARES if settings.cautious else (1.0, 1.0)
         self.fill = fill_sky(pixels, self.generator)
         self.carving = Carving(self.field, pixels, points, settings)
         if matched is not None and self.carving.ground is not None:
@@ -110,7 +111,7 @@ class Fitting:
         groups = [
             {"params": _of(named, "geometry_net", "colour_net"), "shares": (1.0, 1.0)},
             {"params": _of(named, "surface_net"), "shares": (1.0, 1.0)},
-            {"params": _of(named, "view_net"), "shares": VIEW_SHARES[settings.cautious]},
+            {"params": _of(named, "view_net"), "shares": view_shares},
             {"params": _of(named, "sky_net"), "shares": sky_shares},
             {"params": _of(named, "embeddings"), "shares": EMBEDDING_SHARES},
             {"params": list(self.masks.parameters()), "shares": MASK_SHARES},
@@ -559,9 +560,9 @@ def scale_gradient(value: Float[Tensor, "*n"], factor: Float[Tensor, "*n"]) -> F
 # The sky's share before and after surfaces are found, where no labels tell it from matter: it may
 # not paint the view before there is matter.
 SKY_SHARES = (0.03, 0.3)
-# The same of the view's, by `FitSettings.cautious`: as long as colours depend on place alone,
+# The same of the view's, of a fit that is `cautious`: as long as colours depend on place alone,
 # matter before one camera cannot show that camera its photo.
-VIEW_SHARES = {True: (0.0, 1.0), False: (1.0, 1.0)}
+VIEW_SHARES = (0.0, 1.0)
 # Of appearance vectors. They begin with the view's: alone they would take up what the direction
 # explains better, and frames in their mean would be off in colour.
 EMBEDDING_SHARES = (0.0, 0.02)

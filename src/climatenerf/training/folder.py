@@ -1,10 +1,15 @@
 """Which folders a fit may write into. Imports no torch, so that it is known before all else."""
 
+import dataclasses
 from pathlib import Path
 
 from climatenerf.errors import UserError
+from climatenerf.field.presets import PRESETS
 from climatenerf.scene.scene import Scene
+from climatenerf.storage import check_schema, read_json
+from climatenerf.training.settings import FitSettings
 
+SCHEMA_VERSION = 1  # of config.json
 OPTIMISER = "optimiser.safetensors"
 
 
@@ -26,4 +31,35 @@ def check_folder(scene: Scene, run: Path, resume: bool) -> None:
     if not resume and ((run / OPTIMISER).exists() or (run / "metrics.json").exists()):
         raise UserError(
             f"{run} already holds a run; choose another -o, or continue it with --resume"
+        )
+
+
+def check_config(run: Path) -> dict:
+    """The run's configuration; refuses one from a newer version."""
+    config = read_json(run / "config.json", "the run's configuration")
+    check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
+    return config
+
+
+def check_resumable(run: Path, settings: FitSettings) -> None:
+    """Refuses to go on with a fit that was begun in another way, before photos are read.
+
+    Raises:
+        UserError: in one sentence, what to do instead.
+    """
+    config = check_config(run)
+    before, size = config.get("settings") or {}, PRESETS[settings.preset]
+    if "losses" in before and before.get("preset", settings.preset) != settings.preset:
+        raise UserError(
+            f"{run} was fitted with --preset {before['preset']}; resume it with the same"
+        )
+    if "losses" not in before or config.get("field") != dataclasses.asdict(size):
+        raise UserError(
+            f"{run} was fitted by an earlier version; it can be rendered but not resumed, fit anew"
+            " into another folder"
+        )
+    if before.get("refine_poses") and not settings.refine_poses:
+        raise UserError(
+            f"{run} was fitted with --refine-poses; resume it with that, or its cameras would move"
+            " back"
         )

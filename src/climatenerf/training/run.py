@@ -16,7 +16,6 @@ from climatenerf.evaluation.metrics import psnr, psnr_cc, ssim
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.extent import find_extent
 from climatenerf.field.field import Field
-from climatenerf.field.presets import PRESETS
 from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.view import render_view
@@ -31,21 +30,24 @@ from climatenerf.scene.images import (
 from climatenerf.scene.scene import Scene, load_scene, save_scene
 from climatenerf.storage import (
     atomic_path,
-    check_schema,
     make_folder,
-    read_json,
     read_safetensors,
     write_json,
     write_safetensors,
 )
 from climatenerf.training.fit import REFINE_AT, Fitting, Report
-from climatenerf.training.folder import OPTIMISER, check_folder
+from climatenerf.training.folder import (
+    OPTIMISER,
+    SCHEMA_VERSION,
+    check_config,
+    check_folder,
+    check_resumable,
+)
 from climatenerf.training.matching import match_photos
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import shown_points
 from climatenerf.training.settings import FitSettings
 
-SCHEMA_VERSION = 1
 CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0
 PREVIEW_WIDTH = 240
@@ -170,9 +172,9 @@ def begin(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
     Raises:
         UserError: a photo cannot be read, or all are from one spot.
     """
-    pixels = load_pixels(scene, downscale)
     poses = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
     check_moves(poses, scene.scale)
+    pixels = load_pixels(scene, downscale)
     extent = find_extent(poses, scene.points_world())
     points = shown_points(scene, pixels)
     matched = None
@@ -298,13 +300,6 @@ def with_corrections(scene: Scene, fitting: Fitting) -> Scene:
     )
 
 
-def check_config(run: Path) -> dict:
-    """The run's configuration; refuses one from a newer version."""
-    config = read_json(run / "config.json", "the run's configuration")
-    check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
-    return config
-
-
 def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
     """The scene in the metres of a run that is to be resumed: its field knows no others.
 
@@ -334,30 +329,6 @@ def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
         scale_report=before.scale_report,
         georeference=before.georeference,
     )
-
-
-def check_resumable(run: Path, settings: FitSettings) -> None:
-    """Refuses to go on with a fit that was begun in another way, before photos are read.
-
-    Raises:
-        UserError: in one sentence, what to do instead.
-    """
-    config = check_config(run)
-    before, size = config.get("settings") or {}, PRESETS[settings.preset]
-    if "losses" not in before or config.get("field") != dataclasses.asdict(size):
-        if before.get("preset", settings.preset) != settings.preset:
-            raise UserError(
-                f"{run} was fitted with --preset {before['preset']}; resume it with the same"
-            )
-        raise UserError(
-            f"{run} was fitted by an earlier version; it can be rendered but not resumed, fit anew"
-            " into another folder"
-        )
-    if before.get("refine_poses") and not settings.refine_poses:
-        raise UserError(
-            f"{run} was fitted with --refine-poses; resume it with that, or its cameras would move"
-            " back"
-        )
 
 
 def restore(fitting: Fitting, run: Path) -> None:

@@ -69,8 +69,8 @@ class FitSettings:
     crowded: float = 3.0
     """Gradients shrink within this many times the nearest distance to a camera; 0: nowhere."""
     cautious: bool = True
-    """Colours depend on the view, and matter right before cameras is believed, once a quarter of
-    the fit is over; False: from the first step, as in a plain NGP."""
+    """Colours depend on the view once a quarter of the fit is over, and matter near cameras is
+    believed bit by bit until then; False: both from the first step, as in a plain NGP."""
     opaque_sky: bool = False
     """The paper's sky loss: sky rays end on matter far away, instead of on none."""
     refine_poses: bool = False
