@@ -129,6 +129,15 @@ def test_a_run_is_resumed_as_it_was_begun_or_not_at_all(
     assert kept(run_folder) == before
 
 
+def test_a_run_of_another_preset_is_refused_before_labels_are_made(run_folder, capsys, monkeypatch):
+    def minutes(*_):
+        raise AssertionError("labels may take minutes to make")
+
+    monkeypatch.setattr("climatenerf.cli.fit.with_perception", minutes)
+    said = complaint(capsys, "fit", STREET, "-o", run_folder, "--resume", "--preset", "gpu")
+    assert "with --preset cpu; resume it with the same" in said
+
+
 def test_the_command_to_go_on_with_repeats_the_flags():
     from climatenerf.cli.fit import Fit, resuming
 

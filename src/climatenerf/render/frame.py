@@ -50,7 +50,12 @@ def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
 def traced_rays(
     camera: Camera, c2w: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """What `trace` wants of a camera's pixels: origins, directions, angles, turns of gloss."""
+    """What `trace` wants of a camera's pixels (c2w: world m), row by row.
+
+    Returns:
+        Origins (world m), unit directions, the angle each pixel spans, and the turn of its glossy
+        reflection (both rad).
+    """
     rays_o, rays_d = camera_rays(camera, c2w)
     # Solid angle's side at the image centre; towards the corners pixels see a little less.
     angle = torch.full((rays_o.shape[0],), 1.0 / camera.fx)
