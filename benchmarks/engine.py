@@ -32,6 +32,7 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.placing import uniform
+from climatenerf.ops.vectors import unit
 from climatenerf.render.samples import Samples
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.classes import SOLID
@@ -76,6 +77,12 @@ def eager_distortion(weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor) ->
     return each.new_zeros(offsets.shape[0] - 1).index_add(0, ray_of(offsets), each)
 
 
+def eager_surface(weights: Tensor, raw: Tensor, target: Tensor, offsets: Tensor):
+    logits = eager_accumulate(weights, raw[:, 3:], offsets)
+    off = (unit(raw[:, :3], 1e-6) - target).square().sum(-1, keepdim=True)
+    return logits, eager_accumulate(weights, off, offsets)[:, 0]
+
+
 def eager_slopes(q: Float[Tensor, "n 3"], net: dispatch.Net) -> Float[Tensor, "n 3"]:
     table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
     return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)])
@@ -91,6 +98,7 @@ def plain_pytorch():
         render_weights=eager_weights,
         accumulate=eager_accumulate,
         distortion=eager_distortion,
+        surface=eager_surface,
     )
 
 
@@ -132,19 +140,18 @@ def loss_of(field: Field, at: Drawn) -> Float[Tensor, ""]:
     u = reference.contract(at.q)
     dt, t = samples.dt / field.unit, samples.t / field.unit
     weights, left = dispatch.render_weights(field.density_with_gradient(u) * dt, samples.offsets)
-    embedding = field.embeddings[batch.image]
+    embedding = field.embeddings.index_select(0, batch.image)
     colour = field.colour_at(u, at.ray, batch.rays_d, embedding)
     radiance = dispatch.accumulate(weights, colour, samples.offsets)
     radiance = radiance + left[:, None] * field.sky_colour(batch.rays_d, embedding)
     loss = losses.colour_error(radiance, batch.rgb).mean()
     loss = loss + 1e-2 * losses.distortion_loss(weights, t, dt, samples.offsets)
     loss = loss + 2e-4 * losses.opacity_loss(left)
-    normal, logits = field.surface_at(u)
-    own = weights.detach()
-    composited = dispatch.accumulate(own, logits, samples.offsets)
+    goal = field.density_normal(at.q)
+    logits, apart = dispatch.surface(weights.detach(), field.surface_raw(u), goal, samples.offsets)
     target = torch.arange(n) % len(SOLID)  # their cost does not depend on what they are
-    loss = loss + 4e-2 * losses.class_loss(composited, target, torch.ones(n, dtype=torch.bool))
-    return loss + 4e-2 * losses.normal_loss(own, normal, field.density_normal(at.q), n)
+    loss = loss + 4e-2 * losses.class_loss(logits, target, torch.ones(n, dtype=torch.bool))
+    return loss + 4e-2 * apart.sum() / n
 
 
 def our_step(field: Field, at: Drawn) -> Callable[[], None]:

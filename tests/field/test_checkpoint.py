@@ -10,6 +10,7 @@ from random_field import directions, points, random_field
 
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import FILE_NAME, SCHEMA_VERSION, load_field, save_field
+from climatenerf.field.field import THIN_AT_FIRST
 from climatenerf.render.view import render_view
 from climatenerf.scene.cameras import Camera
 from climatenerf.storage import read_safetensors, write_safetensors
@@ -32,9 +33,11 @@ def test_a_loaded_field_renders_bit_identically(tmp_path, refined):
         field.occupancy.update(field.grid_density, 1.0, 0.9, torch.Generator().manual_seed(0))
         field.occupancy.refine()
     field.occupancy.seen[0, 3:9, 2:8, 4:7] = 1
+    field.thin = 0.04
     save_field(field, tmp_path)
     loaded = load_field(tmp_path)
     assert (loaded.size, loaded.unit, loaded.near) == (field.size, field.unit, field.near)
+    assert loaded.thin == field.thin
     assert loaded.state_dict().keys() == field.state_dict().keys()
     for name, tensor in field.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor), name
@@ -59,6 +62,7 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
     def earlier(about, arrays):
         about["schema_version"] = 1
         about["size"] = {k: v for k, v in about["size"].items() if "surface" not in k}
+        del about["thin"]
         for name in [name for name in arrays if name.startswith(("surface_", "learned"))]:
             del arrays[name]
 
@@ -68,6 +72,7 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
     assert torch.equal(loaded.density(x), field.density(x))
     assert torch.equal(loaded.colour(x, d), field.colour(x, d))
     assert not loaded.knows_normals and not loaded.knows_classes
+    assert loaded.thin == THIN_AT_FIRST
 
 
 def test_a_folder_without_a_field(tmp_path):
@@ -111,6 +116,8 @@ def without(name):
         lambda about, arrays: arrays.update(centre=np.zeros(4, np.float32)),
         lambda about, _: about.update(unit="wide"),
         lambda about, _: about.update(unit=0.0),
+        lambda about, _: about.update(thin="a hair"),
+        lambda about, _: about.update(thin=float("nan")),
         lambda about, arrays: arrays["centre"].fill(np.nan),
     ],
 )

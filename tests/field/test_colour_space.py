@@ -40,6 +40,16 @@ def test_gradients_are_finite_and_alive_from_black_to_over_exposed(curve, dtype)
 
 
 @pytest.mark.parametrize("curve", [encode_srgb, decode_srgb])
+def test_gradients_are_slopes(curve):
+    x = torch.tensor([0.001, 0.003, 0.02, 0.05, 0.3, 0.9, 1.2, -0.1], dtype=torch.float64)
+    x.requires_grad_()
+    (slope,) = torch.autograd.grad(curve(x).sum(), x)
+    with torch.no_grad():
+        measured = (curve(x + 1e-7) - curve(x - 1e-7)) / 2e-7
+    assert torch.allclose(slope, measured, rtol=1e-6)
+
+
+@pytest.mark.parametrize("curve", [encode_srgb, decode_srgb])
 def test_linear_above_one_with_the_slope_it_has_there(curve):
     x = torch.tensor([0.99999, 1.0, 1.5, 2.0, 7.0], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(curve(x).sum(), x)

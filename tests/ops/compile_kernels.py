@@ -59,7 +59,7 @@ def compile_all() -> None:
     u, order = torch.zeros(s, 3), torch.zeros(s, dtype=torch.long)
     cells = torch.ones(2, 32, 32, 32, dtype=torch.uint8), torch.ones(2, 4, 4, 4, dtype=torch.uint8)
     density = net_of(PRESETS["gpu"], "geometry")
-    steps, room = (1 / 256, 1 / 160), torch.zeros(3, 1024, n)
+    steps, room = (1 / 256, 1 / 160, 1e-3), torch.zeros(3, 1024, n)
     table, resolutions = density[:2]
     features = torch.zeros(24, s)
     gpu.hash_encode(u, table, resolutions, features)

@@ -237,7 +237,7 @@ def test_marching(generator, monkeypatch, skip, share):
         [torch.full((n,), 0.05), torch.full((n,), 1e9), torch.rand(n, generator=generator)], dim=-1
     )
     spans[2, 1] = 0.5
-    steps = (0.1, 0.02)
+    steps = (0.1, 0.02, 1e-3)
     monkeypatch.setattr(dispatch, "GPU_RAYS", 19)  # in two parts, the first of two blocks
     monkeypatch.setattr(dispatch, "CAPACITY", 64)
     offsets, samples = dispatch.march(

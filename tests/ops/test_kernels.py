@@ -109,10 +109,16 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
 
 
 @pytest.mark.parametrize(
-    ("side", "skips", "share"),
-    [(8, (1,), 0.3), (32, (8, 4, 1), 0.01), (32, (8, 4, 1), 0.002), (32, (8, 4, 1), 0.0)],
+    ("side", "skips", "share", "thin"),
+    [
+        (8, (1,), 0.3, 1e-3),
+        (8, (1,), 0.3, 0.05),
+        (32, (8, 4, 1), 0.01, 1e-3),
+        (32, (8, 4, 1), 0.002, 1e-3),
+        (32, (8, 4, 1), 0.0, 1e-3),
+    ],
 )
-def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share):
+def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, thin):
     table, resolutions = grid(generator)
     layers, plain = network(generator, 8, 16)
     occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
@@ -129,7 +135,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share):
     jitter = torch.rand(n, generator=generator)
     near, far = torch.full((n,), 0.05), torch.full((n,), 1e9)
     far[2] = 0.5
-    steps = (0.05, 0.02)
+    steps = (0.05, 0.02, thin)
     monkeypatch.setattr(dispatch, "CPU_RAYS", 32)  # in two parts
     offsets, found = dispatch.march(
         (o, d),
@@ -171,7 +177,7 @@ def test_a_ray_ends_where_it_is_opaque_and_cells_that_are_empty_give_no_samples(
         occupied = torch.full((2, 8, 8, 8), fill, dtype=torch.uint8)
         span = torch.tensor([[0.0, 1e9, 0.0]])
         offsets, (_, dt, sigma) = dispatch.march(
-            rays, span, dispatch.cells_of(occupied), (0.01, 0.0), 1e-3, net
+            rays, span, dispatch.cells_of(occupied), (0.01, 0.0, 1e-3), 1e-3, net
         )
         if fill:
             tau = dt * sigma
@@ -218,6 +224,31 @@ def test_accumulation_matches_the_twin(generator):
     (b * up.double()).sum().backward()
     for x, y in zip(fast, slow, strict=True):
         assert torch.allclose(x.grad.double(), y.grad, atol=1e-5)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_what_rays_see_of_the_surface_head_matches_the_twin(generator, known):
+    offsets = packed(generator)
+    n, rays = int(offsets[-1]), offsets.shape[0] - 1
+    w, raw = torch.rand(n, generator=generator), torch.randn(n, 9, generator=generator)
+    raw[0, :3], raw[1, :3] = 0.0, torch.tensor([1e-7, 0.0, 0.0])  # without a direction
+    target = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
+    raw[2, :3] = 5 * target[2]  # on it
+    up, up_apart = torch.randn(rays, 6, generator=generator), torch.rand(rays, generator=generator)
+    found = []
+    for run, dtype in ((dispatch.surface, torch.float32), (reference.surface, torch.float64)):
+        for turned in (False, True):  # as networks leave it, and as it is
+            own = raw.T.contiguous().T if turned else raw
+            own = leaf(own, dtype)
+            goal = target.to(dtype) if known else None
+            logits, apart = run(w.to(dtype), own, goal, offsets)
+            ((logits * up.to(dtype)).sum() + (apart * up_apart.to(dtype)).sum()).backward()
+            assert torch.isfinite(own.grad).all()
+            found.append([logits.detach(), apart.detach(), own.grad[2:], own.grad[:2] * 1e-6])
+    for fast in found[:2]:
+        for a, b in zip(fast, found[2], strict=True):
+            assert (a.double() - b).abs().max() < 1e-5 * max(1.0, float(b.abs().max()))
+    assert (float(found[0][1].max()) > 0) == known
 
 
 def test_distortion_matches_the_double_sum(generator):

@@ -14,7 +14,7 @@ import torch
 from numba import njit
 
 from climatenerf.field.occupancy import Occupancy
-from climatenerf.ops import cpu, cpu_network, dispatch, lanes, metaballs, reference
+from climatenerf.ops import ball_lanes, cpu, cpu_network, dispatch, lanes, metaballs, reference
 from climatenerf.ops.lanes import LANES
 from climatenerf.ops.vectors import length, unit
 
@@ -36,8 +36,10 @@ def network(features, w1, b1, w2, b2, out):
 
 def test_kernels_are_compiled_anew_when_their_instructions_change():
     """Numba looks at a kernel's own file alone; its text has to change with `lanes.py`'s."""
-    digest = hashlib.sha256(Path(lanes.__file__).read_bytes()).hexdigest()[:12]
+    own, balls = (Path(each.__file__).read_bytes() for each in (lanes, ball_lanes))
     for module in (cpu, cpu_network, metaballs):
+        text = own + balls if module is metaballs else own
+        digest = hashlib.sha256(text).hexdigest()[:12]
         assert digest == module.LANES_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
 
 
@@ -154,10 +156,10 @@ def test_cells_are_packed_anew_when_they_change():
 
 
 def test_adam_leaves_alone_what_has_no_gradient():
-    """Against PyTorch's own, over groups that are empty, full and cut off at the end."""
-    n = 4096 + 3 * cpu.GROUP + 5
+    """Against PyTorch's own, over lanes that are empty, full and cut off at the end."""
+    n = 4096 + 3 * LANES + 5
     own, gradients = torch.randn(n), torch.randn(2, n)
-    gradients[:, cpu.GROUP : 2 * cpu.GROUP] = 0.0
+    gradients[:, LANES : 2 * LANES] = 0.0
     gradients[:, ::3] = 0.0
     gradients[1, 1::3] = 0.0  # moved by the first step, left alone by the second
     first, second = torch.zeros(n), torch.zeros(n)

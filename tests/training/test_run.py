@@ -246,9 +246,11 @@ def stop_half_way(fitting, run):
 
 def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
     fitting = begin(scene, steps=40)
+    fitting.field.thin = 0.004
     stop_half_way(fitting, tmp_path)
     again = begin(scene, steps=40)
     restore(again, tmp_path)
+    assert again.field.thin == fitting.field.thin
     assert_same(fitting, again)
     fitting.run(nothing)
     again.run(nothing)

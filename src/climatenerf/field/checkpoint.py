@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from climatenerf.errors import UserError
-from climatenerf.field.field import Field
+from climatenerf.field.field import THIN_AT_FIRST, Field
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops.placing import placed
@@ -24,6 +24,7 @@ def save_field(field: Field, run: Path) -> None:
         "size": dataclasses.asdict(field.size),
         "unit": field.unit,
         "near": field.near,
+        "thin": field.thin,
     }
     tensors = {k: v.detach().contiguous() for k, v in field.state_dict().items()}
     write_safetensors(run / FILE_NAME, tensors, {"climatenerf": json.dumps(about)})
@@ -48,12 +49,14 @@ def load_field(run: Path) -> Field:
         about = json.loads(metadata["climatenerf"])
         check_schema(about["schema_version"], SCHEMA_VERSION, f"the field in {run}")
         size = FieldSize(**about["size"])
-        numbers = [about["unit"], about["near"], *arrays["centre"].tolist()]
+        thin = about.get("thin", THIN_AT_FIRST)  # earlier runs ended with what fits begin with
+        numbers = [about["unit"], about["near"], thin, *arrays["centre"].tolist()]
         if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0:
             raise ValueError("a length is not a finite number above 0")
         field = Field(
             size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
         )
+        field.thin = float(thin)
         field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
         tensors = {k: placed(v) for k, v in arrays.items()}
         if about["schema_version"] == 1:  # without normals and classes: nothing is learned of them

@@ -6,10 +6,13 @@ from torch import Tensor
 
 
 def spherical_harmonics(d: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 16"]:
-    """The 16 real spherical harmonics of degrees 0 to 3, orthonormal over the sphere."""
+    """The 16 real spherical harmonics of degrees 0 to 3, orthonormal over the sphere.
+
+    In memory each lies in a row, as encodings leave their features.
+    """
     x, y, z = d.unbind(-1)
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-    return torch.stack(
+    rows = torch.stack(
         [
             torch.full_like(x, 0.28209479177387814),
             -0.48860251190291987 * y,
@@ -27,6 +30,6 @@ def spherical_harmonics(d: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 16"]:
             0.45704579946446572 * x * (1.0 - 5.0 * zz),
             1.4453057213202769 * z * (xx - yy),
             0.59004358992664352 * x * (-xx + 3.0 * yy),
-        ],
-        dim=-1,
+        ]
     )
+    return rows.movedim(0, -1)

@@ -27,6 +27,7 @@ from climatenerf.scene.classes import SOLID
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
 STEP_CONE = 1.0 / 160  # marching step per length travelled
+THIN_AT_FIRST = 1e-3  # optical depth of samples that count as empty, as fits begin
 
 
 def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
@@ -80,6 +81,8 @@ class Field(nn.Module):
         self.size = size
         self.unit = unit
         self.near = near
+        self.thin = THIN_AT_FIRST
+        """Optical depth below which a marched sample counts as empty; see `training.fit`."""
         self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
         self.register_buffer(
             "geometry_resolutions",
@@ -221,7 +224,7 @@ class Field(nn.Module):
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, t_max / self.unit, jitter], dim=-1),
             self.occupancy.cells(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin),
             stop,
             self._net(),
         )
@@ -248,7 +251,7 @@ class Field(nn.Module):
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, endless, start], dim=-1),
             self.occupancy.cells(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin),
             (stop, LEAST_WEIGHT),
             self._net(),
             ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
@@ -377,7 +380,8 @@ class Field(nn.Module):
     ) -> Float[Tensor, "n h"]:
         """What a ray's samples share: one layer, added to the first of the samples' own."""
         weight, bias = self.view_net
-        return torch.cat([spherical_harmonics(rays_d), embedding], dim=-1) @ weight + bias
+        x = torch.cat([spherical_harmonics(rays_d), embedding], dim=-1)
+        return torch.addmm(bias, x, weight)
 
     def _coloured(
         self, u: Float[Tensor, "s 3"], ray: Int[Tensor, "s"], shared: Float[Tensor, "n h"]
@@ -386,15 +390,22 @@ class Field(nn.Module):
         layers = _pairs(self.colour_net)
         return _to_radiance(dispatch.encoded_mlp(u, grid, resolutions, layers, shared, ray))
 
-    def surface_at(
-        self, u: Float[Tensor, "s 3"]
-    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s c"]]:
-        """Predicted normals (unit, world axes) and class logits (of `SOLID`) at unit-cube u."""
+    def surface_raw(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s 3+c"]:
+        """Predicted normals of any length (world axes) and class logits (of `SOLID`), unit-cube u.
+
+        As `dispatch.surface` takes them.
+        """
         if self.size.surface_levels:
             grid, resolutions = self.surface_grid, self.surface_resolutions
         else:
             grid, resolutions = self.appearance_grid, self.appearance_resolutions
-        raw = dispatch.encoded_mlp(u, grid, resolutions, _pairs(self.surface_net))
+        return dispatch.encoded_mlp(u, grid, resolutions, _pairs(self.surface_net))
+
+    def surface_at(
+        self, u: Float[Tensor, "s 3"]
+    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s c"]]:
+        """Predicted normals (unit, world axes) and class logits (of `SOLID`) at unit-cube u."""
+        raw = self.surface_raw(u)
         # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
         return unit_vector(raw[:, :3], 1e-6), raw[:, 3:]
 
@@ -405,8 +416,8 @@ class Field(nn.Module):
         # Clouds need finer detail than the harmonics have: what the sky cannot show, floating
         # matter would. Where no photo looked the grid is blank and the harmonics go on.
         detail = dispatch.hash_encode(0.5 + 0.499 * d, self.sky_grid, self.sky_resolutions)
-        x = torch.cat([spherical_harmonics(d), detail, embedding], dim=-1)
-        return _to_radiance(dispatch.mlp(x, _pairs(self.sky_net)))
+        x = torch.cat([spherical_harmonics(d).T, detail.T, embedding.T])
+        return _to_radiance(dispatch.mlp(x.T, _pairs(self.sky_net)))
 
     @torch.no_grad()
     def colour(

@@ -6,17 +6,15 @@ in grid units (see `reference.contract`); rays are packed: the samples of ray r 
 """
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 
 from climatenerf.ops import lanes
 from climatenerf.ops.lanes import LANES
 
-LANES_DIGEST = "867c92b329b6"  # of `lanes.py`, which says why
+LANES_DIGEST = "d31ec889e448"  # of `lanes.py`, which says why
 
 BLOCK = 256  # points that one thread takes at once
-ENCODED = 8192  # the same, at most, where levels come one by one: their tables stay in the caches
-PARTS = 16  # at least so many blocks, so that all cores have some
-GROUP = 64  # entries of a table that the optimiser looks at together
+ENCODED = 2**16  # the same, at most, where levels come one by one
 RAY_BLOCK = 32  # rays that one thread marches in turn
 
 
@@ -27,10 +25,10 @@ def _contract_scale(m):
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def hash_encode(u, table, resolutions, out):
-    """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n] (feature-major)."""
+def _hash_encode(u, table, resolutions, out, threads):
     n = u.shape[0]
-    size = max(LANES, min(ENCODED, n // PARTS // LANES * LANES))
+    each = -(-n // threads)
+    size = min(ENCODED, -(-max(each, 1) // LANES) * LANES)
     for block in prange((n + size - 1) // size):
         places = np.zeros((3, LANES), np.float32)
         features = np.empty((2, LANES), np.float32)
@@ -47,26 +45,41 @@ def hash_encode(u, table, resolutions, out):
 
 
 @njit(cache=True, fastmath=True, parallel=True)
+def _hash_encode_backward(u, grad_out, resolutions, grad_table, threads):
+    n = u.shape[0]
+    for part in prange(threads):
+        places, grad = np.zeros((3, LANES), np.float32), np.zeros((2, LANES), np.float32)
+        for level in range(part, grad_table.shape[0], threads):
+            for start in range(0, n, LANES):
+                count = min(LANES, n - start)
+                some = np.float32(0.0)
+                grad[:] = 0.0
+                for k in range(count):
+                    for axis in range(3):
+                        places[axis, k] = u[start + k, axis]
+                    for feature in range(2):
+                        grad[feature, k] = grad_out[2 * level + feature, start + k]
+                        some += abs(grad[feature, k])
+                if some != np.float32(0.0):
+                    lanes.spread(places, grad, grad_table, level, resolutions[level])
+
+
+def hash_encode(u, table, resolutions, out):
+    """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n] (feature-major).
+
+    A thread takes its points through one level after the other: most of a large table is read, and
+    it is read once.
+    """
+    _hash_encode(u, table, resolutions, out, get_num_threads())
+
+
 def hash_encode_backward(u, grad_out, resolutions, grad_table):
     """Adds the gradient of `hash_encode` to grad_table [L,T,2].
 
-    One thread owns a level, so no two threads write to one row and the sum's order is fixed.
+    One thread owns a level, so no two threads write to one row and the sum's order is fixed. Fine
+    levels take longest, so each thread has some of all kinds.
     """
-    n = u.shape[0]
-    for level in prange(grad_table.shape[0]):
-        places, grad = np.zeros((3, LANES), np.float32), np.zeros((2, LANES), np.float32)
-        for start in range(0, n, LANES):
-            count = min(LANES, n - start)
-            some = np.float32(0.0)
-            grad[:] = 0.0
-            for k in range(count):
-                for axis in range(3):
-                    places[axis, k] = u[start + k, axis]
-                for feature in range(2):
-                    grad[feature, k] = grad_out[2 * level + feature, start + k]
-                    some += abs(grad[feature, k])
-            if some != np.float32(0.0):
-                lanes.spread(places, grad, grad_table, level, resolutions[level])
+    _hash_encode_backward(u, grad_out, resolutions, grad_table, get_num_threads())
 
 
 @njit(cache=True, fastmath=True, parallel=True)
@@ -234,7 +247,8 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
     cells = (words [K,W,W,W] of `pack_cells`, whether blocks of 8³ cells hold an occupied one, or of
     one cell each), cascade k covers the cube of half side 2^k;
-    steps = (smallest step, step per length); stop = transmittance at which a ray ends;
+    steps = (smallest step, step per length, optical depth below which one counts as empty);
+    stop = transmittance at which a ray ends;
     net = (table, resolutions, w1 [hidden, features], b1, w2 [1, hidden], b2).
     rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
     samples one after the other, to be packed. counts [n] receive the samples written per ray.
@@ -248,11 +262,11 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
     side = blocks.shape[1] << shift
     capacity = rows.shape[2] // RAY_BLOCK
     far = np.float32(2.0 ** (cascades - 1))
-    dt_min, cone = np.float32(steps[0]), np.float32(steps[1])
+    dt_min, cone, thin = np.float32(steps[0]), np.float32(steps[1]), np.float32(steps[2])
     log_stop = np.float32(-np.log(stop))
     half_cells = np.float32(0.5) * np.float32(side)
     for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
-        places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        places, thinned = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
         features = np.empty((2 * table.shape[0], LANES), np.float32)
         sigma = np.empty((1, LANES), np.float32)
         middles, lengths = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
@@ -303,7 +317,7 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
                         if word == 0:
                             empty = word_shift
                         elif word >> ((ix & 3) | (iy & 3) << 2 | (iz & 3) << 4) & 1:
-                            _place(places, thin, count, qx, qy, qz)
+                            _place(places, thinned, count, qx, qy, qz)
                             middles[count], lengths[count] = tm, dt
                             count += 1
                             t += dt
@@ -319,9 +333,9 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
                     skip = np.ceil((leave - tm) / dt)
                     t += dt * max(skip, np.float32(1.0))
                 if count:
-                    _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
+                    _densities(places, thinned, table, resolutions, w1, b1, w2, b2, features, sigma)
                 for i in range(count):
-                    if sigma[0, i] * lengths[i] > np.float32(1e-3):
+                    if sigma[0, i] * lengths[i] > thin:
                         rows[0, block, k] = middles[i]
                         rows[1, block, k] = lengths[i]
                         rows[2, block, k] = sigma[0, i]
@@ -363,37 +377,38 @@ def grid_positions(rays_o, rays_d, offsets, t, u):
 def weights_forward(tau, offsets, weights, transmittance):
     """Rendering weights of packed samples with optical depths tau; transmittance left per ray."""
     for r in prange(offsets.shape[0] - 1):
-        total = 0.0
+        left = 1.0
         for i in range(offsets[r], offsets[r + 1]):
-            before = np.exp(-total)
-            total += tau[i]
-            weights[i] = before * -np.expm1(-tau[i])
-        transmittance[r] = np.exp(-total)
+            passed = np.exp(-np.float64(tau[i]))  # in double 1 - passed keeps its digits
+            weights[i] = left * (1.0 - passed)
+            left *= passed
+        transmittance[r] = left
 
 
 @njit(cache=True, parallel=True)
 def weights_backward(tau, offsets, grad_w, grad_t, grad_tau):
     """Gradient of `weights_forward`: dw_i/dtau_i = T_{i+1}, dw_j/dtau_i = -w_j for j > i."""
     for r in prange(offsets.shape[0] - 1):
-        total = 0.0
+        left = 1.0
         for i in range(offsets[r], offsets[r + 1]):
-            total += tau[i]
-        behind = grad_t[r] * np.exp(-total)
+            grad_tau[i] = left  # for the way back
+            left *= np.exp(-np.float64(tau[i]))
+        behind = grad_t[r] * left
         for i in range(offsets[r + 1] - 1, offsets[r] - 1, -1):
-            after = np.exp(-total)
-            total -= tau[i]
-            grad_tau[i] = grad_w[i] * after - behind
-            behind += grad_w[i] * np.exp(-total) * -np.expm1(-tau[i])
+            before = np.float64(grad_tau[i])
+            grad_tau[i] = grad_w[i] * left - behind
+            behind += grad_w[i] * before * (1.0 - np.exp(-np.float64(tau[i])))
+            left = before
 
 
 @njit(cache=True, parallel=True)
 def accumulate_forward(weights, values, offsets, out):
-    """Sum over each ray of weights [s] · values [s,c] → out [rays,c]."""
+    """Sum over each ray of weights [s] · values [c,s] → out [rays,c]."""
     for r in prange(offsets.shape[0] - 1):
-        for c in range(values.shape[1]):
+        for c in range(values.shape[0]):
             total = 0.0
             for i in range(offsets[r], offsets[r + 1]):
-                total += weights[i] * values[i, c]
+                total += weights[i] * values[c, i]
             out[r, c] = total
 
 
@@ -403,10 +418,60 @@ def accumulate_backward(weights, values, offsets, grad_out, grad_w, grad_v):
     for r in prange(offsets.shape[0] - 1):
         for i in range(offsets[r], offsets[r + 1]):
             total = 0.0
-            for c in range(values.shape[1]):
-                total += grad_out[r, c] * values[i, c]
-                grad_v[i, c] = grad_out[r, c] * weights[i]
+            for c in range(values.shape[0]):
+                total += grad_out[r, c] * values[c, i]
+                grad_v[c, i] = grad_out[r, c] * weights[i]
             grad_w[i] = total
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _unit(x, y, z):
+    """Direction of a vector, its length, and the least length taken where it has none."""
+    least = np.float32(1e-6)
+    length = max(np.sqrt(x * x + y * y + z * z), least)
+    return x / length, y / length, z / length, length, least
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def surface_forward(weights, raw, target, offsets, logits, apart):
+    """Sums over rays of weights [s] · the surface head's output; see `reference.surface`.
+
+    raw [3 + c, s]; target [s, 3], or [0, 3] → logits [rays, c], apart [rays].
+    """
+    for r in prange(offsets.shape[0] - 1):
+        first, last = offsets[r], offsets[r + 1]
+        for c in range(logits.shape[1]):
+            total = np.float32(0.0)
+            for i in range(first, last):
+                total += weights[i] * raw[3 + c, i]
+            logits[r, c] = total
+        total = np.float32(0.0)
+        if target.shape[0]:
+            for i in range(first, last):
+                nx, ny, nz, _, _ = _unit(raw[0, i], raw[1, i], raw[2, i])
+                nx, ny, nz = nx - target[i, 0], ny - target[i, 1], nz - target[i, 2]
+                total += weights[i] * (nx * nx + ny * ny + nz * nz)
+        apart[r] = total
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def surface_backward(weights, raw, target, offsets, grad_logits, grad_apart, grad_raw):
+    """Gradient of `surface_forward` to raw."""
+    for r in prange(offsets.shape[0] - 1):
+        for i in range(offsets[r], offsets[r + 1]):
+            for c in range(grad_logits.shape[1]):
+                grad_raw[3 + c, i] = grad_logits[r, c] * weights[i]
+            if not target.shape[0]:
+                grad_raw[:3, i] = 0.0
+                continue
+            nx, ny, nz, length, least = _unit(raw[0, i], raw[1, i], raw[2, i])
+            ex, ey, ez = nx - target[i, 0], ny - target[i, 1], nz - target[i, 2]
+            # A direction moves across itself alone.
+            along = nx * ex + ny * ey + nz * ez if length > least else np.float32(0.0)
+            pull = np.float32(2.0) * grad_apart[r] * weights[i] / length
+            grad_raw[0, i] = pull * (ex - along * nx)
+            grad_raw[1, i] = pull * (ey - along * ny)
+            grad_raw[2, i] = pull * (ez - along * nz)
 
 
 @njit(cache=True, parallel=True)
@@ -444,31 +509,23 @@ def distortion_backward(weights, s, ds, offsets, grad_out, grad_w):
 def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correction1, correction2):
     """One Adam step over flat arrays that leaves entries without gradient untouched.
 
-    Groups without any are passed over; in the others all entries are computed, without a branch,
-    which vectorises, and those without gradient keep what they had.
+    Lanes without any are passed over; in the others all are computed, and those without gradient
+    keep what they had.
     """
-    n = parameter.shape[0]
-    zero, one = np.float32(0.0), np.float32(1.0)
-    grow1, grow2 = one / correction1, one / correction2
+    n, one = parameter.shape[0], np.float32(1.0)
+    rates = (one - beta1, beta1, one - beta2, beta2, rate / correction1, one / correction2, epsilon)
     for block in prange((n + 4095) // 4096):
-        for start in range(block * 4096, min(n, block * 4096 + 4096), GROUP):
-            stop = min(n, start + GROUP)
-            g = gradient[start:stop]
-            some = zero
-            for i in range(g.shape[0]):
-                some += abs(g[i])
-            if some == zero:
-                continue
-            p, m, v = parameter[start:stop], first[start:stop], second[start:stop]
-            for i in range(g.shape[0]):
-                mean = beta1 * m[i] + (one - beta1) * g[i]
-                square = beta2 * v[i] + (one - beta2) * g[i] * g[i]
-                step = rate * (mean * grow1) / (np.sqrt(square * grow2) + epsilon)
-                given = g[i] != zero
-                m[i] = mean if given else m[i]
-                v[i] = square if given else v[i]
-                p[i] -= step if given else zero
-                g[i] = zero
+        end = min(n, block * 4096 + 4096)
+        whole = end // LANES * LANES
+        for place in range(block * 4096, whole, LANES):
+            lanes.adam(parameter, gradient, first, second, place, rates)
+        for i in range(max(whole, block * 4096), end):
+            g = gradient[i]
+            if g != 0:
+                first[i] = beta1 * first[i] + rates[0] * g
+                second[i] = beta2 * second[i] + rates[2] * g * g
+                parameter[i] -= rates[4] * first[i] / (np.sqrt(second[i] * rates[5]) + epsilon)
+                gradient[i] = 0
 
 
 @njit(cache=True, parallel=True)

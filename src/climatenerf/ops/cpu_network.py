@@ -1,9 +1,12 @@
-"""CPU kernels in Numba: networks with one hidden layer, forward and backward.
+"""CPU kernels in Numba: small networks, forward and backward.
 
 Their twin is `reference.mlp`. Features come in rows, [features, n] as the encoding leaves them, so
 that vectors run over samples, whatever the layers' widths are. A block of samples and its hidden
-layer stay in the first- and second-level cache, and the backward pass computes the hidden layer
-again rather than keep it.
+layers stay in the first- and second-level cache, and the backward pass computes these again rather
+than keep them.
+
+All layers of a network lie in one row of numbers: of each its weights, [outputs, inputs] or turned
+[inputs, outputs], and its biases. `widths` are the inputs and then each layer's outputs.
 """
 
 import numpy as np
@@ -12,7 +15,7 @@ from numba import njit, prange
 from climatenerf.ops import lanes
 from climatenerf.ops.lanes import LANES
 
-LANES_DIGEST = "867c92b329b6"  # of `lanes.py`, which says why
+LANES_DIGEST = "d31ec889e448"  # of `lanes.py`, which says why
 
 BLOCK = 128  # samples at a time, some whole lanes: 64 hidden rows of them are 32 kB
 CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients over
@@ -28,106 +31,146 @@ def _take(rows, start, size, out):
 
 
 @njit(cache=True, fastmath=True)
-def _hidden(x, shared, row, w1, b1, start, size, hidden):
-    """The first layer after its ReLU of a block x [inputs, BLOCK] → first rows of hidden."""
-    units = w1.shape[0]
-    for m in range(units):
-        hidden[m] = b1[m]  # behind the block's end, too: what is there meets zeros
-    if shared.shape[0]:
-        # Samples of a ray lie side by side: each run of them is filled at once.
-        begin = start
-        while begin < start + size:
-            end = begin + 1
-            while end < start + size and row[end] == row[begin]:
-                end += 1
-            own = shared[row[begin]]
-            for m in range(units):
-                hidden[m, begin - start : end - start] = b1[m] + own[m]
-            begin = end
-    lanes.add_product(w1, x, hidden, (size + LANES - 1) // LANES)
-    for m in range(units):
-        line = hidden[m]
-        for s in range(BLOCK):
-            line[s] = max(line[s], np.float32(0.0))
+def _rows_of(row, start, size, which):
+    """The shared rows of a block's samples, the last one's to the lanes' end → which [BLOCK]."""
+    for s in range(size):
+        which[s] = row[start + s]
+    which[size : (size + LANES - 1) // LANES * LANES] = row[start + size - 1]
+
+
+@njit(cache=True, fastmath=True)
+def _layer(weights, widths, layer, start):
+    """A layer's weights [outputs, inputs] and biases, which begin at `start`; where it ends."""
+    inputs, outputs = widths[layer], widths[layer + 1]
+    middle = start + outputs * inputs
+    return (
+        weights[start:middle].reshape(outputs, inputs),
+        weights[middle : middle + outputs],
+        middle + outputs,
+    )
+
+
+@njit(cache=True, fastmath=True)
+def _hidden_layers(rows, shared, which, weights, widths, size):
+    """All hidden layers of a block of samples after their ReLU, one after the other.
+
+    rows [inputs + 1 + hidden layers with a row of ones behind each, BLOCK] begin with the samples'
+    features; shared [rays, hidden] is added to the first layer by `which` [BLOCK], or is empty.
+    Returns where the last of them begins, and where the output layer's weights do.
+    """
+    count = (size + LANES - 1) // LANES
+    first, start = 0, 0
+    for layer in range(widths.shape[0] - 2):
+        w, b, start = _layer(weights, widths, layer, start)
+        below = rows[first : first + widths[layer]]
+        first += widths[layer] + 1
+        units = widths[layer + 1]
+        own = rows[first : first + units]
+        for m in range(units):
+            own[m] = b[m]  # behind the block's end, too: what is there meets zeros
+        if layer == 0 and shared.shape[0]:
+            whole = units // LANES * LANES
+            for point in range(0, size, LANES):
+                for unit in range(0, whole, LANES):
+                    lanes.add_shared(own, shared, which, unit, point)
+            for m in range(whole, units):
+                for s in range(size):
+                    own[m, s] += shared[which[s], m]
+        lanes.add_product(w, below, own, count)
+        for m in range(units):
+            line = own[m]
+            for s in range(BLOCK):
+                line[s] = max(line[s], np.float32(0.0))
+    return first, start
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def network_forward(x, shared, row, w1, b1, w2, b2, out):
-    """One hidden layer with ReLU: → out [outputs, n].
+def network_forward(x, shared, row, weights, widths, out):
+    """Layers with a ReLU between them: → out [outputs, n].
 
-    Args: x [inputs, n]; w1 [hidden, inputs], w2 [outputs, hidden]: transposed, so that a unit's
-    weights lie side by side; shared [rays, hidden] is added to the first layer by row [n], or is
-    empty.
+    Args: x [inputs, n]; weights [numbers], a unit's side by side, and widths [layers + 1]: see
+    above; shared [rays, hidden] is added to the first layer by row [n], or is empty.
     """
-    n = x.shape[1]
+    n, last = x.shape[1], widths.shape[0] - 2
     for chunk in prange((n + CHUNK - 1) // CHUNK):
-        given = np.empty((x.shape[0], BLOCK), np.float32)
-        hidden = np.empty((w1.shape[0], BLOCK), np.float32)
-        own = np.empty((w2.shape[0], BLOCK), np.float32)
+        rows = np.ones((widths[:-1].sum() + widths.shape[0] - 1, BLOCK), np.float32)
+        own = np.empty((widths[-1], BLOCK), np.float32)
+        which = np.zeros(BLOCK, np.int64)
         for start in range(chunk * CHUNK, min(n, chunk * CHUNK + CHUNK), BLOCK):
             size = min(BLOCK, n - start)
-            _take(x, start, size, given)
-            _hidden(given, shared, row, w1, b1, start, size, hidden)
+            _take(x, start, size, rows)
+            if shared.shape[0]:
+                _rows_of(row, start, size, which)
+            first, at = _hidden_layers(rows, shared, which, weights, widths, size)
+            w, b, _ = _layer(weights, widths, last, at)
             for o in range(own.shape[0]):
-                own[o] = b2[o]
-            lanes.add_product(w2, hidden, own, (size + LANES - 1) // LANES)
+                own[o] = b[o]
+            hidden = rows[first : first + widths[last]]
+            lanes.add_product(w, hidden, own, (size + LANES - 1) // LANES)
             out[:, start : start + size] = own[:, :size]
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def network_backward(given, weights, turned, grad, borders, gradients):
+def network_backward(given, weights, turned, widths, grad, borders, gradients):
     """Gradients of `network_forward`.
 
-    Args: given = (x, shared, row) and weights = (w1, b1, w2) as there; turned = the same weights
-    the other way round, (w1 [inputs, hidden], w2 [hidden, outputs]); grad [outputs, n];
+    Args: given = (x, shared, row), weights and widths as there; turned: the same weights the other
+    way round, a layer's [inputs, outputs] and its biases; grad [outputs, n];
     borders [chunks + 1] of chunks of samples that share no ray with another.
     → gradients = (grad_x [inputs, n] or of no rows, grad_shared [rays, hidden] or of no rows, which
-    is added to, sums1 [chunks, hidden, inputs + 1], sums2 [chunks, outputs, hidden + 1]): sums of
-    the weights', with the bias in the last column.
+    is added to, sums [chunks, numbers]: of each layer [outputs, inputs + 1], with the bias in the
+    last column).
     """
     x, shared, row = given
-    w1, b1, w2 = weights
-    w1_in, w2_in = turned
-    grad_x, grad_shared, sums1, sums2 = gradients
-    units, inputs = w1.shape
+    grad_x, grad_shared, sums = gradients
+    layers = widths.shape[0] - 1
     for chunk in prange(borders.shape[0] - 1):
-        # The last rows are of ones: by them the biases' sums come with the weights'.
-        own_x, hidden = (
-            np.ones((inputs + 1, BLOCK), np.float32),
-            np.ones((units + 1, BLOCK), np.float32),
-        )
-        own_grad = np.empty((grad.shape[0], BLOCK), np.float32)
-        back, to_x = np.empty((units, BLOCK), np.float32), np.empty((inputs, BLOCK), np.float32)
+        # Behind each layer's rows is one of ones: by it the biases' sums come with the weights'.
+        rows = np.ones((widths[:-1].sum() + layers, BLOCK), np.float32)
+        above = np.empty((widths.max(), BLOCK), np.float32)
+        below = np.empty((widths.max(), BLOCK), np.float32)
+        which = np.zeros(BLOCK, np.int64)
         for start in range(borders[chunk], borders[chunk + 1], BLOCK):
             size = min(BLOCK, borders[chunk + 1] - start)
             count = (size + LANES - 1) // LANES
-            _take(x, start, size, own_x)
-            _take(grad, start, size, own_grad)
-            _hidden(own_x, shared, row, w1, b1, start, size, hidden)
-            lanes.add_outer(own_grad, hidden, sums2[chunk], count)
-            back[:] = 0.0
-            lanes.add_product(w2_in, own_grad, back, count)
-            for m in range(units):
-                line, lit = back[m], hidden[m]
-                for s in range(BLOCK):
-                    line[s] = line[s] if lit[s] > 0 else np.float32(0.0)
-            lanes.add_outer(back, own_x, sums1[chunk], count)
+            _take(x, start, size, rows)
+            _take(grad, start, size, above)
+            if shared.shape[0]:
+                _rows_of(row, start, size, which)
+            first, at = _hidden_layers(rows, shared, which, weights, widths, size)
+            for layer in range(layers - 1, -1, -1):
+                inputs, outputs = widths[layer], widths[layer + 1]
+                total = outputs * (inputs + 1)  # numbers, with the biases
+                own = sums[chunk, at : at + total].reshape(outputs, inputs + 1)
+                lanes.add_outer(above[:outputs], rows[first : first + inputs + 1], own, count)
+                if layer or grad_x.shape[0]:
+                    w = turned[at : at + inputs * outputs].reshape(inputs, outputs)
+                    below[:inputs] = 0.0
+                    lanes.add_product(w, above[:outputs], below, count)
+                if layer:
+                    for m in range(inputs):
+                        line, lit = below[m], rows[first + m]
+                        for s in range(BLOCK):
+                            line[s] = line[s] if lit[s] > 0 else np.float32(0.0)
+                    above, below = below, above
+                    first -= widths[layer - 1] + 1
+                    at -= inputs * (widths[layer - 1] + 1)
+                if layer == 1 and grad_shared.shape[0]:
+                    _add_to_shared(above, which, inputs, size, grad_shared)
             if grad_x.shape[0]:
-                to_x[:] = 0.0
-                lanes.add_product(w1_in, back, to_x, count)
-                grad_x[:, start : start + size] = to_x[:, :size]
-            if grad_shared.shape[0]:
-                begin = start
-                while begin < start + size:
-                    end = begin + 1
-                    while end < start + size and row[end] == row[begin]:
-                        end += 1
-                    for m in range(units):
-                        total = np.float32(0.0)
-                        for s in range(begin - start, end - start):
-                            total += back[m, s]
-                        grad_shared[row[begin], m] += total
-                    begin = end
+                grad_x[:, start : start + size] = below[: widths[0], :size]
+
+
+@njit(cache=True, fastmath=True)
+def _add_to_shared(grad, which, units, size, out):
+    """Adds the first layer's gradient [units, BLOCK] to what samples share, out [rays, units]."""
+    whole = units // LANES * LANES
+    for point in range(0, size, LANES):
+        for unit in range(0, whole, LANES):
+            lanes.add_to_shared(grad, out, which, unit, point)
+    for m in range(whole, units):
+        for s in range(size):
+            out[which[s], m] += grad[m, s]
 
 
 def chunk_borders(row: np.ndarray, n: int) -> np.ndarray:

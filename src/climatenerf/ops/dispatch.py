@@ -5,6 +5,7 @@ Triton on an NVIDIA GPU (`gpu.py`, the same functions); all others go to the ref
 slow and always right.
 """
 
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -14,6 +15,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.ops import cpu, cpu_network, reference
+from climatenerf.ops.vectors import unit
 
 
 def _kernels(*tensors: Tensor) -> ModuleType | None:
@@ -113,10 +115,13 @@ def render_weights(
 
 
 class _Accumulate(torch.autograd.Function):
+    """On a CPU values lie in rows, as networks leave them, elsewhere side by side."""
+
     @staticmethod
     def forward(ctx, weights, values, offsets, kernels):
         out = values.new_empty(offsets.shape[0] - 1, values.shape[1])
-        kernels.accumulate_forward(_array(weights), _array(values), _array(offsets), _array(out))
+        given = values.T if kernels is cpu else values
+        kernels.accumulate_forward(_array(weights), _array(given), _array(offsets), _array(out))
         ctx.kernels = kernels
         ctx.save_for_backward(weights, values, offsets)
         return out
@@ -124,11 +129,12 @@ class _Accumulate(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         weights, values, offsets = ctx.saved_tensors
-        grad_w, grad_v = torch.empty_like(weights), values.new_empty(values.shape)
+        given = values.T if ctx.kernels is cpu else values
+        grad_w, grad_v = torch.empty_like(weights), values.new_empty(given.shape)
         ctx.kernels.accumulate_backward(
-            *map(_array, (weights, values, offsets, grad, grad_w, grad_v))
+            *map(_array, (weights, given, offsets, grad, grad_w, grad_v))
         )
-        return grad_w, grad_v, None, None
+        return grad_w, grad_v.T if ctx.kernels is cpu else grad_v, None, None
 
 
 def accumulate(
@@ -138,6 +144,42 @@ def accumulate(
     if kernels := _kernels(weights, values, offsets):
         return _Accumulate.apply(weights.contiguous(), values, offsets, kernels)
     return reference.accumulate(weights, values, offsets)
+
+
+class _Surface(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, weights, raw, target, offsets):
+        n = offsets.shape[0] - 1
+        logits, apart = raw.new_empty(n, raw.shape[1] - 3), raw.new_empty(n)
+        cpu.surface_forward(*map(_array, (weights, raw.T, target, offsets, logits, apart)))
+        ctx.save_for_backward(weights, raw, target, offsets)
+        return logits, apart
+
+    @staticmethod
+    def backward(ctx, grad_logits, grad_apart):
+        weights, raw, target, offsets = ctx.saved_tensors
+        grad = raw.new_empty(raw.shape[1], raw.shape[0])
+        given = (weights, raw.T, target, offsets, grad_logits, grad_apart, grad)
+        cpu.surface_backward(*map(_array, given))
+        return None, grad.T, None, None
+
+
+def surface(
+    weights: Float[Tensor, "s"],
+    raw: Float[Tensor, "s 3+c"],
+    target: Float[Tensor, "s 3"] | None,
+    offsets: Int[Tensor, "rays+1"],
+) -> tuple[Float[Tensor, "rays c"], Float[Tensor, "rays"]]:
+    """See `reference.surface`; gradients to raw only."""
+    goal = raw.new_empty(0, 3) if target is None else target
+    if _kernels(weights, raw, goal, offsets) is cpu:
+        return _Surface.apply(weights.detach(), raw, goal.detach(), offsets)
+    weights = weights.detach()
+    logits = accumulate(weights, raw[:, 3:], offsets)
+    if target is None:
+        return logits, torch.zeros_like(logits[:, 0])
+    off = (unit(raw[:, :3], 1e-6) - target.detach()).square().sum(-1, keepdim=True)
+    return logits, accumulate(weights, off, offsets)[:, 0]
 
 
 class _Distortion(torch.autograd.Function):
@@ -170,54 +212,58 @@ def distortion(
 
 
 class _Network(torch.autograd.Function):
-    """One hidden layer. Keeps none of it: the backward pass computes it again, block by block."""
+    """Keeps no hidden layer: the backward pass computes them again, block by block."""
 
     @staticmethod
-    def forward(ctx, x, shared, row, w1, b1, w2, b2):
-        common = x.new_empty(0, w1.shape[1]) if shared is None else shared
+    def forward(ctx, x, shared, row, *layers):
+        weights, widths = layers[::2], np.array([x.shape[1], *(b.shape[0] for b in layers[1::2])])
+        common = x.new_empty(0, widths[1]) if shared is None else shared
         rows = x.new_empty(0, dtype=torch.long) if row is None else row
-        out = x.new_empty(w2.shape[1], x.shape[0])
+        packed = _in_one_row([w.T for w in weights], layers[1::2])
+        out = x.new_empty(widths[-1], x.shape[0])
         cpu_network.network_forward(
-            _array(x.T),
-            _array(common),
-            _array(rows),
-            _array(w1.T),
-            _array(b1),
-            _array(w2.T),
-            _array(b2),
-            _array(out),
+            _array(x.T), _array(common), _array(rows), packed, widths, _array(out)
         )
-        ctx.save_for_backward(x, common, rows, w1, b1, w2)
+        ctx.save_for_backward(x, common, rows, *layers)
+        ctx.given = packed, widths
         return out.T
 
     @staticmethod
     def backward(ctx, grad):
-        x, common, rows, w1, b1, w2 = ctx.saved_tensors
-        inputs, hidden = w1.shape
+        x, common, rows, *layers = ctx.saved_tensors
+        packed, widths = ctx.given
+        turned = _in_one_row(layers[::2], layers[1::2])
         borders = cpu_network.chunk_borders(_array(rows), x.shape[0])
-        chunks = borders.shape[0] - 1
-        sums1 = x.new_zeros(chunks, hidden, inputs + 1)
-        sums2 = x.new_zeros(chunks, w2.shape[1], hidden + 1)
-        grad_x = x.new_empty(inputs if ctx.needs_input_grad[0] else 0, x.shape[0])
+        sums = x.new_zeros(borders.shape[0] - 1, packed.shape[0])
+        grad_x = x.new_empty(widths[0] if ctx.needs_input_grad[0] else 0, x.shape[0])
         grad_shared = torch.zeros_like(common if ctx.needs_input_grad[1] else common[:0])
         cpu_network.network_backward(
             (_array(x.T), _array(common), _array(rows)),
-            (_array(w1.T), _array(b1), _array(w2.T)),
-            (_array(w1), _array(w2)),
+            packed,
+            turned,
+            widths,
             _array(grad.T),
             borders,
-            (_array(grad_x), _array(grad_shared), _array(sums1), _array(sums2)),
+            (_array(grad_x), _array(grad_shared), _array(sums)),
         )
-        first, second = sums1.sum(0), sums2.sum(0)
+        of_layers, start, total = [], 0, sums.sum(0)
+        for inputs, outputs in zip(widths[:-1].tolist(), widths[1:].tolist(), strict=True):
+            end = start + outputs * (inputs + 1)
+            own = total[start:end].view(outputs, inputs + 1)
+            of_layers += [own[:, :-1].T, own[:, -1]]
+            start = end
         return (
             grad_x.T if ctx.needs_input_grad[0] else None,
             grad_shared if ctx.needs_input_grad[1] else None,
             None,
-            first[:, :-1].T,
-            first[:, -1],
-            second[:, :-1].T,
-            second[:, -1],
+            *of_layers,
         )
+
+
+def _in_one_row(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> np.ndarray:
+    """Layers as `cpu_network` takes them."""
+    pairs = zip(weights, biases, strict=True)
+    return np.concatenate([_array(each).reshape(-1) for pair in pairs for each in pair])
 
 
 def mlp(
@@ -226,10 +272,10 @@ def mlp(
     shared: Float[Tensor, "m h"] | None = None,
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
-    """See `reference.mlp`, which deeper networks than those of one hidden layer go to."""
+    """See `reference.mlp`, which is it but on a CPU."""
     given = [x, *(each for pair in layers for each in pair), *([] if shared is None else [shared])]
-    if _kernels(*given) is cpu and len(layers) == 2:  # a GPU's own matrix products are fast
-        return _Network.apply(x, shared, row, *layers[0], *layers[1])
+    if _kernels(*given) is cpu and len(layers) > 1:  # a GPU's own matrix products are fast
+        return _Network.apply(x, shared, row, *(each for pair in layers for each in pair))
     return reference.mlp(x, layers, shared, row)
 
 
@@ -415,7 +461,7 @@ def march(
     rays: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
     spans: Float[Tensor, "n 3"],
     cells: Cells,
-    steps: tuple[float, float],
+    steps: tuple[float, float, float],
     stop: float,
     net: Net,
 ) -> tuple[Int[Tensor, "n+1"], Float[Tensor, "3 s"]]:
@@ -425,7 +471,7 @@ def march(
         rays: origins and unit directions, grid units.
         spans: first and last length of each ray, share of the first step that it begins after.
         cells: which are occupied, by `cells_of`.
-        steps: the smallest step and the step per length.
+        steps: the smallest one, the step per length, the optical depth below which one is empty.
         stop: transmittance at which a ray ends.
         net: of the density.
 
@@ -460,7 +506,7 @@ def composite(
     rays: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
     spans: Float[Tensor, "n 3"],
     cells: Cells,
-    steps: tuple[float, float],
+    steps: tuple[float, float, float],
     limits: tuple[float, float],
     net: Net,
     colours: tuple[Net, Float[Tensor, "n h"]],

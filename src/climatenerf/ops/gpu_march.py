@@ -21,7 +21,6 @@ SAMPLES = 64  # of a tile of densities
 RAYS = 16  # that march together
 WARPS = 2  # they are marched by
 TRIES = tl.constexpr(4)  # empty cells that a ray crosses while others compute densities
-LEAST_TAU = tl.constexpr(1e-3)  # samples thinner than this are left out
 FOREVER = tl.constexpr(1e30)
 
 
@@ -163,7 +162,7 @@ def _march(
         if tl.max(found, 0) > 0:
             dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
             sigma = density_of(qx, qy, qz, here, encoding, layers, SIZES)
-            thick = here & (sigma * dt > LEAST_TAU)
+            thick = here & (sigma * dt > steps[2])
             # By step, then by ray: neighbouring threads write side by side.
             at = rows + k * n + r
             tl.store(at, tm, mask=thick)
@@ -181,7 +180,7 @@ def march(
     rays_d: Tensor,
     spans: Tensor,
     cells: tuple[Tensor, Tensor],
-    steps: tuple[float, float],
+    steps: tuple[float, float, float],
     stop: float,
     net: tuple[Tensor, ...],
     rows: Tensor,
@@ -190,8 +189,9 @@ def march(
     """Marches rays front to back through occupied space, evaluating density on the way.
 
     Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
-    cells = (occupied [K,G,G,G], the same for blocks); steps = (smallest step, step per length);
-    stop = transmittance at which a ray ends; net = (table, resolutions, w1, b1, w2, b2).
+    cells = (occupied [K,G,G,G], the same for blocks); steps = (smallest step, step per length,
+    optical depth below which one counts as empty); stop = transmittance at which a ray ends;
+    net = (table, resolutions, w1, b1, w2, b2).
     rows [3, capacity, n or more] receive t, dt and sigma, counts [n] how many.
     """
     table, resolutions, *layers = net

@@ -26,7 +26,6 @@ from climatenerf.ops.gpu_encoding import (
     unit_cube,
 )
 from climatenerf.ops.gpu_march import (
-    LEAST_TAU,
     RAYS,
     WARPS,
     begin,
@@ -89,7 +88,7 @@ def _composite(
         if tl.max(found, 0) > 0:
             dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
             own = density_of(qx, qy, qz, here, density[0], layers, SIZES) * dt
-            own = tl.where(here & (own > LEAST_TAU), own, 0.0)
+            own = tl.where(here & (own > steps[2]), own, 0.0)
             weight = weight_of(tau, own)
             tau += own
             far += weight * tm
@@ -111,7 +110,7 @@ def composite(
     rays: tuple[Tensor, Tensor],
     spans: Tensor,
     cells: tuple[Tensor, Tensor],
-    steps: tuple[float, float],
+    steps: tuple[float, float, float],
     limits: tuple[float, float],
     net: tuple[Tensor, ...],
     colours: tuple[Tensor, ...],

@@ -1,4 +1,4 @@
-"""Hash lookups, matrix products and sums of metaballs, `LANES` at once, in vector registers.
+"""Hash lookups, matrix products and the optimiser's steps, `LANES` at once, in vector registers.
 
 Numba's compiler does not make vectors of loops that read a table at computed places, and makes
 short ones of products. So these few steps are spelled out in LLVM's vector instructions, which it
@@ -15,7 +15,7 @@ with kernels that use it carry its digest, which a test compares: a change here 
 
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -25,84 +25,84 @@ PRIME_Y = 2654435761
 PRIME_Z = 805459861
 UNITS, VECTORS = 4, 2  # rows and vectors of a product that are held in registers
 
-_F, _I, _L = ir.FloatType(), ir.IntType(32), ir.IntType(64)
-_FLOATS, _INTS, _LONGS = (ir.VectorType(kind, LANES) for kind in (_F, _I, _L))
-_WHERE = ir.VectorType(ir.PointerType(), LANES)
-_FAST = ("fast",)  # sums may be reordered and products fused, as in the other kernels
+F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+FLOATS, INTS, LONGS = (ir.VectorType(kind, LANES) for kind in (F32, I32, I64))
+FAST = ("fast",)  # sums may be reordered and products fused, as in the other kernels
 
 
-def _arrays(context: Any, b: Any, signature: Any, arguments: Any, which: tuple) -> list[Any]:
+def arrays_of(context: Any, b: Any, signature: Any, arguments: Any, which: tuple) -> list[Any]:
+    """The arrays among an intrinsic's arguments: their data, shapes and strides."""
     return [context.make_array(signature.args[i])(context, b, arguments[i]) for i in which]
 
 
-def _sides(b: Any, array: Any) -> list[Any]:
+def sides_of(b: Any, array: Any) -> list[Any]:
+    """An array's shape."""
     return cgutils.unpack_tuple(b, array.shape)
 
 
-def _all(b: Any, scalar: Any) -> Any:
+def everywhere(b: Any, scalar: Any) -> Any:
     """A vector with the scalar in every lane."""
     kind = ir.VectorType(scalar.type, LANES)
     nothing = ir.Constant(kind, ir.Undefined)
-    first = b.insert_element(nothing, scalar, _I(0))
-    return b.shuffle_vector(first, nothing, ir.Constant(_INTS, [0] * LANES))
+    first = b.insert_element(nothing, scalar, I32(0))
+    return b.shuffle_vector(first, nothing, ir.Constant(INTS, [0] * LANES))
 
 
-def _same(kind: ir.VectorType, value: float) -> Any:
+def constant(kind: ir.VectorType, value: float) -> Any:
+    """A vector of one number."""
     return ir.Constant(kind, [value] * LANES)
 
 
-def _at(b: Any, data: Any, place: Any) -> Any:
+def lanes_at(b: Any, data: Any, place: Any) -> Any:
     """Address of the lanes that begin at a place of an array."""
-    return b.bitcast(b.gep(data, [place]), _FLOATS.as_pointer())
+    return b.bitcast(b.gep(data, [place]), FLOATS.as_pointer())
 
 
-def _multiply_add(b: Any, x: Any, y: Any, z: Any) -> Any:
-    return b.fadd(b.fmul(x, y, flags=_FAST), z, flags=_FAST)
+def multiply_add(b: Any, x: Any, y: Any, z: Any) -> Any:
+    """X times y, plus z."""
+    return b.fadd(b.fmul(x, y, flags=FAST), z, flags=FAST)
 
 
 # --- lookups -------------------------------------------------------------------------------------
 
 
 def _pairs(b: Any, table: Any, index: Any) -> tuple[Any, Any]:
-    """Both features of some rows of a table [rows, 2]: read as one number of 64 bits each."""
-    yes = ir.VectorType(ir.IntType(1), LANES)
-    start = _all(b, b.ptrtoint(table, _L))
-    places = b.inttoptr(b.add(start, b.shl(b.zext(index, _LONGS), _same(_LONGS, 3))), _WHERE)
-    given = {_WHERE: places, yes: _same(yes, 1), _LONGS: ir.Constant(_LONGS, ir.Undefined)}
-    if binding.llvm_version_info[0] < 22:  # there the alignment is an argument
-        given = {_WHERE: places, _I: _I(4), **given}
-    gather = cgutils.get_or_insert_function(
-        b.module,
-        ir.FunctionType(_LONGS, list(given)),
-        f"llvm.masked.gather.v{LANES}i64.v{LANES}p0",
-    )
-    both = b.call(gather, list(given.values()))
-    low, high = b.trunc(both, _INTS), b.trunc(b.lshr(both, _same(_LONGS, 32)), _INTS)
-    return b.bitcast(low, _FLOATS), b.bitcast(high, _FLOATS)
+    """Both features of some rows of a table [rows, 2]: read as one number of 64 bits each.
+
+    One after the other: a processor's own gathering of them took up to a quarter longer.
+    """
+    start = everywhere(b, b.ptrtoint(table, I64))
+    places = b.add(start, b.shl(b.zext(index, LONGS), constant(LONGS, 3)))
+    both = ir.Constant(LONGS, ir.Undefined)
+    for lane in range(LANES):
+        place = b.inttoptr(b.extract_element(places, I32(lane)), I64.as_pointer())
+        both = b.insert_element(both, b.load(place, align=4), I32(lane))
+    low, high = b.trunc(both, INTS), b.trunc(b.lshr(both, constant(LONGS, 32)), INTS)
+    return b.bitcast(low, FLOATS), b.bitcast(high, FLOATS)
 
 
 class _Cells:
     """The lattice cells of one level in which points lie: code that computes them."""
 
     def __init__(self, b: Any, places: Any, table: Any, level: Any, resolution: Any, hashed: bool):
-        size = _sides(b, table)[1]
-        self.rows = b.gep(table.data, [b.mul(b.mul(level, size), _L(2))])
-        side = b.add(b.trunc(resolution, _I), _I(1))
-        self.scale = _all(b, b.sitofp(resolution, _F))
+        size = sides_of(b, table)[1]
+        self.rows = b.gep(table.data, [b.mul(b.mul(level, size), I64(2))])
+        side = b.add(b.trunc(resolution, I32), I32(1))
+        self.scale = everywhere(b, b.sitofp(resolution, F32))
         low, inside = [], []
         for axis in range(3):
-            p = b.load(_at(b, places.data, _L(axis * LANES)), align=4)
-            p = b.fmul(p, self.scale, flags=_FAST)
-            low.append(b.fptosi(p, _INTS))
-            inside.append(b.fsub(p, b.sitofp(low[-1], _FLOATS), flags=_FAST))
+            p = b.load(lanes_at(b, places.data, I64(axis * LANES)), align=4)
+            p = b.fmul(p, self.scale, flags=FAST)
+            low.append(b.fptosi(p, INTS))
+            inside.append(b.fsub(p, b.sitofp(low[-1], FLOATS), flags=FAST))
         if hashed:
-            strides = [_same(_INTS, 1), _same(_INTS, PRIME_Y), _same(_INTS, PRIME_Z)]
+            strides = [constant(INTS, 1), constant(INTS, PRIME_Y), constant(INTS, PRIME_Z)]
         else:
-            strides = [_same(_INTS, 1), _all(b, side), _all(b, b.mul(side, side))]
+            strides = [constant(INTS, 1), everywhere(b, side), everywhere(b, b.mul(side, side))]
         starts = [b.mul(p, stride) for p, stride in zip(low, strides, strict=True)]
         self.index = [(s, b.add(s, stride)) for s, stride in zip(starts, strides, strict=True)]
-        self.weight = [(b.fsub(_same(_FLOATS, 1.0), f, flags=_FAST), f) for f in inside]
-        self.last = _all(b, b.sub(b.trunc(size, _I), _I(1)))
+        self.weight = [(b.fsub(constant(FLOATS, 1.0), f, flags=FAST), f) for f in inside]
+        self.last = everywhere(b, b.sub(b.trunc(size, I32), I32(1)))
         self.combine = b.xor if hashed else b.add
         self.hashed = hashed
 
@@ -130,32 +130,32 @@ def _lookup(hashed: bool, sloped: bool) -> Any:
         kinds = (places, table, types.int64, types.int64, out, types.int64, types.int64)
 
         def generate(context, b, signature, arguments):
-            at, tables, result = _arrays(context, b, signature, arguments, (0, 1, 4))
+            at, tables, result = arrays_of(context, b, signature, arguments, (0, 1, 4))
             level, resolution, row, slopes = (arguments[i] for i in (2, 3, 5, 6))
             cells = _Cells(b, at, tables, level, resolution, hashed)
             # The slope of the weight along an axis: of the far corner's, and against it.
             change = b.fneg(cells.scale), cells.scale
-            totals = [_same(_FLOATS, 0.0)] * (8 if sloped else 2)
+            totals = [constant(FLOATS, 0.0)] * (8 if sloped else 2)
             for x, y, z in CORNERS:
                 pair = _pairs(b, cells.rows, cells.row(b, x, y, z))
                 own = [cells.weight[0][x], cells.weight[1][y], cells.weight[2][z]]
-                yz = b.fmul(own[1], own[2], flags=_FAST)
-                shares = [b.fmul(yz, own[0], flags=_FAST)]
+                yz = b.fmul(own[1], own[2], flags=FAST)
+                shares = [b.fmul(yz, own[0], flags=FAST)]
                 if sloped:
-                    xz = b.fmul(own[0], own[2], flags=_FAST)
-                    xy = b.fmul(own[0], own[1], flags=_FAST)
+                    xz = b.fmul(own[0], own[2], flags=FAST)
+                    xy = b.fmul(own[0], own[1], flags=FAST)
                     for rest, far in ((yz, x), (xz, y), (xy, z)):
-                        shares.append(b.fmul(rest, change[far], flags=_FAST))
+                        shares.append(b.fmul(rest, change[far], flags=FAST))
                 products = [(shares[0], f) for f in pair]
                 products += [(share, f) for f in pair for share in shares[1:]]
                 totals = [
-                    _multiply_add(b, share, f, total)
+                    multiply_add(b, share, f, total)
                     for (share, f), total in zip(products, totals, strict=True)
                 ]
             for k, total in enumerate(totals):
-                at_row = b.add(row, _L(k)) if k < 2 else b.add(slopes, _L(k - 2))
-                place = b.mul(at_row, _L(LANES))
-                b.store(total, _at(b, result.data, place), align=4)
+                at_row = b.add(row, I64(k)) if k < 2 else b.add(slopes, I64(k - 2))
+                place = b.mul(at_row, I64(LANES))
+                b.store(total, lanes_at(b, result.data, place), align=4)
             return context.get_dummy_value()
 
         return types.void(*kinds), generate
@@ -165,30 +165,30 @@ def _lookup(hashed: bool, sloped: bool) -> Any:
 
 def _spreading(hashed: bool) -> Any:
     """Generates what adds a gradient to the rows that a lookup has read."""
-    pair = ir.VectorType(_F, 2)
+    pair = ir.VectorType(F32, 2)
 
     @intrinsic
     def spread(typing_context, places, grad, table, level, resolution):
         def generate(context, b, signature, arguments):
-            at, given, tables = _arrays(context, b, signature, arguments, (0, 1, 2))
+            at, given, tables = arrays_of(context, b, signature, arguments, (0, 1, 2))
             cells = _Cells(b, at, tables, arguments[3], arguments[4], hashed)
-            ours = [b.load(_at(b, given.data, _L(k * LANES)), align=4) for k in (0, 1)]
+            ours = [b.load(lanes_at(b, given.data, I64(k * LANES)), align=4) for k in (0, 1)]
             # Lanes may share a row, so they add one after the other, from a list.
-            rows = cgutils.alloca_once(b, _INTS, size=8)
-            sums = cgutils.alloca_once(b, _FLOATS, size=16)
+            rows = cgutils.alloca_once(b, INTS, size=8)
+            sums = cgutils.alloca_once(b, FLOATS, size=16)
             for corner, (x, y, z) in enumerate(CORNERS):
-                yz = b.fmul(cells.weight[1][y], cells.weight[2][z], flags=_FAST)
-                share = b.fmul(yz, cells.weight[0][x], flags=_FAST)
-                first, second = (b.fmul(share, g, flags=_FAST) for g in ours)
-                b.store(cells.row(b, x, y, z), b.gep(rows, [_L(corner)]))
+                yz = b.fmul(cells.weight[1][y], cells.weight[2][z], flags=FAST)
+                share = b.fmul(yz, cells.weight[0][x], flags=FAST)
+                first, second = (b.fmul(share, g, flags=FAST) for g in ours)
+                b.store(cells.row(b, x, y, z), b.gep(rows, [I64(corner)]))
                 for half in (0, 1):
                     mixed = [i // 2 + i % 2 * LANES + half * LANES // 2 for i in range(LANES)]
-                    both = b.shuffle_vector(first, second, ir.Constant(_INTS, mixed))
-                    b.store(both, b.gep(sums, [_L(2 * corner + half)]))
-            rows, sums = b.bitcast(rows, _I.as_pointer()), b.bitcast(sums, pair.as_pointer())
-            with cgutils.for_range(b, _L(8 * LANES), intp=_L) as loop:
-                row = b.zext(b.load(b.gep(rows, [loop.index])), _L)
-                place = b.bitcast(b.gep(cells.rows, [b.shl(row, _L(1))]), pair.as_pointer())
+                    both = b.shuffle_vector(first, second, ir.Constant(INTS, mixed))
+                    b.store(both, b.gep(sums, [I64(2 * corner + half)]))
+            rows, sums = b.bitcast(rows, I32.as_pointer()), b.bitcast(sums, pair.as_pointer())
+            with cgutils.for_range(b, I64(8 * LANES), intp=I64) as loop:
+                row = b.zext(b.load(b.gep(rows, [loop.index])), I64)
+                place = b.bitcast(b.gep(cells.rows, [b.shl(row, I64(1))]), pair.as_pointer())
                 own = b.load(b.gep(sums, [loop.index]))
                 b.store(b.fadd(b.load(place, align=4), own), place, align=4)
             return context.get_dummy_value()
@@ -238,15 +238,16 @@ def spread(places, grad, table, level, resolution):
 
 def _blocks(b: Any, count: Any, sizes: tuple[int, ...]) -> Any:
     """Loops that go through 0..count in steps of the first size, then of the next, for the rest."""
-    start = _L(0)
+    start = I64(0)
     for size in sizes:
-        stop = b.mul(b.udiv(count, _L(size)), _L(size))
-        with cgutils.for_range_slice(b, start, stop, _L(size), intp=_L) as (index, _):
+        whole = b.mul(b.udiv(b.sub(count, start), I64(size)), I64(size))
+        stop = b.add(start, whole)
+        with cgutils.for_range_slice(b, start, stop, I64(size), intp=I64) as (index, _):
             yield index, size
         start = stop
 
 
-def _sums(b: Any, vectors: list[Any]) -> Any:
+def sums_of(b: Any, vectors: list[Any]) -> Any:
     """The sum of each of some vectors, 1, 2 or 4, as a short vector.
 
     Halves of two vectors are added side by side, so that all sums take little more than one.
@@ -264,12 +265,12 @@ def _sums(b: Any, vectors: list[Any]) -> Any:
 def _folded(b: Any, vectors: tuple, length: int, group: int) -> Any:
     """The first halves of all groups of lanes plus the second, of one or two vectors in a row."""
     first = [i for i in range(len(vectors) * length) if i % group < group // 2]
-    kind = ir.VectorType(_I, len(first))
+    kind = ir.VectorType(I32, len(first))
     halves = (
         b.shuffle_vector(vectors[0], vectors[-1], ir.Constant(kind, [i + shift for i in first]))
         for shift in (0, group // 2)
     )
-    return b.fadd(*halves, flags=_FAST)
+    return b.fadd(*halves, flags=FAST)
 
 
 def _add_product() -> Any:
@@ -281,31 +282,31 @@ def _add_product() -> Any:
     @intrinsic
     def add_product(typing_context, weight, rows, out, vectors):
         def generate(context, b, signature, arguments):
-            weight, rows, out = _arrays(context, b, signature, arguments, (0, 1, 2))
-            m, k = _sides(b, weight)
-            across, along = _sides(b, rows)[1], _sides(b, out)[1]
+            weight, rows, out = arrays_of(context, b, signature, arguments, (0, 1, 2))
+            m, k = sides_of(b, weight)
+            across, along = sides_of(b, rows)[1], sides_of(b, out)[1]
             for unit, units in _blocks(b, m, (UNITS, 1)):
                 for vector, several in _blocks(b, arguments[3], (VECTORS, 1)):
                     block = [(u, v) for u in range(units) for v in range(several)]
-                    place = b.mul(vector, _L(LANES))
+                    place = b.mul(vector, I64(LANES))
                     results, totals = {}, {}
                     for u, v in block:
-                        start = b.add(b.mul(b.add(unit, _L(u)), along), place)
-                        results[u, v] = _at(b, out.data, b.add(start, _L(v * LANES)))
-                        totals[u, v] = cgutils.alloca_once(b, _FLOATS)
+                        start = b.add(b.mul(b.add(unit, I64(u)), along), place)
+                        results[u, v] = lanes_at(b, out.data, b.add(start, I64(v * LANES)))
+                        totals[u, v] = cgutils.alloca_once(b, FLOATS)
                         b.store(b.load(results[u, v], align=4), totals[u, v])
-                    with cgutils.for_range(b, k, intp=_L) as loop:
+                    with cgutils.for_range(b, k, intp=I64) as loop:
                         start = b.add(b.mul(loop.index, across), place)
                         values = [
-                            b.load(_at(b, rows.data, b.add(start, _L(v * LANES))), align=4)
+                            b.load(lanes_at(b, rows.data, b.add(start, I64(v * LANES))), align=4)
                             for v in range(several)
                         ]
                         for u in range(units):
-                            at = b.add(b.mul(b.add(unit, _L(u)), k), loop.index)
-                            w = _all(b, b.load(b.gep(weight.data, [at])))
+                            at = b.add(b.mul(b.add(unit, I64(u)), k), loop.index)
+                            w = everywhere(b, b.load(b.gep(weight.data, [at])))
                             for v in range(several):
                                 total = b.load(totals[u, v])
-                                b.store(_multiply_add(b, w, values[v], total), totals[u, v])
+                                b.store(multiply_add(b, w, values[v], total), totals[u, v])
                     for each in block:
                         b.store(b.load(totals[each]), results[each], align=4)
             return context.get_dummy_value()
@@ -324,22 +325,24 @@ def _add_outer() -> Any:
     @intrinsic
     def add_outer(typing_context, left, right, out, vectors):
         def generate(context, b, signature, arguments):
-            left, right, out = _arrays(context, b, signature, arguments, (0, 1, 2))
-            (m, across), (n, along) = _sides(b, left), _sides(b, right)
-            width = _sides(b, out)[1]
-            for i, rows in _blocks(b, m, (UNITS, 1)):
+            left, right, out = arrays_of(context, b, signature, arguments, (0, 1, 2))
+            (m, across), (n, along) = sides_of(b, left), sides_of(b, right)
+            width = sides_of(b, out)[1]
+            for i, rows in _blocks(b, m, (UNITS, 3, 1)):
                 for j, columns in _blocks(b, n, (UNITS, 1)):
                     block = [(r, c) for r in range(rows) for c in range(columns)]
                     totals = {}
                     for each in block:
-                        totals[each] = cgutils.alloca_once(b, _FLOATS)
-                        b.store(_same(_FLOATS, 0.0), totals[each])
-                    with cgutils.for_range(b, arguments[3], intp=_L) as loop:
-                        place = b.mul(loop.index, _L(LANES))
+                        totals[each] = cgutils.alloca_once(b, FLOATS)
+                        b.store(constant(FLOATS, 0.0), totals[each])
+                    with cgutils.for_range(b, arguments[3], intp=I64) as loop:
+                        place = b.mul(loop.index, I64(LANES))
                         ours, theirs = (
                             [
                                 b.load(
-                                    _at(b, of.data, b.add(b.mul(b.add(at, _L(r)), long), place)),
+                                    lanes_at(
+                                        b, of.data, b.add(b.mul(b.add(at, I64(r)), long), place)
+                                    ),
                                     align=4,
                                 )
                                 for r in range(several)
@@ -351,14 +354,14 @@ def _add_outer() -> Any:
                         )
                         for r, c in block:
                             total = b.load(totals[r, c])
-                            b.store(_multiply_add(b, ours[r], theirs[c], total), totals[r, c])
+                            b.store(multiply_add(b, ours[r], theirs[c], total), totals[r, c])
                     for r in range(rows):
-                        at = b.add(b.mul(b.add(i, _L(r)), width), j)
+                        at = b.add(b.mul(b.add(i, I64(r)), width), j)
                         own = [b.load(totals[r, c]) for c in range(columns)]
-                        sums = _sums(b, own)
+                        sums = sums_of(b, own)
                         place = b.bitcast(b.gep(out.data, [at]), sums.type.as_pointer())
                         known = b.load(place, align=4)
-                        b.store(b.fadd(known, sums, flags=_FAST), place, align=4)
+                        b.store(b.fadd(known, sums, flags=FAST), place, align=4)
             return context.get_dummy_value()
 
         return types.void(left, right, out, types.int64), generate
@@ -376,27 +379,27 @@ def _network() -> Any:
     @intrinsic
     def network(typing_context, features, w1, b1, w2, b2, out):
         def generate(context, b, signature, arguments):
-            given = _arrays(context, b, signature, arguments, (0, 1, 2, 3, 5))
-            hidden, inputs = _sides(b, given[1])
+            given = arrays_of(context, b, signature, arguments, (0, 1, 2, 3, 5))
+            hidden, inputs = sides_of(b, given[1])
             x, first, bias, second, out = (each.data for each in given)
-            total = cgutils.alloca_once_value(b, _all(b, arguments[4]))
+            total = cgutils.alloca_once_value(b, everywhere(b, arguments[4]))
 
             def number(data: Any, place: Any) -> Any:
-                return _all(b, b.load(b.gep(data, [place])))
+                return everywhere(b, b.load(b.gep(data, [place])))
 
             for unit, units in _blocks(b, hidden, (UNITS, 1)):
-                places = [b.add(unit, _L(u)) for u in range(units)]
+                places = [b.add(unit, I64(u)) for u in range(units)]
                 sums = [cgutils.alloca_once_value(b, number(bias, place)) for place in places]
-                with cgutils.for_range(b, inputs, intp=_L) as loop:
-                    row = b.load(_at(b, x, b.mul(loop.index, _L(LANES))), align=4)
+                with cgutils.for_range(b, inputs, intp=I64) as loop:
+                    row = b.load(lanes_at(b, x, b.mul(loop.index, I64(LANES))), align=4)
                     for own, place in zip(sums, places, strict=True):
                         w = number(first, b.add(b.mul(place, inputs), loop.index))
-                        b.store(_multiply_add(b, w, row, b.load(own)), own)
+                        b.store(multiply_add(b, w, row, b.load(own)), own)
                 for own, place in zip(sums, places, strict=True):
-                    value, zero = b.load(own), _same(_FLOATS, 0.0)
+                    value, zero = b.load(own), constant(FLOATS, 0.0)
                     lit = b.select(b.fcmp_ordered(">", value, zero), value, zero)
-                    b.store(_multiply_add(b, number(second, place), lit, b.load(total)), total)
-            b.store(b.load(total), _at(b, out, _L(0)), align=4)
+                    b.store(multiply_add(b, number(second, place), lit, b.load(total)), total)
+            b.store(b.load(total), lanes_at(b, out, I64(0)), align=4)
             return context.get_dummy_value()
 
         return types.void(features, w1, b1, w2, types.float32, out), generate
@@ -407,128 +410,97 @@ def _network() -> Any:
 add_product, add_outer, network = _add_product(), _add_outer(), _network()
 
 
-# --- metaballs: the lanes are 4 x 4 vertices about a point in y and z, for one plane of x at a time
-
-_NEAR = [
-    [float(lane // 4 - 1) for lane in range(LANES)],
-    [float(lane % 4 - 1) for lane in range(LANES)],
-]
+# --- rows that runs of points share --------------------------------------------------------------
 
 
-def _squares(b: Any, u: list[Any], reach: float) -> tuple[list[Any], Any]:
-    """Distances of the vertices in y and z, and reach squared less their squares."""
-    beside = [
-        b.fsub(_all(b, own), ir.Constant(_FLOATS, near), flags=_FAST)
-        for own, near in zip(u[1:], _NEAR, strict=True)
-    ]
-    rest = _same(_FLOATS, reach * reach)
-    for d in beside:
-        rest = b.fsub(rest, b.fmul(d, d, flags=_FAST), flags=_FAST)
-    return beside, rest
+def _turned(b: Any, rows: list[Any]) -> list[Any]:
+    """LANES vectors with rows and columns exchanged, a bit of their numbers at a time."""
+    width = 1
+    while width < LANES:
+        first = [c if not c & width else LANES + (c ^ width) for c in range(LANES)]
+        second = [c ^ width if not c & width else LANES + c for c in range(LANES)]
+        turned = list(rows)
+        for low in (r for r in range(LANES) if not r & width):
+            pair = rows[low], rows[low | width]
+            turned[low] = b.shuffle_vector(*pair, ir.Constant(INTS, first))
+            turned[low | width] = b.shuffle_vector(*pair, ir.Constant(INTS, second))
+        rows, width = turned, 2 * width
+    return rows
 
 
-def _planes(b: Any, u: list[Any], rest: Any) -> Any:
-    """For each of the planes in x: its number, distance, and how far within reach vertices are."""
-    for plane in range(4):
-        d = _all(b, b.fsub(u[0], ir.Constant(_F, plane - 1.0), flags=_FAST))
-        q = b.fsub(rest, b.fmul(d, d, flags=_FAST), flags=_FAST)
-        zero = _same(_FLOATS, 0.0)
-        yield plane, d, b.select(b.fcmp_ordered(">", q, zero), q, zero)
+def _add_shared(back: bool) -> Any:
+    """Generates `add_shared`: points [unit.., point..] += rows [which [point..], unit..].
 
-
-def _vertices(b: Any, array: Any, place: list[Any], plane: int) -> Any:
-    """Values at a plane's vertices: [brick, x, y, z] of whole numbers, in floats."""
-    sides = _sides(b, array)
-    kind = array.data.type.pointee
-    run = ir.IntType(4 * kind.width)
-    rows = ir.Constant(ir.VectorType(run, 4), ir.Undefined)
-    brick, i, j, m = place
-    for row in range(4):
-        at = b.add(b.mul(brick, sides[1]), b.add(i, _L(plane)))
-        at = b.add(b.mul(at, sides[2]), b.add(j, _L(row)))
-        at = b.add(b.mul(at, sides[3]), m)
-        four = b.load(b.bitcast(b.gep(array.data, [at]), run.as_pointer()), align=1)
-        rows = b.insert_element(rows, four, _I(row))
-    values = b.bitcast(rows, ir.VectorType(kind, LANES))
-    wide = b.zext if kind.width == 8 else b.sext  # bytes have no sign here, longer ones have
-    return b.sitofp(wide(values, _INTS), _FLOATS)
-
-
-def _given(b: Any, arguments: Any, first: int) -> tuple[list[Any], list[Any]]:
-    """Where a point is: brick, x, y, z of its cell; and its place in the cell, in spacings."""
-    return list(arguments[first : first + 4]), list(arguments[first + 4 : first + 7])
-
-
-WHERE = (types.int64,) * 4 + (types.float32,) * 3
-
-
-def _ball_sums(reach: float) -> Any:
-    """Generates `ball_sums(fill, brick, i, j, m, ux, uy, uz)`: kernels' sums about a point.
-
-    K = (reach² - r²)³. Returns sums over the 64 vertices about it of K and K f, then of the slope
-    (reach² - r²)² times dx, dy and dz, and of that times f.
+    For LANES units and points from `unit` and `point` on. `back`: the rows get the points' instead.
     """
 
     @intrinsic
-    def ball_sums(typing_context, fill, brick, i, j, m, ux, uy, uz):
-        result = types.UniTuple(types.float32, 8)
-
+    def add_shared(typing_context, points, rows, which, unit, point):
         def generate(context, b, signature, arguments):
-            (fills,) = _arrays(context, b, signature, arguments, (0,))
-            place, u = _given(b, arguments, 1)
-            (dy, dz), rest = _squares(b, u, reach)
-            names = ("k", "kf", "x", "xf", "all", "allf")
-            sums = dict.fromkeys(names, _same(_FLOATS, 0.0))
-            for plane, dx, q in _planes(b, u, rest):
-                f = _vertices(b, fills, place, plane)
-                slope = b.fmul(q, q, flags=_FAST)
-                slope_f = b.fmul(slope, f, flags=_FAST)
-                terms = ((slope, q), (slope_f, q), (slope, dx), (slope_f, dx))
-                for name, (one, other) in zip(names, terms, strict=False):
-                    sums[name] = _multiply_add(b, one, other, sums[name])
-                sums["all"] = b.fadd(sums["all"], slope, flags=_FAST)
-                sums["allf"] = b.fadd(sums["allf"], slope_f, flags=_FAST)
-            yz = [b.fmul(sums[kind], d, flags=_FAST) for kind in ("all", "allf") for d in (dy, dz)]
-            k, kf, x, xf = (sums[name] for name in names[:4])
-            halves = _sums(b, [k, kf, x, yz[0]]), _sums(b, [yz[1], xf, yz[2], yz[3]])
-            own = [b.extract_element(half, _I(n)) for half in halves for n in range(4)]
-            return context.make_tuple(b, signature.return_type, own)
+            points, rows, which = arrays_of(context, b, signature, arguments, (0, 1, 2))
+            unit, point = arguments[3:]
+            width, along = sides_of(b, rows)[1], sides_of(b, points)[1]
+            by_point, by_unit = [], []
+            for k in range(LANES):
+                row = b.load(b.gep(which.data, [b.add(point, I64(k))]))
+                by_point.append(lanes_at(b, rows.data, b.add(b.mul(row, width), unit)))
+                place = b.add(b.mul(b.add(unit, I64(k)), along), point)
+                by_unit.append(lanes_at(b, points.data, place))
+            given, taking = (by_unit, by_point) if back else (by_point, by_unit)
+            values = _turned(b, [b.load(place, align=4) for place in given])
+            for place, value in zip(taking, values, strict=True):
+                b.store(b.fadd(b.load(place, align=4), value, flags=FAST), place, align=4)
+            return context.get_dummy_value()
 
-        return result(fill, *WHERE), generate
+        return types.void(points, rows, which, types.int64, types.int64), generate
 
-    return ball_sums
+    return add_shared
 
 
-def _ball_means(reach: float) -> Any:
-    """Generates `ball_means(fill, height, shade, brick, ...)`: as `ball_sums`.
+add_shared, add_to_shared = _add_shared(False), _add_shared(True)
 
-    Returns sums of K f; of that times height; times dz; times shade.
+
+# --- the optimiser -------------------------------------------------------------------------------
+
+
+def _adam() -> Any:
+    """Generates `adam`: its step for LANES entries from `place` on of flat arrays.
+
+    Entries without gradient keep what they had, and where all are nothing more is read. rates:
+    (1 - share kept) and share kept of the first moment, of the second; step length; factor on the
+    second moment; epsilon. The gradient is cleared.
     """
 
     @intrinsic
-    def ball_means(typing_context, fill, height, shade, brick, i, j, m, ux, uy, uz):
-        result = types.UniTuple(types.float32, 4)
-
+    def adam(typing_context, parameter, gradient, first, second, place, rates):
         def generate(context, b, signature, arguments):
-            arrays = _arrays(context, b, signature, arguments, (0, 1, 2))
-            place, u = _given(b, arguments, 3)
-            (_, dz), rest = _squares(b, u, reach)
-            total, high, lit = (_same(_FLOATS, 0.0) for _ in range(3))
-            for plane, _, q in _planes(b, u, rest):
-                f, over, bright = (_vertices(b, array, place, plane) for array in arrays)
-                cube = b.fmul(b.fmul(q, q, flags=_FAST), q, flags=_FAST)
-                weight = b.fmul(cube, f, flags=_FAST)
-                total = b.fadd(total, weight, flags=_FAST)
-                high = _multiply_add(b, weight, over, high)
-                lit = _multiply_add(b, weight, bright, lit)
-            four = _sums(b, [total, high, b.fmul(total, dz, flags=_FAST), lit])
-            own = [b.extract_element(four, _I(n)) for n in range(4)]
-            return context.make_tuple(b, signature.return_type, own)
+            flat = arrays_of(context, b, signature, arguments, (0, 1, 2, 3))
+            at_p, at_g, at_m, at_v = (lanes_at(b, each.data, arguments[4]) for each in flat)
+            new1, old1, new2, old2, length, grow, epsilon = (
+                everywhere(b, each) for each in cgutils.unpack_tuple(b, arguments[5])
+            )
+            nothing = constant(FLOATS, 0.0)
+            g = b.load(at_g, align=4)
+            given = b.fcmp_unordered("!=", g, nothing)
+            bits = ir.IntType(LANES)
+            with b.if_then(b.icmp_unsigned("!=", b.bitcast(given, bits), bits(0))):
+                p, m, v = (b.load(at, align=4) for at in (at_p, at_m, at_v))
+                mean = multiply_add(b, new1, g, b.fmul(old1, m))
+                square = multiply_add(b, new2, b.fmul(g, g), b.fmul(old2, v))
+                kind = ir.FunctionType(FLOATS, [FLOATS])
+                root = cgutils.get_or_insert_function(b.module, kind, f"llvm.sqrt.v{LANES}f32")
+                # Exact: quick roots of a square that has vanished are no numbers.
+                below = b.fadd(b.call(root, [b.fmul(square, grow)]), epsilon)
+                step = b.fdiv(b.fmul(length, mean), below)
+                b.store(b.select(given, mean, m), at_m, align=4)
+                b.store(b.select(given, square, v), at_v, align=4)
+                b.store(b.select(given, b.fsub(p, step), p), at_p, align=4)
+                b.store(nothing, at_g, align=4)
+            return context.get_dummy_value()
 
-        return result(fill, height, shade, *WHERE), generate
+        return types.void(parameter, gradient, first, second, types.int64, rates), generate
 
-    return ball_means
+    return adam
 
 
-BALL_REACH = 2.0  # of a metaball's kernel, lattice spacings
-ball_sums, ball_means = _ball_sums(BALL_REACH), _ball_means(BALL_REACH)
+adam = _adam()

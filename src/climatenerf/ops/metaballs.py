@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from numba import njit, prange
 
-from climatenerf.ops.lanes import BALL_REACH, ball_means, ball_sums
+from climatenerf.ops.ball_lanes import BALL_REACH, ball_means, ball_sums
 
-LANES_DIGEST = "867c92b329b6"  # of `lanes.py`, which says why
+LANES_DIGEST = "9daa2f318f9f"  # of `lanes.py` and `ball_lanes.py`; the former says why
 BRICK = 8
 """Cells along a brick's side."""
 STORED = BRICK + 3

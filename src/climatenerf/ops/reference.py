@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from climatenerf.ops.vectors import unit
+
 
 def contract(q: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Unit-cube coordinates of a position: mip-NeRF 360's contraction (Eq. 10), then (x+2)/4.
@@ -123,6 +125,25 @@ def accumulate(
     )
 
 
+def surface(
+    weights: Float[Tensor, "s"],
+    raw: Float[Tensor, "s 3+c"],
+    target: Float[Tensor, "s 3"] | None,
+    offsets: Int[Tensor, "rays+1"],
+) -> tuple[Float[Tensor, "rays c"], Float[Tensor, "rays"]]:
+    """What rays see of the surface head's output, normals (of any length) before class logits.
+
+    Logits are accumulated; normals compared: the sum of weights·|n - target|², n the unit vector
+    (Verbin et al. 2022), or 0 without a target.
+    """
+    logits = accumulate(weights, raw[:, 3:], offsets)
+    if target is None:
+        return logits, torch.zeros_like(logits[:, 0])
+    # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
+    off = (unit(raw[:, :3], 1e-6) - target).square().sum(-1, keepdim=True)
+    return logits, accumulate(weights, off, offsets)[:, 0]
+
+
 def distortion(
     weights: Float[Tensor, "s"],
     s: Float[Tensor, "s"],
@@ -143,7 +164,7 @@ def march(
     ray_d: Float[Tensor, "3"],
     span: tuple[float, float, float],
     occupied: Int[Tensor, "k g g g"],
-    steps: tuple[float, float],
+    steps: tuple[float, float, float],
     stop: float,
     density_at,
     skips: tuple[int, ...] = (1,),
@@ -151,9 +172,10 @@ def march(
     """One ray through occupied space: its samples (t, dt, sigma), front to back.
 
     span = (t_min, t_max, jitter of the first step in [0,1)). A step is max(steps[0], steps[1]·t)
-    long; in an empty cell whole steps are skipped until the ray has left it, or has left the
-    block of skip³ cells about it if all of these are empty, for the first such of `skips`. Ends
-    where the transmittance falls below `stop`. Cascade k covers the cube of half side 2^k.
+    long; of an optical depth below steps[2] it counts as empty. In an empty cell whole steps are
+    skipped until the ray has left it, or has left the block of skip³ cells about it if all of these
+    are empty, for the first such of `skips`. Ends where the transmittance falls below `stop`.
+    Cascade k covers the cube of half side 2^k.
     """
     cascades, side = occupied.shape[:2]
     far = 2.0 ** (cascades - 1)
@@ -179,7 +201,7 @@ def march(
         index = ((q + half) / cell).long().clamp(0, side - 1)
         if occupied[cascade, index[0], index[1], index[2]]:
             sigma = density_at(q[None])[0].item()
-            if sigma * dt > 1e-3:
+            if sigma * dt > steps[2]:
                 samples.append((middle, dt, sigma))
                 tau += sigma * dt
             t += dt

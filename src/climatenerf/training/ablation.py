@@ -77,6 +77,7 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         match=False,
         crowded=0.0,
         cautious=False,
+        thin=1e-3,
         decay=0.0,
     )
     return {

@@ -16,14 +16,16 @@ from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.extent import Extent
-from climatenerf.field.field import Field
+from climatenerf.field.field import THIN_AT_FIRST, Field
 from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.placing import array_of, placed, uniform
+from climatenerf.ops.vectors import unit
 from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.training import losses
 from climatenerf.training.carving import Carving, on_the_ground
+from climatenerf.training.gradients import scale_gradient
 from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.pixels import HORIZON, Batch, TrainingPixels
@@ -209,6 +211,7 @@ class Fitting:
         tau = samples.sigma * samples.dt
         before, _ = dispatch.render_weights(tau, samples.offsets)
         field.keep_occupied(rays_o, rays_d, samples, before > SEEN_WEIGHT)
+        self.thin_out(tau, before)
         kept, chance = self.choose(before)
         u = self.positions(batch, samples, kept)
         # Near a camera many rays crowd into little space that few other cameras see, and haze there
@@ -409,24 +412,24 @@ class Fitting:
             return u.sum() * 0.0
         n = max(batch.rays_o.shape[0] // SURFACE_SHARE, 1)
         some = slice(0, int(torch.searchsorted(ray, n)))
-        normal, logits = self.field.surface_at(u[some].detach())
+        raw = self.field.surface_raw(u[some].detach())
         own, of = share[some], ray[some]
-        loss = normal.sum() * 0.0
-        if weigh.classes and self.pixels.label is not None and self.field.knows_classes:
-            target = self.solid_of[batch.label[:n].long()]
-            composited = dispatch.accumulate(own, logits, offsets_of(of, n))
-            loss = loss + weigh.classes * losses.class_loss(composited, target, target != UNKNOWN)
+        q = goal = None
         if (weigh.normals or weigh.bend) and self.stage > REFINE_AT:
             at = samples.t[index[some], None]
             q = self.field.to_grid(batch.rays_o.detach()[of] + at * batch.rays_d.detach()[of])
             if weigh.normals:
                 self.field.learned[0] = self.stage > NORMALS_AT
-                target = self.field.density_normal(q)
-                loss = loss + weigh.normals * losses.normal_loss(own, normal, target, n)
-            if weigh.bend:
-                step = BEND_STEP * samples.dt[index[some]] / self.field.unit
-                bent = self.field.sloped_normal(q, step)
-                loss = loss + weigh.bend * losses.normal_loss(own, bent, normal.detach(), n)
+                goal = self.field.density_normal(q)
+        logits, apart = dispatch.surface(own, raw, goal, offsets_of(of, n))
+        loss = weigh.normals * apart.sum() / n
+        if weigh.classes and self.pixels.label is not None and self.field.knows_classes:
+            target = self.solid_of[batch.label[:n].long()]
+            loss = loss + weigh.classes * losses.class_loss(logits, target, target != UNKNOWN)
+        if weigh.bend and q is not None:
+            step = BEND_STEP * samples.dt[index[some]] / self.field.unit
+            bent, shown = self.field.sloped_normal(q, step), unit(raw[:, :3].detach(), 1e-6)
+            loss = loss + weigh.bend * losses.normal_loss(own, bent, shown, n)
         return loss
 
     def depth_loss(self, measured: PointRays) -> tuple[Float[Tensor, ""], int]:
@@ -457,6 +460,17 @@ class Fitting:
         """Ray length (m) from which matter is believed at present."""
         return max(self.field.near, self.first_near * (1 - self.stage / REFINE_AT))
 
+    def thin_out(self, tau: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
+        """From `THIN_FROM` on ever denser samples count as empty (`Field.thin`).
+
+        Once surfaces are found, thin matter are veils before them, above all between leaves and the
+        sky: they go, and what light needs becomes dense. Not while much light ends on thin matter.
+        """
+        grown = min(1.0, max(0.0, (self.stage - THIN_FROM) / (FINE_AT - THIN_FROM)))
+        goal = THIN_AT_FIRST * (self.settings.thin / THIN_AT_FIRST) ** grown
+        if goal > self.field.thin and weights[tau < goal].sum() < THIN_SHARE * weights.sum():
+            self.field.thin = goal
+
     def choose(self, weights: Float[Tensor, "s"]) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
         """Indices of the samples that get colour and gradients, and the chance that each had.
 
@@ -481,7 +495,7 @@ class Fitting:
     ) -> Float[Tensor, "n 3"]:
         """Linear radiance of a batch's rays: matter (the samples given) in front of the sky."""
         n = batch.rays_o.shape[0]
-        appearance = self.field.embeddings[batch.image]
+        appearance = self.field.embeddings.index_select(0, batch.image)
         if not self.settings.appearance:
             appearance = appearance.detach()
         colour = self.field.colour_at(u, ray, batch.rays_d, appearance)
@@ -495,13 +509,14 @@ class Fitting:
         drawn = torch.zeros(n).index_add(0, ray, share.detach())
         # 1e-3: rays of which nothing was drawn, 0/0.
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
-        sky = self.field.sky_colour(batch.rays_d, appearance)
+        open_ = (left.detach() > LEAST_WEIGHT).nonzero()[:, 0]
+        sky = self.field.sky_colour(batch.rays_d[open_], appearance[open_])
         if self.knows_sky:
             # It learns from its own pixels; then it may learn fast, and in detail. What nobody has
             # labelled may be sky, and would have to be painted with matter else.
             unknown = SKY_SHARES[self.stage > REFINE_AT] * (batch.label == UNKNOWN)
-            sky = scale_gradient(sky, (batch.is_sky + unknown)[:, None])
-        return own + left[:, None] * sky
+            sky = scale_gradient(sky, (batch.is_sky + unknown)[open_, None])
+        return own.index_add(0, open_, left[open_, None] * sky)
 
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
@@ -538,23 +553,6 @@ def _of(named: dict[str, torch.nn.Parameter], *starts: str) -> list[torch.nn.Par
 def triples(n: int, m: int) -> Int[Tensor, "3 m"]:
     """Rows of a batch of n rays that are the middles, first and other sides of its m triples."""
     return torch.stack([torch.arange(m), torch.arange(n - 2 * m, n - m), torch.arange(n - m, n)])
-
-
-class _ScaledGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, value, factor):
-        ctx.save_for_backward(factor)
-        return value.view_as(value)
-
-    @staticmethod
-    def backward(ctx, grad):
-        (factor,) = ctx.saved_tensors
-        return grad * factor, None
-
-
-def scale_gradient(value: Float[Tensor, "*n"], factor: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """The same value, its gradient multiplied by a factor."""
-    return _ScaledGradient.apply(value, factor)
 
 
 # The sky's share before and after surfaces are found, where no labels tell it from matter: it may
@@ -595,6 +593,8 @@ POINT_SHARE = 16  # rays of photos for one to a sparse point, and one to a match
 MAX_STEP_SCALE = 8.0
 LEAST_SAMPLES = 4  # of a ray in the mean: empty ones cost too
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
+THIN_FROM = 0.5  # stage from which ever denser samples count as empty, until `FINE_AT`,
+THIN_SHARE = 0.01  # while they take no more than this of the light that matter does
 FINE_AT = 0.8  # stage from which steps are as fine as when rendering
 REFINE_AT = 0.25  # stage at which occupancy cells are halved
 NORMALS_AT = 0.35  # stage from which predicted normals, learned since then, are shown

@@ -117,9 +117,8 @@ def class_loss(
     logits: Float[Tensor, "n c"], target: Int[Tensor, "n"], known: Bool[Tensor, "n"]
 ) -> Float[Tensor, ""]:
     """Cross-entropy of composited logits where the class is known, a mean over all rays."""
-    if not bool(known.any()):
-        return logits.sum() * 0.0
-    return F.cross_entropy(logits[known], target[known], reduction="sum") / logits.shape[0]
+    counted = torch.where(known, target, -1)
+    return F.cross_entropy(logits, counted, reduction="sum", ignore_index=-1) / logits.shape[0]
 
 
 def normal_loss(

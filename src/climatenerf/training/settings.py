@@ -71,6 +71,9 @@ class FitSettings:
     cautious: bool = True
     """Colours depend on the view once a quarter of the fit is over, and matter near cameras is
     believed bit by bit until then; False: both from the first step, as in a plain NGP."""
+    thin: float = 1e-3
+    """Optical depth below which a sample on a ray counts as empty at the end of a fit, and in what
+    is rendered from it; until half of the fit 1e-3."""
     opaque_sky: bool = False
     """The paper's sky loss: sky rays end on matter far away, instead of on none."""
     refine_poses: bool = False
@@ -99,6 +102,7 @@ PAPER = FitSettings(
     match=False,
     crowded=0.0,
     cautious=False,
+    thin=1e-3,
 )
 """The paper's (supplement, "Training Details"), whose print "3^{-4}" is a mis-set 3e-4."""
 
