@@ -71,7 +71,7 @@ class FitSettings:
     cautious: bool = True
     """Colours depend on the view once a quarter of the fit is over, and matter near cameras is
     believed bit by bit until then; False: both from the first step, as in a plain NGP."""
-    thin: float = 1e-3
+    thin: float = 0.1
     """Optical depth below which a sample on a ray counts as empty at the end of a fit, and in what
     is rendered from it; until half of the fit 1e-3."""
     opaque_sky: bool = False
