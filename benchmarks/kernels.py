@@ -86,7 +86,7 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
     layers = list(zip(field.colour_net[::2], field.colour_net[1::2], strict=True))
     geometry = list(zip(field.geometry_net[::2], field.geometry_net[1::2], strict=True))
     tau = torch.rand(n, requires_grad=True)
-    values = torch.rand(n, 3, requires_grad=True)
+    values = torch.rand(3, n).T.requires_grad_()  # as networks leave them
     t = torch.rand(n // SAMPLES_PER_RAY, SAMPLES_PER_RAY).sort(-1)[0].flatten()
     ds = torch.full((n,), 0.01)
     q = torch.randn(n, 3)

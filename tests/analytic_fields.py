@@ -96,8 +96,13 @@ class AnalyticField:
         t_min: Tensor,
         t_max: Tensor,
         step_scale: float = 1.0,
+        *,
+        thin: float | None = None,
     ) -> Samples:
-        """Samples from where each ray enters a solid (inside `bounds`) until it is opaque."""
+        """Samples from where each ray enters a solid (inside `bounds`) until it is opaque.
+
+        All of them count, whatever `thin` is: nothing here is a veil.
+        """
         lower, upper = self.bounds
         limits = Box(tuple(lower.tolist()), tuple(upper.tolist())).interval(rays_o, rays_d)
         low = torch.maximum(t_min, limits[0])

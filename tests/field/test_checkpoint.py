@@ -10,7 +10,7 @@ from random_field import directions, points, random_field
 
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import FILE_NAME, SCHEMA_VERSION, load_field, save_field
-from climatenerf.field.field import THIN_AT_FIRST
+from climatenerf.render.samples import LEAST_TAU
 from climatenerf.render.view import render_view
 from climatenerf.scene.cameras import Camera
 from climatenerf.storage import read_safetensors, write_safetensors
@@ -72,7 +72,7 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
     assert torch.equal(loaded.density(x), field.density(x))
     assert torch.equal(loaded.colour(x, d), field.colour(x, d))
     assert not loaded.knows_normals and not loaded.knows_classes
-    assert loaded.thin == THIN_AT_FIRST
+    assert loaded.thin == LEAST_TAU
 
 
 def test_a_folder_without_a_field(tmp_path):

@@ -152,6 +152,41 @@ def test_changing_the_appearance_leaves_density_bit_identical():
     assert (field.colour(x, d) - colour).abs().max() > 0.01
 
 
+def test_marching_leaves_out_what_is_thin_and_nothing_else():
+    field = dense(random_field(full=True))
+    n = 200
+    o, d = points(field, n, spread=0.5), directions(n)
+    everything = field.march(o, d, *ends(n), stop=1e-38)
+    tau = everything.sigma * everything.dt
+    field.thin = float(tau.median())
+    some = field.march(o, d, *ends(n), stop=1e-38)
+    least, most = (int((tau > share * field.thin).sum()) for share in (1 + 1e-5, 1 - 1e-5))
+    assert 0.3 * len(tau) < least <= some.t.numel() <= most
+    assert (some.sigma * some.dt).min() > (1 - 1e-5) * field.thin
+
+
+def test_rays_of_snow_and_sun_meet_what_cameras_do():
+    """Beside matter steps are short, and each of them is thin."""
+    field = random_field(full=True)
+    with torch.no_grad():
+        field.geometry_net[2].zero_()
+        field.geometry_net[3].fill_(2.3)  # 10 a grid unit
+    field.thin = 0.1
+    o, d = field.centre[None], torch.tensor([[0.0, 0.0, 1.0]])
+    left = {}
+    for name, own, start in (
+        ("camera", field, 5 * field.unit),  # from five units away
+        ("beside", field, 0.0),
+        ("snow", field.trusted(), 0.0),
+    ):
+        begin = torch.full((1,), start)
+        samples = own.march(o - start * d, d, begin, begin + field.unit)
+        weights, rest = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        left[name] = float(rest)
+    assert left["camera"] < 1e-3 and left["snow"] < 1e-3 and left["beside"] == 1
+    assert field.thin == 0.1, "the field itself is as it was"
+
+
 def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
     field = random_field(full=True)
     with torch.no_grad():

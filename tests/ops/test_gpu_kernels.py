@@ -220,8 +220,10 @@ def test_density_inside_and_outside_the_core(generator):
     assert torch.allclose(ours, density_of(weights)(q), rtol=1e-3)
 
 
-@pytest.mark.parametrize(("skip", "share"), [(1, 0.3), (8, 0.02)])
-def test_marching(generator, monkeypatch, skip, share):
+@pytest.mark.parametrize(
+    ("skip", "share", "thin"), [(1, 0.3, 1e-3), (8, 0.02, 1e-3), (1, 0.3, 0.1)]
+)
+def test_marching(generator, monkeypatch, skip, share, thin):
     weights = net(generator)
     side = 32 if skip == 8 else 8
     occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
@@ -237,7 +239,7 @@ def test_marching(generator, monkeypatch, skip, share):
         [torch.full((n,), 0.05), torch.full((n,), 1e9), torch.rand(n, generator=generator)], dim=-1
     )
     spans[2, 1] = 0.5
-    steps = (0.1, 0.02, 1e-3)
+    steps = (0.1, 0.02, thin)
     monkeypatch.setattr(dispatch, "GPU_RAYS", 19)  # in two parts, the first of two blocks
     monkeypatch.setattr(dispatch, "CAPACITY", 64)
     offsets, samples = dispatch.march(
@@ -263,10 +265,11 @@ def test_marching(generator, monkeypatch, skip, share):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stop", "least"), [(1e-3, 1e-4), (0.4, 0.03)])
-def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least):
+@pytest.mark.parametrize(("stop", "least", "thin"), [(1e-3, 1e-4, 1e-3), (0.4, 0.03, 0.05)])
+def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least, thin):
     """One launch against marching, encoding, networks and compositing on the CPU."""
     field, n = random_field(), 20
+    field.thin = thin
     o = field.centre + 0.7 * field.unit * random(generator, n, 3)
     d = torch.nn.functional.normalize(random(generator, n, 3), dim=-1)
     o[0] = field.centre + 40 * field.unit  # outside all cells, looking away

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops import dispatch, reference
+from climatenerf.ops import cpu, dispatch, reference
 
 
 @pytest.fixture
@@ -273,12 +273,15 @@ def leaf(tensor, dtype):
     return tensor.clone().to(dtype).requires_grad_()
 
 
-@pytest.mark.parametrize("kind", ["one hidden layer", "shared", "shared, mixed up", "two layers"])
+KINDS = ["one hidden layer", "shared", "shared, mixed up", "two layers", "two layers, shared"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("widths", [(16, 32, 1), (13, 22, 7)])  # whole sweeps of rows, and rests
 def test_network_matches_the_twin_and_autograd(generator, kind, widths):
     n, rays = 9000, 2000  # more than two chunks
     inputs, hidden, outputs = widths
-    sizes = [inputs, hidden, *([8] if kind == "two layers" else []), outputs]
+    sizes = [inputs, hidden, *([8] if kind.startswith("two layers") else []), outputs]
     layers = [
         (torch.randn(a, b, generator=generator), torch.randn(b, generator=generator))
         for a, b in zip(sizes[:-1], sizes[1:], strict=True)
@@ -294,7 +297,7 @@ def test_network_matches_the_twin_and_autograd(generator, kind, widths):
     for run, dtype in ((dispatch.mlp, torch.float32), (reference.mlp, torch.float64)):
         own = [tuple(leaf(p, dtype) for p in pair) for pair in layers]
         given = [leaf(x, dtype), leaf(shared, dtype)]
-        if kind.startswith("shared"):
+        if "shared" in kind:
             out = run(given[0], own, given[1], row)
         else:
             out, given = run(given[0], own), given[:1]
@@ -302,6 +305,34 @@ def test_network_matches_the_twin_and_autograd(generator, kind, widths):
         grads.append([out, *[t.grad for t in given], *[p.grad for pair in own for p in pair]])
     for fast, slow in zip(*grads, strict=True):
         assert (fast.double() - slow).abs().max() < 1e-5 * slow.abs().max()
+
+
+def test_a_network_on_what_needs_no_gradient_learns_the_same(generator):
+    layers, _ = network(generator, 8, 16)
+    x = torch.randn(300, 8, generator=generator)
+    found = []
+    for needed in (True, False):
+        own = [tuple(leaf(p, torch.float32) for p in pair) for pair in layers]
+        dispatch.mlp(x.clone().requires_grad_(needed), own).sum().backward()
+        found.append([p.grad for pair in own for p in pair])
+    for a, b in zip(*found, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_encodings_do_not_depend_on_how_many_threads_share_them(generator):
+    table, resolutions = grid(generator)
+    u = torch.rand(1000, 3, generator=generator).numpy()
+    levels = table.shape[0]
+    up = torch.randn(2 * levels, 1000, generator=generator).numpy()
+    found = []
+    for threads in (1, 3, 99):  # fewer and more than levels
+        out, grads = np.empty_like(up), np.zeros(table.shape, np.float32)
+        cpu._hash_encode(u, table.numpy(), resolutions.numpy(), out, threads)
+        cpu._hash_encode_backward(u, up, resolutions.numpy(), grads, threads)
+        found.append((out, grads))
+    for other in found[1:]:
+        assert np.array_equal(found[0][0], other[0]) and np.array_equal(found[0][1], other[1])
+    assert np.abs(found[0][1]).sum() > 0
 
 
 def test_a_network_of_nothing_gives_nothing():

@@ -11,8 +11,8 @@ from climatenerf.errors import UserError
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import Dry, Place
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.field import THIN_AT_FIRST
 from climatenerf.field.presets import PRESETS, FieldSize
+from climatenerf.render.samples import LEAST_TAU
 from climatenerf.scene import Camera, load_scene, read_scene
 from climatenerf.training import ablation
 from climatenerf.training import run as run_module
@@ -78,7 +78,7 @@ def test_each_row_leaves_out_just_what_it_says():
     plain = rows["plain NGP"]
     assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
     assert not plain.sky_labels and not plain.match and plain.decay == 0 < full.decay
-    assert not plain.cautious and not plain.crowded and plain.thin == THIN_AT_FIRST < full.thin
+    assert not plain.cautious and not plain.crowded and plain.thin == LEAST_TAU < full.thin
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 

@@ -24,6 +24,7 @@ from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
 from climatenerf.render.camera_path import camera_path
 from climatenerf.render.frame import see_frame
+from climatenerf.render.samples import LEAST_TAU
 from climatenerf.render.stage import Stage, prepare
 from climatenerf.render.surface import see_surface
 from climatenerf.render.view import RENDER_STEP, camera_rays
@@ -233,7 +234,7 @@ def open_sky(place: Place) -> float:
     rays_o[:, 2] += LIFTED
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(found), 3).contiguous()
     start, end = torch.zeros(len(found)), torch.full((len(found),), 1e9)
-    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP)
+    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP, thin=LEAST_TAU)
     _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
     return float(left.mean())
 

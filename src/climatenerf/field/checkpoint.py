@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from climatenerf.errors import UserError
-from climatenerf.field.field import THIN_AT_FIRST, Field
+from climatenerf.field.field import Field
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops.placing import placed
+from climatenerf.render.samples import LEAST_TAU
 from climatenerf.storage import check_schema, read_safetensors, write_safetensors
 
 SCHEMA_VERSION = 2
@@ -49,10 +50,10 @@ def load_field(run: Path) -> Field:
         about = json.loads(metadata["climatenerf"])
         check_schema(about["schema_version"], SCHEMA_VERSION, f"the field in {run}")
         size = FieldSize(**about["size"])
-        thin = about.get("thin", THIN_AT_FIRST)  # earlier runs ended with what fits begin with
+        thin = about.get("thin", LEAST_TAU)  # earlier runs ended with what fits begin with
         numbers = [about["unit"], about["near"], thin, *arrays["centre"].tolist()]
-        if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0:
-            raise ValueError("a length is not a finite number above 0")
+        if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0 or thin < 0:
+            raise ValueError("a length is not a finite number above 0, or a bound is below it")
         field = Field(
             size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
         )

@@ -22,12 +22,11 @@ from climatenerf.field.presets import FieldSize
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.vectors import length
 from climatenerf.ops.vectors import unit as unit_vector
-from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
+from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import SOLID
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
 STEP_CONE = 1.0 / 160  # marching step per length travelled
-THIN_AT_FIRST = 1e-3  # optical depth of samples that count as empty, as fits begin
 
 
 def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
@@ -81,8 +80,8 @@ class Field(nn.Module):
         self.size = size
         self.unit = unit
         self.near = near
-        self.thin = THIN_AT_FIRST
-        """Optical depth below which a marched sample counts as empty; see `training.fit`."""
+        self.thin = LEAST_TAU
+        """Optical depth below which a sample on a camera's ray is empty; see `training.fit`."""
         self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
         self.register_buffer(
             "geometry_resolutions",
@@ -206,6 +205,7 @@ class Field(nn.Module):
         step_scale: float = 1.0,
         jitter: Float[Tensor, "n"] | None = None,
         stop: float = 1e-3,
+        thin: float | None = None,
     ) -> Samples:
         """Samples of rays where matter is, without gradient.
 
@@ -217,14 +217,17 @@ class Field(nn.Module):
             step_scale: factor on the step length.
             jitter: share of the first step by which each ray's comb is shifted; default 0.
             stop: transmittance at which a ray ends.
+            thin: optical depth below which a sample counts as empty; default: the field's, which is
+                of the steps of a camera's rays. Rays that begin beside matter have finer ones.
         """
+        thin = self.thin if thin is None else thin
         if jitter is None:
             jitter = torch.zeros_like(t_min)
         offsets, (t, dt, sigma) = dispatch.march(
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, t_max / self.unit, jitter], dim=-1),
             self.occupancy.cells(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale, thin),
             stop,
             self._net(),
         )
@@ -344,10 +347,12 @@ class Field(nn.Module):
 
         Photos say nothing about space that they do not show; haze left there would shelter the
         ground from snow and sun. Early in a fit all is haze and nothing is seen: all is trusted.
+        Rays of snow and sun begin beside matter, with fine steps, so next to none counts as empty.
         """
-        if not bool(self.occupancy.seen.any()):
-            return self
         twin = copy.copy(self)
+        twin.thin = LEAST_TAU
+        if not bool(self.occupancy.seen.any()):
+            return twin
         twin.__dict__["_modules"] = dict(self._modules)
         twin.occupancy = Occupancy(self.size.cascades, self.occupancy.side)
         near_seen = nn.functional.max_pool3d(

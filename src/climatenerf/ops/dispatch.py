@@ -1,8 +1,8 @@
 """The operations as the rest of the program calls them: one function each, with gradients.
 
 The device of the tensors decides the kernel. Those of 32 bits go to Numba on a CPU (`cpu.py`), to
-Triton on an NVIDIA GPU (`gpu.py`, the same functions); all others go to the reference, which is
-slow and always right.
+Triton on an NVIDIA GPU (`gpu.py`, the same functions but for what is said here); all others go to
+the reference, which is slow and always right.
 """
 
 from collections.abc import Sequence
@@ -171,14 +171,16 @@ def surface(
     offsets: Int[Tensor, "rays+1"],
 ) -> tuple[Float[Tensor, "rays c"], Float[Tensor, "rays"]]:
     """See `reference.surface`; gradients to raw only."""
-    goal = raw.new_empty(0, 3) if target is None else target
-    if _kernels(weights, raw, goal, offsets) is cpu:
-        return _Surface.apply(weights.detach(), raw, goal.detach(), offsets)
-    weights = weights.detach()
+    weights, goal = weights.detach(), raw.new_empty(0, 3) if target is None else target.detach()
+    kernels = _kernels(weights, raw, goal, offsets)
+    if kernels is cpu:
+        return _Surface.apply(weights, raw, goal, offsets)
+    if kernels is None:
+        return reference.surface(weights, raw, target, offsets)
     logits = accumulate(weights, raw[:, 3:], offsets)
     if target is None:
         return logits, torch.zeros_like(logits[:, 0])
-    off = (unit(raw[:, :3], 1e-6) - target.detach()).square().sum(-1, keepdim=True)
+    off = (unit(raw[:, :3], 1e-6) - goal).square().sum(-1, keepdim=True)
     return logits, accumulate(weights, off, offsets)[:, 0]
 
 
@@ -272,7 +274,7 @@ def mlp(
     shared: Float[Tensor, "m h"] | None = None,
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
-    """See `reference.mlp`, which is it but on a CPU."""
+    """See `reference.mlp`, which it is but for networks of 32 bits with hidden layers on a CPU."""
     given = [x, *(each for pair in layers for each in pair), *([] if shared is None else [shared])]
     if _kernels(*given) is cpu and len(layers) > 1:  # a GPU's own matrix products are fast
         return _Network.apply(x, shared, row, *(each for pair in layers for each in pair))

@@ -3,8 +3,8 @@
 Numba's compiler does not make vectors of loops that read a table at computed places, and makes
 short ones of products. So these few steps are spelled out in LLVM's vector instructions, which it
 translates for whatever processor it runs on (AVX-512, AVX2, Neon). Values of points lie in rows,
-[what, points], and rows are whole vectors long. All arrays are float32, C-contiguous, as everywhere
-in the kernels.
+[what, points], and rows are whole vectors long. All arrays are C-contiguous, and float32 but for
+indices, as everywhere in the kernels.
 
 Numba keeps compiled kernels until their own file changes, and knows nothing of this one. So files
 with kernels that use it carry its digest, which a test compares: a change here changes them.

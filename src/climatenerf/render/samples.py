@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
+LEAST_TAU = 1e-3  # optical depth of samples that count as empty; later in a fit `Field.thin`
 
 
 @dataclass

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
-from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
+from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.render.view import RENDER_STEP, rays_at_once
 from climatenerf.render.world import SKY_OPACITY, TINY, Seen, Water, World
 from climatenerf.weather import flood as water_physics
@@ -393,7 +393,8 @@ def _other_side(
     if down.numel():
         o, d = start[down], direction[down]
         zero, far = torch.zeros(down.shape[0]), torch.full_like(o[:, 0], 1e9)
-        samples = world.field.march(o, d, zero, far, RENDER_STEP)  # a bed is seen as it is
+        # A bed is seen as it is; its steps are fine.
+        samples = world.field.march(o, d, zero, far, RENDER_STEP, thin=LEAST_TAU)
         weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
         ray = samples.ray_index()
         keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]

@@ -22,9 +22,16 @@ class FieldLike(Protocol):
         ...
 
     def march(
-        self, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, t_max: Tensor, step_scale: float = 1.0
+        self,
+        rays_o: Tensor,
+        rays_d: Tensor,
+        t_min: Tensor,
+        t_max: Tensor,
+        step_scale: float = 1.0,
+        *,
+        thin: float | None = None,
     ) -> Samples:
-        """Samples where matter is."""
+        """Samples where matter is, but for those of an optical depth below `thin`."""
         ...
 
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:

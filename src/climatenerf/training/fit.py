@@ -16,12 +16,12 @@ from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.extent import Extent
-from climatenerf.field.field import THIN_AT_FIRST, Field
+from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.placing import array_of, placed, uniform
 from climatenerf.ops.vectors import unit
-from climatenerf.render.samples import LEAST_WEIGHT, Samples, offsets_of
+from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.training import losses
 from climatenerf.training.carving import Carving, on_the_ground
@@ -461,15 +461,15 @@ class Fitting:
         return max(self.field.near, self.first_near * (1 - self.stage / REFINE_AT))
 
     def thin_out(self, tau: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
-        """From `THIN_FROM` on ever denser samples count as empty (`Field.thin`).
+        """From `THIN_FROM` on ever denser samples count as empty, unless much light ends on them.
 
-        Once surfaces are found, thin matter are veils before them, above all between leaves and the
-        sky: they go, and what light needs becomes dense. Not while much light ends on thin matter.
+        Once surfaces are found, what is thin are veils, above all between leaves and the sky.
         """
         grown = min(1.0, max(0.0, (self.stage - THIN_FROM) / (FINE_AT - THIN_FROM)))
-        goal = THIN_AT_FIRST * (self.settings.thin / THIN_AT_FIRST) ** grown
-        if goal > self.field.thin and weights[tau < goal].sum() < THIN_SHARE * weights.sum():
-            self.field.thin = goal
+        goal = LEAST_TAU * (self.settings.thin / LEAST_TAU) ** grown
+        denser = 2 * self.field.thin
+        if goal > self.field.thin and weights[tau < denser].sum() < THIN_SHARE * weights.sum():
+            self.field.thin = min(goal, denser)
 
     def choose(self, weights: Float[Tensor, "s"]) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
         """Indices of the samples that get colour and gradients, and the chance that each had.
@@ -509,14 +509,14 @@ class Fitting:
         drawn = torch.zeros(n).index_add(0, ray, share.detach())
         # 1e-3: rays of which nothing was drawn, 0/0.
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
-        open_ = (left.detach() > LEAST_WEIGHT).nonzero()[:, 0]
-        sky = self.field.sky_colour(batch.rays_d[open_], appearance[open_])
+        skyward = (left.detach() > LEAST_WEIGHT).nonzero()[:, 0]
+        sky = self.field.sky_colour(batch.rays_d[skyward], appearance[skyward])
         if self.knows_sky:
             # It learns from its own pixels; then it may learn fast, and in detail. What nobody has
             # labelled may be sky, and would have to be painted with matter else.
             unknown = SKY_SHARES[self.stage > REFINE_AT] * (batch.label == UNKNOWN)
-            sky = scale_gradient(sky, (batch.is_sky + unknown)[open_, None])
-        return own.index_add(0, open_, left[open_, None] * sky)
+            sky = scale_gradient(sky, (batch.is_sky + unknown)[skyward, None])
+        return own.index_add(0, skyward, left[skyward, None] * sky)
 
     def update_occupancy(self) -> None:
         """Looks at every cell in the first steps, at a share of them later."""
@@ -594,7 +594,7 @@ MAX_STEP_SCALE = 8.0
 LEAST_SAMPLES = 4  # of a ray in the mean: empty ones cost too
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
 THIN_FROM = 0.5  # stage from which ever denser samples count as empty, until `FINE_AT`,
-THIN_SHARE = 0.01  # while they take no more than this of the light that matter does
+THIN_SHARE = 0.2  # while samples up to twice as dense take no more of the light that matter does
 FINE_AT = 0.8  # stage from which steps are as fine as when rendering
 REFINE_AT = 0.25  # stage at which occupancy cells are halved
 NORMALS_AT = 0.35  # stage from which predicted normals, learned since then, are shown
