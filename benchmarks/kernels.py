@@ -6,9 +6,10 @@ python benchmarks/kernels.py --samples 131072 --repeats 7
 Million samples a second, forward and with backward. Twins that loop over rays in Python get fewer
 samples and fewer repeats; the rate is what counts.
 
-`bound`: what the machine could do at best. Reads of 64 bits at random places of one level's table
-and multiply-adds of a large matrix product (by PyTorch's library) are measured in the same run; a
-kernel needs so many of each a sample (`NEEDS`), and the slower of the two bounds it.
+`bound`: what the machine could do at best. Reads of 64 bits at random places of one level's table,
+multiply-adds of a large matrix product (by PyTorch's library) and bytes of two arrays added to a
+third, each of a value a sample, are measured in the same run; a kernel needs so many of each a
+sample (`NEEDS`), and the slowest of the three bounds it.
 """
 
 import argparse
@@ -28,16 +29,23 @@ SAMPLES_PER_RAY = 32
 SIZE = PRESETS["cpu"]
 COLOURED = 2 * SIZE.appearance_levels * SIZE.colour_hidden, 3 * SIZE.colour_hidden
 DENSE = (2 * SIZE.geometry_levels + 1) * SIZE.geometry_hidden
-NEEDS = {  # a sample: reads of a table's rows, multiply-adds of what is read and of networks
-    "hash encode": (8 * SIZE.appearance_levels, 16 * SIZE.appearance_levels),
+NEEDS = {  # a sample: reads of a table's rows, multiply-adds of what is read and of networks, bytes
+    "hash encode": (8 * SIZE.appearance_levels, 16 * SIZE.appearance_levels, 12),
     # Every row is read once forward, and read and written backward.
-    "hash encode + backward": (24 * SIZE.appearance_levels, 32 * SIZE.appearance_levels),
-    "density": (8 * SIZE.geometry_levels, 16 * SIZE.geometry_levels + DENSE),
-    "density slopes": (8 * SIZE.geometry_levels, 64 * SIZE.geometry_levels + 2 * DENSE),
-    "network": (0, sum(COLOURED)),
+    "hash encode + backward": (24 * SIZE.appearance_levels, 32 * SIZE.appearance_levels, 24),
+    "density": (8 * SIZE.geometry_levels, 16 * SIZE.geometry_levels + DENSE, 16),
+    "march": (8 * SIZE.geometry_levels, 16 * SIZE.geometry_levels + DENSE, 12),
+    "density slopes": (8 * SIZE.geometry_levels, 64 * SIZE.geometry_levels + 2 * DENSE, 24),
+    "network": (0, sum(COLOURED), 108),
     # Forward; the hidden layer again, and three products for the gradients of the first layer's
     # weights and inputs and the second's weights, one for the hidden layer's.
-    "network + backward": (0, 4 * COLOURED[0] + 3 * COLOURED[1]),
+    "network + backward": (0, 4 * COLOURED[0] + 3 * COLOURED[1], 312),
+    # What is given is read, what is asked for written, once each way.
+    "weights + backward": (0, 0, 20),
+    "accumulate + backward": (0, 0, 48),
+    "surface + backward": (0, 0, 136),
+    "distortion + backward": (0, 0, 28),
+    "merge": (0, 0, 24),
 }
 
 
@@ -50,15 +58,18 @@ def read_rows(table, index, out):
         out[part] = total
 
 
-def bounds(repeats: int) -> dict[str, float]:
-    """Reads of table rows and multiply-adds a second, all cores."""
+def bounds(repeats: int, samples: int) -> dict[str, float]:
+    """Reads of table rows, multiply-adds and bytes a second, all cores."""
     random, parts = np.random.default_rng(0), torch.get_num_threads()
     table = random.integers(0, 2**40, 2**SIZE.appearance_log2_rows)
     index = random.integers(0, table.shape[0], (parts, 2**20))
     reads = common.measure(lambda: read_rows(table, index, np.empty(parts, np.int64)), repeats)
     square = torch.rand(1024, 1024)
     products = common.measure(lambda: square @ square, repeats)
+    a, b, c = torch.rand(3, samples)
+    added = common.measure(lambda: [torch.add(a, b, out=c) for _ in range(100)], repeats)
     return {
+        "GB/s": 100 * 12 * samples / added["median"] / 1e9,
         "Mreads/s": index.size / reads["median"] / 1e6,
         "Gmultiply-adds/s": 1024**3 / products["median"] / 1e9,
     }
@@ -89,6 +100,8 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
     values = torch.rand(3, n).T.requires_grad_()  # as networks leave them
     t = torch.rand(n // SAMPLES_PER_RAY, SAMPLES_PER_RAY).sort(-1)[0].flatten()
     ds = torch.full((n,), 0.01)
+    raw = torch.randn(9, n).T.requires_grad_()
+    goal = torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
     q = torch.randn(n, 3)
 
     def density() -> torch.Tensor:
@@ -96,6 +109,23 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
             return field.grid_density(q)
         with torch.no_grad():
             return reference.density(q, field.geometry_grid, field.geometry_resolutions, geometry)
+
+    def march() -> torch.Tensor:
+        """Rays through cells that are all full, as long as they have samples enough."""
+        if ops is dispatch:
+            rays = n // SAMPLES_PER_RAY
+            start, end = torch.zeros(rays), torch.full((rays,), SAMPLES_PER_RAY / 256 + 1e-6)
+            d = torch.nn.functional.normalize(q[:rays], dim=-1)
+            samples = field.march(torch.zeros(rays, 3), d, start, end, stop=1e-30, thin=0.0)
+            assert samples.t.shape[0] in range(n, n + rays + 1)
+            return samples.sigma
+        cells = torch.ones(1, 4, 4, 4, dtype=torch.uint8)
+        for d in torch.nn.functional.normalize(q[: n // SAMPLES_PER_RAY], dim=-1):
+            reference.march(torch.zeros(3), d, (0.0, SAMPLES_PER_RAY / 256, 0.0), cells,
+                            (1 / 256, 1 / 160, 0.0), 1e-30, lambda at: reference.density(
+                            at, field.geometry_grid.detach(), field.geometry_resolutions,
+                            [(w.detach(), b.detach()) for w, b in geometry]))  # fmt: skip
+        return q
 
     def slopes(field: Field, q: torch.Tensor) -> torch.Tensor:
         if ops is dispatch:
@@ -108,12 +138,14 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
         "hash encode": lambda: ops.hash_encode(u, table.detach(), resolutions),
         "hash encode + backward": lambda: backward(ops.hash_encode(u, table, resolutions)),
         "density": density,
+        "march": march,
         "density slopes": lambda: slopes(field, q),
         "network": lambda: ops.mlp(x.detach(), [(w.detach(), b.detach()) for w, b in layers],
                                    shared.detach(), row),
         "network + backward": lambda: backward(ops.mlp(x, layers, shared, row)),
         "weights + backward": lambda: backward(*ops.render_weights(tau, offsets)),
         "accumulate + backward": lambda: backward(ops.accumulate(tau, values, offsets)),
+        "surface + backward": lambda: backward(*ops.surface(tau.detach(), raw, goal, offsets)),
         "distortion + backward": lambda: backward(ops.distortion(tau, t, ds, offsets)),
         "merge": lambda: ops.merge_order(t, offsets, t, offsets),
     }  # fmt: skip
@@ -127,7 +159,7 @@ def main() -> None:
     options = parser.parse_args()
     few = min(options.twin_samples, options.samples)
     fast, slow = jobs(options.samples, dispatch), jobs(few, reference)
-    best = bounds(options.repeats)
+    best = bounds(options.repeats, options.samples)
     rows: dict[str, dict] = {"machine": best}
     for name in fast:
         a = common.measure(fast[name], options.repeats)
@@ -136,8 +168,12 @@ def main() -> None:
         rows[name] = {"Msamples/s": rate, "twin Msamples/s": twin, "times": rate / twin,
                       "seconds": a}  # fmt: skip
         if name in NEEDS:
-            reads, adds = NEEDS[name]
-            each = max(reads / best["Mreads/s"], adds / best["Gmultiply-adds/s"] / 1e3)
+            reads, adds, size = NEEDS[name]
+            each = max(
+                reads / best["Mreads/s"],
+                adds / best["Gmultiply-adds/s"] / 1e3,
+                size / best["GB/s"] / 1e3,
+            )
             rows[name]["bound Msamples/s"] = 1 / each
             rows[name]["share of bound"] = rate * each
     table = torch.randn(2**22)
