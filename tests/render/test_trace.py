@@ -11,6 +11,7 @@ from random_field import directions, random_field
 
 from climatenerf.render import trace as trace_module
 from climatenerf.render.frame import render_frame
+from climatenerf.render.samples import LEAST_TAU
 from climatenerf.render.trace import trace
 from climatenerf.render.world import Water, World
 from climatenerf.scene.cameras import Camera
@@ -185,6 +186,21 @@ def test_snell_apparent_depth_near_the_nadir():
     edge = slant[(green[1:] - green[:-1]).abs().argmax()]
     apparent = 0.1 / float(edge) - 1.0
     assert abs(apparent / (depth / 1.333) - 1) < 0.01
+
+
+def test_a_bed_s_rays_leave_out_next_to_nothing(monkeypatch):
+    """They begin at the water, with short steps, of which each is thin; the eye's do not."""
+    asked, march = [], AnalyticField.march
+
+    def noting(self, *rays, thin=None):
+        asked.append(thin)
+        return march(self, *rays, thin=thin)
+
+    monkeypatch.setattr(AnalyticField, "march", noting)
+    linear(World(street()))
+    assert set(asked) == {None}
+    linear(World(street(), water=flooded()))
+    assert set(asked) == {None, LEAST_TAU}
 
 
 def test_flooded_pixels_are_nested_as_the_level_rises():
