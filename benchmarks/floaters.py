@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from climatenerf.evaluation import geometry
-from climatenerf.evaluation.reference import Truth, read_reference
+from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import Place, check_views, passing
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene
@@ -29,7 +29,6 @@ from climatenerf.scene.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
 SAME = 0.02  # of the distance: a photo shows a place that lies in the range of its 3x3 pixels there
-EDGE = 0.1  # of the distance, and m: a pixel beside one that is so much nearer is at an edge
 PHOTOS = (0, 1, 2, 3, 5, 9, 17)  # from so many photos on
 METRES = (0, 20, 60)
 LOST = (0, 0.1, 0.7)
@@ -74,12 +73,6 @@ def times_shown(
     return count
 
 
-def at_edges(truth: Truth) -> Bool[np.ndarray, "h w"]:
-    """Pixels beside what is nearer."""
-    depth = np.where(truth.sky, 1e6, truth.depth)
-    return minimum_filter(depth, 3) < (1 - EDGE) * depth - EDGE
-
-
 def shares(lost: Float[np.ndarray, "n"], which: Bool[np.ndarray, "n"]) -> dict[str, float]:
     """The share of pixels that these are, and their part in the mean of all."""
     return {"pixels": float(which.mean()), "floaters": float(lost[which].sum() / len(lost))}
@@ -104,7 +97,7 @@ def main() -> None:
         solid = ~truth.sky
         lost.append(1 - passed[solid])
         shown.append(times_shown(truth.points[solid], place.scene, photos))
-        edge.append(at_edges(truth)[solid])
+        edge.append(geometry.beside_nearer(truth)[solid])
         way.append(truth.depth[solid])
     lost, shown, edge, way = (np.concatenate(each) for each in (lost, shown, edge, way))
     everything = np.ones(len(lost), bool)

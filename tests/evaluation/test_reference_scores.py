@@ -156,6 +156,24 @@ def test_clear_sky_has_sky_all_around():
     assert found["clear_sky_empty_fraction"] == pytest.approx(1 - 8 / clear)
 
 
+def test_floaters_are_told_off_edges_too():
+    truth = truth_of()
+    truth.depth[:] = 10.0
+    truth.depth[8:11, 8:11] = 4.0  # a leaf, and the ring of pixels about it
+    beside = np.zeros(truth.depth.shape, bool)
+    beside[7:12, 7:12] = True
+    beside[8:11, 8:11] = False
+    assert np.array_equal(geometry.beside_nearer(truth), beside)
+    lost = np.where(beside, 1.0, 0.125)
+    found = geometry.emptiness_scores([lost], [1 - lost], (truth,))
+    assert found["clear_floater_mass"] == pytest.approx(0.125)
+    assert found["floater_mass"] == pytest.approx(0.125 + 0.875 * beside.mean())
+    # A surface that recedes is its own neighbour, not an edge; nor is what the sky is behind.
+    truth.depth[:] = np.linspace(5, 9, truth.depth.shape[0])[:, None]
+    truth.depth[:4] = np.inf
+    assert not geometry.beside_nearer(truth)[4:].any()
+
+
 def waterline(depth, level, truth, mask):
     return weather_scores.waterline_scores(
         [depth], [mask], [truth.c2w], level, (truth,), 0.3, 1 / CAMERA.fx

@@ -18,6 +18,7 @@ from climatenerf.scene.classes import (
 HOLE = 1.5  # times the true distance: ground seen beyond that is missing
 FARTHEST = 50.0  # m: beyond it photos of a walk say little about distance
 MARGIN, MARGIN_SHARE = 0.1, 0.05  # m, and of the depth: matter this close before a surface is its
+EDGE, EDGE_SHARE = 0.1, 0.1  # m, and of the depth: a neighbour so much nearer makes an edge
 EMPTY = 0.99  # transmittance of what counts as empty sky
 CLEAR = 1.0  # m: how far around a place nothing stands over open ground,
 STANDING = 0.5  # m: and from which height it counts
@@ -134,12 +135,14 @@ def emptiness_scores(
     Returns:
         `floater_mass`, the mean share lost before the surface, and `floaters_CLASS`, the same
         before surfaces of each class; `sky_empty_fraction`, the share of true sky pixels that at
-        least `EMPTY` of the light passes; `clear_sky_empty_fraction`, the same of those with sky
-        all around (a pixel beside a leaf is leaf in part, whatever its middle shows).
+        least `EMPTY` of the light passes; `clear_floater_mass` and `clear_sky_empty_fraction`, the
+        same of pixels with nothing nearer beside them, and of those with sky all around (a pixel
+        beside a leaf is leaf in part, whatever its middle shows).
     """
     lost = np.concatenate([a[~t.sky] for a, t in zip(absorbed, truths, strict=True)])
     passed = np.concatenate([s[t.sky] for s, t in zip(skyward, truths, strict=True)])
     clear = np.concatenate([within(t.sky)[t.sky] for t in truths])
+    inner = np.concatenate([~beside_nearer(t)[~t.sky] for t in truths])
     kind = np.concatenate([MERGED[t.label][~t.sky] for t in truths])
     each = {
         f"floaters_{name}": float(lost[kind == own].mean())
@@ -148,10 +151,20 @@ def emptiness_scores(
     }
     return {
         "floater_mass": float(lost.mean()),
+        "clear_floater_mass": float(lost[inner].mean()),
         **each,
         "sky_empty_fraction": _share(passed >= EMPTY),
         "clear_sky_empty_fraction": _share(passed[clear] >= EMPTY),
     }
+
+
+def beside_nearer(truth: Truth) -> Bool[np.ndarray, "h w"]:
+    """Pixels one of whose eight neighbours shows what is much nearer."""
+    # What may be this near and still belong to the pixel's own surface; the sky has no end.
+    least = np.where(truth.sky, np.inf, (1 - EDGE_SHARE) * truth.depth - EDGE)
+    padded = np.pad(truth.depth, 1, mode="edge")
+    rows = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.minimum(np.minimum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]) < least
 
 
 def within(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -54,6 +54,7 @@ MEASURED = {
     "normal_ground_roof_median_deg": "ground, roofs",
     "slope_median_deg": "slope, deg",
     "floater_mass": "floaters",
+    "clear_floater_mass": "off edges",
     "sky_empty_fraction": "sky",
     "miou": "mIoU",
     **{name: f"{name}, dB" for name in WEATHERS},
