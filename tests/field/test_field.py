@@ -2,7 +2,7 @@ import numpy as np
 import torch
 from random_field import directions, points, random_field
 
-from climatenerf.field.field import _Brightness
+from climatenerf.field.activations import _Brightness
 from climatenerf.ops import dispatch, reference
 
 

@@ -15,7 +15,7 @@ import torch
 from random_field import random_field
 
 from climatenerf.field import field as field_module
-from climatenerf.field.field import _to_radiance
+from climatenerf.field.activations import plain_radiance
 from climatenerf.ops import cpu, dispatch, reference
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -308,7 +308,9 @@ def radiance_of(raw, out):
 def test_a_colour_is_decoded_as_the_field_does(raw):
     out = torch.empty(1, device=DEVICE)
     radiance_of[(1,)](raw, out)
-    assert float(out) == pytest.approx(float(_to_radiance(torch.tensor([raw]))), rel=1e-4, abs=1e-9)
+    assert float(out) == pytest.approx(
+        float(plain_radiance(torch.tensor([raw]))), rel=1e-4, abs=1e-9
+    )
 
 
 def test_merging_two_lists(generator, rays):

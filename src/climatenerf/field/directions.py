@@ -4,6 +4,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from climatenerf.ops import cpu_pointwise
+
+
+def harmonics(d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 16"]:
+    """See `spherical_harmonics`, which it is but where PyTorch need not know of it."""
+    if d.requires_grad or d.device.type != "cpu" or d.dtype != torch.float32:
+        return spherical_harmonics(d)
+    out = d.new_empty(16, d.shape[0])
+    cpu_pointwise.harmonics(d.contiguous().numpy(), out.numpy())
+    return out.T
+
 
 def spherical_harmonics(d: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 16"]:
     """The 16 real spherical harmonics of degrees 0 to 3, orthonormal over the sphere.

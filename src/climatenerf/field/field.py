@@ -15,12 +15,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from climatenerf.field.colour_space import decode_srgb
-from climatenerf.field.directions import spherical_harmonics
+from climatenerf.field import activations, directions
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops import dispatch, reference
-from climatenerf.ops.vectors import length
 from climatenerf.ops.vectors import unit as unit_vector
 from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.scene.classes import SOLID
@@ -283,11 +281,7 @@ class Field(nn.Module):
 
     def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Density (1/grid unit) at unit-cube coordinates, with gradients to the parameters."""
-        raw = self.raw_density(u)
-        # 1/|q|^2 outside the core (see `reference.density`), from the contracted radius 2 - 1/|q|.
-        # 1e-4: the outermost shell, where rounding could make it negative.
-        shell = (2.0 - length(4.0 * u - 2.0)).clamp(1e-4, 1.0)
-        return raw.clamp_max(15.0).exp() * shell.square()
+        return activations.thinned_density(self.raw_density(u), u)
 
     def density_normal(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Unit vectors against the density's gradient at positions in grid units, no gradient.
@@ -385,7 +379,7 @@ class Field(nn.Module):
     ) -> Float[Tensor, "n h"]:
         """What a ray's samples share: one layer, added to the first of the samples' own."""
         weight, bias = self.view_net
-        x = torch.cat([spherical_harmonics(rays_d), embedding], dim=-1)
+        x = torch.cat([directions.harmonics(rays_d), embedding], dim=-1)
         return torch.addmm(bias, x, weight)
 
     def _coloured(
@@ -393,7 +387,7 @@ class Field(nn.Module):
     ) -> Float[Tensor, "s 3"]:
         grid, resolutions = self.appearance_grid, self.appearance_resolutions
         layers = _pairs(self.colour_net)
-        return _to_radiance(dispatch.encoded_mlp(u, grid, resolutions, layers, shared, ray))
+        return activations.radiance(dispatch.encoded_mlp(u, grid, resolutions, layers, shared, ray))
 
     def surface_raw(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s 3+c"]:
         """Predicted normals of any length (world axes) and class logits (of `SOLID`), unit-cube u.
@@ -421,8 +415,8 @@ class Field(nn.Module):
         # Clouds need finer detail than the harmonics have: what the sky cannot show, floating
         # matter would. Where no photo looked the grid is blank and the harmonics go on.
         detail = dispatch.hash_encode(0.5 + 0.499 * d, self.sky_grid, self.sky_resolutions)
-        x = torch.cat([spherical_harmonics(d).T, detail.T, embedding.T])
-        return _to_radiance(dispatch.mlp(x.T, _pairs(self.sky_net)))
+        x = torch.cat([directions.harmonics(d).T, detail.T, embedding.T])
+        return activations.radiance(dispatch.mlp(x.T, _pairs(self.sky_net)))
 
     @torch.no_grad()
     def colour(
@@ -446,37 +440,3 @@ class Field(nn.Module):
     def sky(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Linear radiance of the sky, in the appearance shown."""
         return self.sky_colour(d, self.shown_embedding.expand(d.shape[0], -1))
-
-
-class _Brightness(torch.autograd.Function):
-    """Softplus out of whose flat part there is a way back.
-
-    Where it is black its slope vanishes. Adam makes steps of full length of vanishing gradients, so
-    colours that darken for a while would sink ever deeper and never return: a fit in which the sky
-    shone through the haze stayed black for good.
-    """
-
-    @staticmethod
-    def forward(ctx, x):
-        ctx.save_for_backward(x)
-        return nn.functional.softplus(x, beta=SHARPNESS)
-
-    @staticmethod
-    def backward(ctx, grad):
-        (x,) = ctx.saved_tensors
-        slope = torch.sigmoid(SHARPNESS * x)
-        # Steps go against the gradient: negative ones brighten.
-        return grad * torch.where(grad < 0, slope.clamp_min(LEAST_SLOPE), slope * (x > BLACK))
-
-
-def _to_radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Network output to linear radiance: a display value ≥ 0 and unbounded, decoded.
-
-    Softplus with sharpness 8 is nearly the identity from 0.3 up.
-    """
-    return decode_srgb(_Brightness.apply(raw + 0.5))
-
-
-SHARPNESS = 8.0  # of the softplus
-LEAST_SLOPE = 0.1  # upwards
-BLACK = -0.5  # below it the display value is under .003, and nothing darkens further

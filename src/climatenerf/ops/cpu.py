@@ -11,9 +11,10 @@ from numba import get_num_threads, njit, prange
 from climatenerf.ops import lanes
 from climatenerf.ops.lanes import LANES
 
-LANES_DIGEST = "31cd8dc8a8cb"  # of `lanes.py`, which says why
+LANES_DIGEST = "eeeb3e1424f9"  # of `lanes.py`, which says why
 
 BLOCK = 256  # points that one thread takes at once
+AHEAD = 2 * LANES  # points by which a table's rows are asked for before they are read
 ENCODED = 2**16  # the same, at most, where levels come one by one
 RAY_BLOCK = 32  # rays that one thread marches in turn
 
@@ -31,10 +32,17 @@ def _hash_encode(u, table, resolutions, out, threads):
     size = min(ENCODED, -(-max(each, 1) // LANES) * LANES)
     for block in prange((n + size - 1) // size):
         places = np.zeros((3, LANES), np.float32)
-        features = np.empty((2, LANES), np.float32)
+        features, ahead = np.empty((2, LANES), np.float32), np.zeros((3, LANES), np.float32)
+        end = min(n, block * size + size)
         for level in range(table.shape[0]):
-            for start in range(block * size, min(n, block * size + size), LANES):
+            far = lanes.is_far(table, resolutions[level])
+            for start in range(block * size, end, LANES):
                 count = min(LANES, n - start)
+                if far:
+                    for k in range(min(LANES, end - start - AHEAD)):
+                        for axis in range(3):
+                            ahead[axis, k] = u[start + AHEAD + k, axis]
+                    lanes.touch(ahead, table, level, resolutions[level])
                 for k in range(count):
                     for axis in range(3):
                         places[axis, k] = u[start + k, axis]
@@ -49,9 +57,16 @@ def _hash_encode_backward(u, grad_out, resolutions, grad_table, threads):
     n = u.shape[0]
     for part in prange(threads):
         places, grad = np.zeros((3, LANES), np.float32), np.zeros((2, LANES), np.float32)
+        ahead = np.zeros((3, LANES), np.float32)
         for level in range(part, grad_table.shape[0], threads):
+            far = lanes.is_far(grad_table, resolutions[level])
             for start in range(0, n, LANES):
                 count = min(LANES, n - start)
+                if far:
+                    for k in range(min(LANES, n - start - AHEAD)):
+                        for axis in range(3):
+                            ahead[axis, k] = u[start + AHEAD + k, axis]
+                    lanes.touch(ahead, grad_table, level, resolutions[level])
                 some = np.float32(0.0)
                 grad[:] = 0.0
                 for k in range(count):

@@ -35,7 +35,7 @@ from climatenerf.ops.gpu_march import (
     weight_of,
 )
 
-SHARPNESS = tl.constexpr(8.0)  # of the softplus; see `field.field._to_radiance`
+SHARPNESS = tl.constexpr(8.0)  # of the softplus; see `field.activations`
 BRIGHT = tl.constexpr(2.4 / 1.055)  # slope beyond white; see `field.colour_space.decode_srgb`
 
 

@@ -23,6 +23,7 @@ from numba.extending import intrinsic
 LANES = 16
 PRIME_Y = 2654435761
 PRIME_Z = 805459861
+NEAR_ROWS = 2**17  # of a level, 1 MB: what a core's own cache holds as a rule
 UNITS, VECTORS = 4, 2  # rows and vectors of a product that are held in registers
 
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
@@ -198,6 +199,33 @@ def _spreading(hashed: bool) -> Any:
     return spread
 
 
+def _touching(hashed: bool) -> Any:
+    """Generates what asks for the rows that a lookup will read, without waiting for them."""
+
+    @intrinsic
+    def touch(typing_context, places, table, level, resolution):
+        def generate(context, b, signature, arguments):
+            at, tables = arrays_of(context, b, signature, arguments, (0, 1))
+            cells = _Cells(b, at, tables, arguments[2], arguments[3], hashed)
+            byte = ir.IntType(8).as_pointer()
+            kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
+            fetch = cgutils.get_or_insert_function(b.module, kind, "llvm.prefetch.p0i8")
+            start = everywhere(b, b.ptrtoint(cells.rows, I64))
+            for y, z in ((0, 0), (1, 0), (0, 1), (1, 1)):
+                # Its neighbour along x is next to it, as a rule in the same line of the caches.
+                row = b.zext(cells.row(b, 0, y, z), LONGS)
+                address = b.add(start, b.shl(row, constant(LONGS, 3)))
+                for lane in range(LANES):
+                    place = b.inttoptr(b.extract_element(address, I32(lane)), byte)
+                    b.call(fetch, [place, I32(0), I32(3), I32(1)])
+            return context.get_dummy_value()
+
+        return types.void(places, table, types.int64, types.int64), generate
+
+    return touch
+
+
+_touch_hashed, _touch_dense = _touching(True), _touching(False)
 _hashed, _dense = _lookup(True, False), _lookup(False, False)
 _hashed_sloped, _dense_sloped = _lookup(True, True), _lookup(False, True)
 _spread_hashed, _spread_dense = _spreading(True), _spreading(False)
@@ -211,6 +239,23 @@ def look_up(places, table, level, resolution, out, row):
         _dense(places, table, level, resolution, out, row, 0)
     else:
         _hashed(places, table, level, resolution, out, row, 0)
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def is_far(table, resolution):
+    """Whether a core's own cache holds but part of a level, so that it pays to `touch` it."""
+    side = resolution + 1
+    return min(side * side * side, table.shape[1]) > NEAR_ROWS
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def touch(places, table, level, resolution):
+    """Asks for the rows that `look_up` or `spread` will want of a level."""
+    side = resolution + 1
+    if side * side * side <= table.shape[1]:
+        _touch_dense(places, table, level, resolution)
+    else:
+        _touch_hashed(places, table, level, resolution)
 
 
 @njit(cache=True, fastmath=True, inline="always")

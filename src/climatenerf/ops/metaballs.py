@@ -17,7 +17,7 @@ from numba import njit, prange
 
 from climatenerf.ops.ball_lanes import BALL_REACH, ball_means, ball_sums
 
-LANES_DIGEST = "764cadc5d065"  # of `lanes.py` and `ball_lanes.py`; the former says why
+LANES_DIGEST = "d22e9516b615"  # of `lanes.py` and `ball_lanes.py`; the former says why
 BRICK = 8
 """Cells along a brick's side."""
 STORED = BRICK + 3
