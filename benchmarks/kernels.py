@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
+from climatenerf.field import activations
 from climatenerf.field.field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.ops import cpu, dispatch, reference
@@ -46,6 +47,8 @@ NEEDS = {  # a sample: reads of a table's rows, multiply-adds of what is read an
     "surface + backward": (0, 0, 136),
     "distortion + backward": (0, 0, 28),
     "merge": (0, 0, 24),
+    # Of three values: 8 bytes each forward, 16 backward.
+    "radiance + backward": (0, 0, 72),
 }
 
 
@@ -104,6 +107,8 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
     goal = torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
     q = torch.randn(n, 3)
 
+    radiance = activations.radiance if ops is dispatch else activations.plain_radiance
+
     def density() -> torch.Tensor:
         if ops is dispatch:
             return field.grid_density(q)
@@ -147,6 +152,7 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
         "accumulate + backward": lambda: backward(ops.accumulate(tau, values, offsets)),
         "surface + backward": lambda: backward(*ops.surface(tau.detach(), raw, goal, offsets)),
         "distortion + backward": lambda: backward(ops.distortion(tau, t, ds, offsets)),
+        "radiance + backward": lambda: backward(radiance(values)),
         "merge": lambda: ops.merge_order(t, offsets, t, offsets),
     }  # fmt: skip
 
