@@ -91,6 +91,11 @@ def eager_positions(rays, offsets: Tensor, t: Float[Tensor, "s"]) -> Float[Tenso
     return reference.contract(o + t[:, None] * d)
 
 
+def eager_encoded(u, table, resolutions, layers, shared=None, row=None) -> Tensor:
+    """On a GPU `dispatch` has a kernel of its own for both."""
+    return reference.mlp(reference.hash_encode(u, table, resolutions), layers, shared, row)
+
+
 def eager_slopes(q: Float[Tensor, "n 3"], net: dispatch.Net) -> Float[Tensor, "n 3"]:
     table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
     return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)])
@@ -103,6 +108,7 @@ def plain_pytorch() -> Iterator[None]:
         dispatch,
         hash_encode=reference.hash_encode,
         mlp=reference.mlp,
+        encoded_mlp=eager_encoded,
         density_slopes=eager_slopes,
         render_weights=eager_weights,
         accumulate=eager_accumulate,
