@@ -96,3 +96,9 @@ def test_powers_and_logarithms_hold_over_all_that_a_float_is():
     both(x, powers, logarithms)
     assert np.allclose(powers, np.exp2(x.astype(np.float64)), rtol=1e-6)
     assert np.allclose(logarithms, x, atol=1e-5)
+
+
+def test_what_is_no_number_stays_none():
+    raw = torch.tensor([[0.5, torch.nan, 1.0]])
+    assert torch.equal(radiance(raw).isnan(), raw.isnan())
+    assert thinned_density(torch.tensor([torch.nan]), torch.full((1, 3), 0.5)).isnan().all()

@@ -13,6 +13,8 @@ SHARPNESS = 8.0  # of the softplus
 LEAST_SLOPE = 0.1  # upwards
 BLACK = -0.5  # below it the display value is under .003, and nothing darkens further
 LARGEST_RAW = 15.0  # logarithm of a density: beyond it a float32 would be infinite soon
+# NaN keeps its meaning: what has diverged is to be seen.
+_FAST = {"contract", "reassoc", "arcp", "nsz"}
 BLOCK = 2048  # values that one thread takes at once
 LN2 = 0.6931471805599453
 # exp2 over [-1/2, 1/2]: the exponential's series, 2e-7 off.
@@ -22,7 +24,7 @@ P1, P3, P5, P7, P9, P11, P13 = (2.0 / (k * SHARPNESS) for k in range(1, 14, 2)) 
 TOE, TOE_SLOPE, ABOVE_SLOPE = 0.04045, 1.0 / 12.92, 2.4 / 1.055  # see `field.colour_space`
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=_FAST, inline="always")
 def _exp2(y):
     """2 to the power of a float32, which is held within what one can be."""
     y = min(max(y, np.float32(-126.0)), np.float32(126.0))
@@ -34,7 +36,7 @@ def _exp2(y):
     return series * np.int32((whole + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=_FAST, inline="always")
 def _log2(x):
     """Logarithm of a positive, normal float32."""
     bits = np.float32(x).view(np.int32)
@@ -48,7 +50,7 @@ def _log2(x):
     return np.float32(whole) + s * series
 
 
-@njit(cache=True, fastmath=True, inline="always")
+@njit(cache=True, fastmath=_FAST, inline="always")
 def _display(x):
     """The softplus of x, and e^-|x·SHARPNESS|, of which its slope is made."""
     e = _exp2(-abs(x) * np.float32(SHARPNESS / LN2))
@@ -61,7 +63,7 @@ def _display(x):
     return max(x, np.float32(0.0)) + s * series, e
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=_FAST, parallel=True)
 def radiance_forward(raw, out):
     """Linear radiance of network outputs raw [n]."""
     n = raw.shape[0]
@@ -74,10 +76,10 @@ def radiance_forward(raw, out):
                 value = np.float32(1.0) + (x - np.float32(1.0)) * np.float32(ABOVE_SLOPE)
             if x <= np.float32(TOE):
                 value = x * np.float32(TOE_SLOPE)
-            out[i] = value
+            out[i] = value if raw[i] == raw[i] else raw[i]
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=_FAST, parallel=True)
 def radiance_backward(raw, value, grad_out, grad):
     """Gradient to raw [n]; `value` is what `radiance_forward` gave."""
     n = raw.shape[0]
@@ -101,7 +103,7 @@ def radiance_backward(raw, value, grad_out, grad):
             grad[i] = own * slope
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=_FAST, parallel=True)
 def density_forward(raw, u, out):
     """Density (1/grid unit) of network outputs raw [n] at u [n,3]."""
     n = raw.shape[0]
@@ -114,10 +116,10 @@ def density_forward(raw, u, out):
             shell = np.float32(2.0) - np.sqrt(square)
             shell = min(max(shell, np.float32(1e-4)), np.float32(1.0))
             y = min(raw[i], np.float32(LARGEST_RAW)) * np.float32(1.0 / LN2)
-            out[i] = _exp2(y) * shell * shell
+            out[i] = _exp2(y) * shell * shell if raw[i] == raw[i] else raw[i]
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=_FAST, parallel=True)
 def density_backward(raw, sigma, grad_out, grad):
     """Gradient to raw [n]; `sigma` is what `density_forward` gave."""
     n = raw.shape[0]
@@ -127,7 +129,7 @@ def density_backward(raw, sigma, grad_out, grad):
             grad[i] = own if raw[i] <= np.float32(LARGEST_RAW) else np.float32(0.0)
 
 
-@njit(cache=True, fastmath=True, parallel=True)
+@njit(cache=True, fastmath=_FAST, parallel=True)
 def harmonics(d, out):
     """The 16 spherical harmonics of unit directions d [n,3] in rows, out [16,n]."""
     n = d.shape[0]
