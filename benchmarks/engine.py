@@ -187,12 +187,14 @@ def our_step(field: Field, at: Drawn) -> Callable[[], None]:
     def step() -> None:
         for table, buffer in zip(tables, buffers, strict=True):
             table.grad_buffer = buffer
-        nets.zero_grad()
-        loss_of(field, at).backward()
-        nets.step()
-        grids.step(1e-6)
-        for table in tables:  # the twins know of no buffers
-            del table.grad_buffer
+        try:
+            nets.zero_grad()
+            loss_of(field, at).backward()
+            nets.step()
+            grids.step(1e-6)
+        finally:
+            for table in tables:  # the twins know of no buffers
+                del table.grad_buffer
 
     return step
 
@@ -212,38 +214,38 @@ def twin_step(field: Field, at: Drawn, compiled: bool) -> Callable[[], None]:
 
 
 def steps(fitting: Fitting, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
-    """Million samples a second, ours and the twins', on the same field and rays.
+    """Samples a second, ours and the twins', on the same field and rays.
 
     In turn: a machine that others use, too, may be slower in one minute than in the next.
     """
     many = drawn(fitting, samples)
     few = many if twin_samples == samples else drawn(fitting, twin_samples)
-    jobs = {"ours": (our_step(fitting.field, many), many)}
-    jobs["eager"] = twin_step(fitting.field, few, False), few
-    jobs["compile"] = twin_step(fitting.field, few, True), few
-    found: dict[str, object] = {}
-    seconds: dict[str, list[float]] = {}
-    for round_ in range(repeats + 1):
-        for name, (job, _) in jobs.items():
-            if name in found:
-                continue
+    jobs = {
+        "ours": our_step(fitting.field, many),
+        "eager": twin_step(fitting.field, few, False),
+        "compile": twin_step(fitting.field, few, True),
+    }
+    counts = {name: (many if name == "ours" else few).samples.t.shape[0] for name in jobs}
+    taken: dict[str, list[float]] = {name: [] for name in jobs}
+    failed: dict[str, str] = {}
+    for turn in range(repeats + 1):
+        for name in [each for each in jobs if each not in failed]:
             try:
-                own = common.measure(job, STEPS if name == "ours" else 1, warm_up=1)
+                jobs[name]()  # the other's tables are in the caches
+                for _ in range(STEPS if name == "ours" else 1):
+                    own = common.measure(jobs[name], 1, warm_up=0)["median"]
+                    if turn:  # the first one compiles
+                        taken[name].append(own)
             except Exception as error:  # torch.compile needs a compiler, may not know an operation
-                found[name] = {"failed": f"{type(error).__name__}: {error}"[:300]}
-                continue
-            if round_:  # the first one compiles
-                seconds.setdefault(name, []).append(own["median"])
-    rates = {}
-    for name, own in seconds.items():
-        size = jobs[name][1].samples.t.shape[0]
-        taken = common.spread(own)
-        rates[name] = size / taken["median"]
-        found[name] = {"samples_per_s": rates[name], "samples": size, "seconds": taken}
-    for name in ("eager", "compile"):
-        if name in rates:
-            found[f"times_{name}"] = rates["ours"] / rates[name]
-    return found
+                failed[name] = f"{type(error).__name__}: {error}"[:300]
+    seconds = {name: common.spread(own) for name, own in taken.items() if name not in failed}
+    rates = {name: counts[name] / own["median"] for name, own in seconds.items()}
+    times = {
+        f"times_{name}": rates["ours"] / rates[name]
+        for name in ("eager", "compile")
+        if name in rates and "ours" in rates
+    }
+    return {**rates, **times, "samples": counts, "seconds": seconds, "failed": failed}
 
 
 # --- a whole fit ---------------------------------------------------------------------------------

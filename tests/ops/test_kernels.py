@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops import cpu, dispatch, reference
+from climatenerf.ops import cpu, dispatch, lanes, reference
 
 
 @pytest.fixture
@@ -24,9 +24,15 @@ def grid(generator, levels=4, log2_rows=9):
     return table, torch.tensor([4, 9, 21, 50])[:levels]
 
 
-def test_hash_encoding_and_its_gradient_match_the_twin(generator):
-    table, resolutions = grid(generator)
-    u = torch.rand(700, 3, generator=generator) * 0.999999
+@pytest.mark.parametrize("far", [False, True])
+def test_hash_encoding_and_its_gradient_match_the_twin(generator, far):
+    """With `far`, tables are so large that rows are asked for ahead, hashed and not."""
+    table, resolutions = grid(generator, log2_rows=18 if far else 9)
+    if far:
+        resolutions = torch.tensor([9, 60, 90, 200])
+        sides = (9, 60, 90, 200)
+        assert [lanes.is_far(table.numpy(), s) for s in sides] == [False, True, True, True]
+    u = torch.rand(709, 3, generator=generator) * 0.999999
     u[0], u[1] = 0.0, 0.999999
     fast_table = table.clone().requires_grad_()
     slow_table = table.double().clone().requires_grad_()

@@ -91,7 +91,7 @@ class _ThinnedDensity(torch.autograd.Function):
     @staticmethod
     def forward(ctx, raw, u):
         out = torch.empty_like(raw)
-        cpu_pointwise.density_forward(raw.detach().numpy(), u.numpy(), out.numpy())
+        cpu_pointwise.density_forward(raw.numpy(), u.numpy(), out.numpy())
         ctx.save_for_backward(raw, out)
         return out
 
