@@ -116,7 +116,7 @@ def density_forward(raw, u, out):
             shell = np.float32(2.0) - np.sqrt(square)
             shell = min(max(shell, np.float32(1e-4)), np.float32(1.0))
             y = min(raw[i], np.float32(LARGEST_RAW)) * np.float32(1.0 / LN2)
-            out[i] = _exp2(y) * shell * shell if raw[i] == raw[i] else raw[i]
+            out[i] = _exp2(y) * shell * shell
 
 
 @njit(cache=True, fastmath=_FAST, parallel=True)
