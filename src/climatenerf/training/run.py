@@ -152,7 +152,7 @@ def fit_scene(
     save_scene(scene, run)
     save_preview(fitting.field, scene, run, fitting.steps)
     metrics = {
-        "seconds": round(fitting.seconds, 1),
+        "seconds": round(fitting.seconds, 3),
         "steps": fitting.steps,
         "samples": fitting.samples,
         "interrupted": interrupted,
