@@ -18,6 +18,7 @@ from climatenerf.training.fit import Fitting
 from climatenerf.training.points import PointRays, find_point_rays
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import PAPER, FitSettings, Losses
+from climatenerf.training.transients import SUSPECT, still_cells
 
 
 def opacity(fitting):
@@ -102,7 +103,7 @@ def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypa
     batch.label[:], batch.relative = VEHICLE, torch.ones(4)
     mask = torch.tensor([0.9, 0.1, 0.4, 0.6])
     monkeypatch.setattr(fitting, "masks", lambda image, place: mask)
-    _, stays = fitting.colour_loss(torch.ones(4), batch)
+    _, stays = fitting.colour_loss(torch.ones(4, 3), torch.ones(4), batch)
     assert stays.label.tolist() == [UNKNOWN, VEHICLE, VEHICLE, UNKNOWN]
     assert torch.isnan(stays.relative).tolist() == [True, False, False, True]
     assert (batch.label == VEHICLE).all()
@@ -117,7 +118,7 @@ def test_a_triple_that_is_masked_in_part_is_none(scene, monkeypatch):
     mask = torch.zeros(n)
     mask[1], mask[n - 2 * m + 2] = 0.9, 0.9  # a middle, and a side of another
     monkeypatch.setattr(fitting, "masks", lambda image, place: mask)
-    _, stays = fitting.colour_loss(torch.ones(n), batch)
+    _, stays = fitting.colour_loss(torch.ones(n, 3), torch.ones(n), batch)
     assert stays.in_line.tolist() == [True, False, False]
 
 
@@ -223,25 +224,24 @@ def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypat
     """A network calls the ground a person, but points lie on it."""
     prices = []
 
-    def recorded(error, mask, price):
+    def recorded(error, unexplained, mask, price):
         prices.append(price)
         return (error + mask).mean()
 
     monkeypatch.setattr(losses, "masked_colour_loss", recorded)
     fitting = with_labels(scene, lambda ids: np.where(ids == 9, 11, ids))
     batch = fitting.pixels.draw(4000, torch.Generator().manual_seed(0))
-    fitting.colour_loss(torch.zeros(4000), batch)
+    fitting.colour_loss(torch.zeros(4000, 3), torch.zeros(4000), batch)
     person = batch.label == PERSON
     full = fitting.settings.losses.transient
     assert torch.isclose(prices[0][~person], torch.tensor(full)).all()
     still = torch.isclose(prices[0][person], torch.tensor(full))
-    suspected = torch.isclose(prices[0][person], torch.tensor(fit.SUSPECT * full))
+    suspected = torch.isclose(prices[0][person], torch.tensor(SUSPECT * full))
     assert (still | suspected).all() and still.float().mean() > 0.05 and suspected.any()
-    # Matched points tell as much as sparse ones.
-    told, fitting.points = fitting.cells_of_points(24), None
-    assert told.any() and torch.equal(fitting.cells_of_points(24), told)
-    fitting.measured = []
-    assert not fitting.cells_of_points(24).any()
+    images = fitting.still.shape[0]
+    told = still_cells(fitting.pixels, fitting.measured, images)
+    assert told.any() and torch.equal(told, fitting.still)
+    assert not still_cells(fitting.pixels, [], images).any()
 
 
 @pytest.mark.slow
@@ -291,3 +291,26 @@ def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
         fitting.step(fitting.pixels.draw(1024, fitting.generator))
         # The first ones are those of density: 1 / chance, and less near the cameras.
         assert (factors[0].min() < 1) == (crowded > 0)
+
+
+def test_what_a_neighbouring_pixel_shows_is_not_unexplained(scene, monkeypatch):
+    """Leaves before the sky are never met pixel by pixel, and no passers-by for that."""
+    found = []
+
+    def recorded(error, unexplained, mask, price):
+        found.append(unexplained)
+        return (error + mask).mean()
+
+    monkeypatch.setattr(losses, "masked_colour_loss", recorded)
+    fitting = begin(scene, steps=10)
+    fitting.steps = 9
+    pixels = fitting.pixels
+    batch = pixels.draw(4000, torch.Generator().manual_seed(0))
+    x = (batch.place[:, 0] * pixels.width[batch.image]).long()
+    y = (batch.place[:, 1] * pixels.height[batch.image]).long()
+    beside = (x + 1).minimum(pixels.width[batch.image] - 1)
+    shown = pixels.rgb[pixels.pixel_start[batch.image] + y * pixels.width[batch.image] + beside]
+    linear = decode_srgb(shown.float() / 255)
+    fitting.colour_loss(linear, torch.ones(4000), batch)
+    fitting.colour_loss(linear + 8.0, torch.ones(4000), batch)
+    assert found[0].max() < 1e-9 and found[1].min() > 1.0

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from climatenerf.errors import UserError
 from climatenerf.scene.cameras import Camera
@@ -97,3 +98,19 @@ def test_what_a_mask_hides_says_nothing_of_what_is_empty():
         assert pixels.witness is not None and pixels.label is not None
         assert bool(pixels.witness.agreed(x, radius)) == carved
         assert (pixels.label == UNKNOWN).any() == (not carved)
+
+
+def test_colours_nearby_are_the_least_and_largest_of_a_window():
+    """Against filters of whole pictures; at borders the window ends, and the next photo is none."""
+    pixels = made()
+    start = pixels.pixel_start.tolist()
+    batch = pixels.draw(3000, torch.Generator().manual_seed(0))
+    low, high = pixels.colours_nearby(batch.image, batch.place)
+    for i, camera in enumerate(pixels.cameras):
+        rgb = pixels.rgb[start[i] : start[i + 1]].numpy().reshape(camera.height, camera.width, 3)
+        some = batch.image == i
+        x, y = (batch.place[some].numpy() * (camera.width, camera.height)).astype(int).T
+        side = 2 * module.NEARBY + 1
+        for found, filtered in ((low, minimum_filter), (high, maximum_filter)):
+            expected = filtered(rgb, (side, side, 1), mode="nearest")[y, x] / 255
+            assert np.allclose(found[some].numpy(), expected, atol=1e-6)

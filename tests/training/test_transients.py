@@ -17,7 +17,8 @@ def train(error_at, images=4, steps=600):
     for _ in range(steps):
         image, place = torch.randint(images, (1024,)), torch.rand(1024, 2)
         error = error_at(image, place)
-        loss = losses.masked_colour_loss(error, masks(image, place), torch.full((1024,), PRICE))
+        price = torch.full((1024,), PRICE)
+        loss = losses.masked_colour_loss(error, error, masks(image, place), price)
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -50,15 +51,36 @@ def test_a_static_capture_is_left_alone():
     assert (m > 0.5).float().mean() < 0.02
 
 
+def test_a_capture_without_anything_amiss_does_not_wear_masks_out():
+    """With nothing to push against, M would sink to 0 and never come back: someone comes late."""
+    step = iter(range(10**9))
+    masks = train(lambda image, place: 0.1 * person(image, place) * (next(step) > 400), steps=700)
+    image, place = torch.randint(4, (8000,)), torch.rand(8000, 2)
+    with torch.no_grad():
+        m = masks(image, place)
+    there = person(image, place)
+    assert m[there].mean() > 0.8 and m[~there].mean() < 0.05, (m[there].mean(), m[~there].mean())
+
+
 def test_masked_loss_is_lowest_at_the_price():
-    """Turning M on pays exactly where the error is above the price."""
-    price = torch.tensor([PRICE])
-    for error, best in ((2 * PRICE, 1.0), (0.5 * PRICE, 0.0)):
-        found = [
-            float(losses.masked_colour_loss(torch.tensor([error]), torch.tensor([m]), price))
-            for m in (0.0, 1.0)
-        ]
-        assert (found[1] < found[0]) == (best == 1.0)
+    """Turning M on pays exactly where the unexplained error is above the price."""
+    price, m = torch.tensor([PRICE]), torch.linspace(0.001, 0.999, 999)[:, None]
+    for unexplained, best in ((2 * PRICE, 0.999), (0.5 * PRICE, 2 * losses.FAINT)):
+        off = torch.tensor([unexplained])
+        found = [losses.masked_colour_loss(off * 0, off, each, price) for each in m]
+        assert abs(float(m[int(torch.stack(found).argmin())]) - best) < 1e-3
+
+
+def test_colours_learn_from_their_error_and_masks_from_what_is_unexplained():
+    error, unexplained = torch.tensor([0.3, 0.3]), torch.tensor([0.0, 0.2])
+    mask, price = torch.tensor([0.25, 0.25]), torch.full((2,), PRICE)
+    for each in (error, unexplained, mask):
+        each.requires_grad_()
+    losses.masked_colour_loss(error, unexplained, mask, price).backward()
+    assert error.grad is not None and torch.allclose(error.grad, torch.full((2,), 0.75 / 2))
+    assert unexplained.grad is None
+    expected = PRICE - unexplained.detach() - PRICE * losses.FAINT / 0.25
+    assert mask.grad is not None and torch.allclose(mask.grad, expected / 2)
 
 
 def test_features_are_bilinear_and_each_images_own():

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
@@ -22,7 +22,7 @@ from climatenerf.ops import dispatch, reference
 from climatenerf.ops.placing import array_of, placed, uniform
 from climatenerf.ops.vectors import unit
 from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
-from climatenerf.scene.classes import PERSON, SKY, SOLID_OF, UNKNOWN, VEGETATION, VEHICLE
+from climatenerf.scene.classes import SKY, SOLID_OF, UNKNOWN, VEGETATION
 from climatenerf.training import losses
 from climatenerf.training.carving import Carving, on_the_ground
 from climatenerf.training.gradients import scale_gradient
@@ -34,7 +34,12 @@ from climatenerf.training.poses import RATE as POSE_RATE
 from climatenerf.training.poses import PoseCorrections
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.sky_fill import fill_sky
-from climatenerf.training.transients import MASKED, TransientMasks
+from climatenerf.training.transients import (
+    MASKED,
+    TransientMasks,
+    prices_of_masks,
+    still_cells,
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +99,7 @@ class Fitting:
             matched = matched.some(~on_the_ground(label))
         self.measured = [each for each in (points, matched) if each is not None]
         kinds = pixels.kinds()
-        self.still = self.cells_of_points(images)
+        self.still = still_cells(pixels, self.measured, images)
         self.solid_of = placed(SOLID_OF.astype(np.int64))
         kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]
         # A head that has met one class alone, or nothing but ground, would say so of everything.
@@ -229,7 +234,7 @@ class Fitting:
         ray = samples.ray_index()[kept][seen]
         radiance = self.radiance(batch, u[seen], ray, share[seen], left, spread[seen])
         error = losses.colour_error(radiance, batch.rgb)
-        loss, batch = self.colour_loss(error, batch)
+        loss, batch = self.colour_loss(radiance.detach(), error, batch)
         loss = loss + self.geometry_loss(batch, samples, weights, left, t, dt)
         loss = loss + self.surface_loss(
             batch, u[seen], ray, share[seen].detach(), samples, kept[seen]
@@ -270,7 +275,7 @@ class Fitting:
         return reference.contract(self.field.to_grid(x))
 
     def colour_loss(
-        self, error: Float[Tensor, "n"], batch: Batch
+        self, radiance: Float[Tensor, "n 3"], error: Float[Tensor, "n"], batch: Batch
     ) -> tuple[Float[Tensor, ""], Batch]:
         """Mean squared error of the colours, without what is taken for transient.
 
@@ -281,35 +286,17 @@ class Fitting:
             return error.mean(), batch
         # As long as all is wrong, nothing stands out.
         price = max(price, OUTSTANDING * self.error)
-        # What can move is suspected sooner; but a word alone removes nothing, and what several
-        # photos show in one place has not moved.
-        movable = (batch.label == PERSON) | (batch.label == VEHICLE)
-        cell = (batch.place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
-        movable &= ~self.still[batch.image, cell[:, 1], cell[:, 0]]
-        prices = torch.where(movable, price * SUSPECT, price)
+        prices = prices_of_masks(price, batch.label, batch.image, batch.place, self.still)
         mask = self.masks(batch.image, batch.place)
         gone = mask.detach() > MASKED
         label = batch.label.masked_fill(gone, UNKNOWN)
         relative = None if batch.relative is None else batch.relative.masked_fill(gone, torch.nan)
         in_line = batch.in_line & ~gone[triples(gone.shape[0], batch.in_line.shape[0])].any(0)
         stays = replace(batch, label=label, relative=relative, in_line=in_line)
-        return losses.masked_colour_loss(error, mask, prices), stays
-
-    def cells_of_points(self, images: int) -> Bool[Tensor, "images cells cells"]:
-        """Where in each image sparse or matched points lie on what it labels person or vehicle.
-
-        A point is found by several photos in one place: a parked car, or a cairn that a network
-        takes for a person.
-        """
-        still = torch.zeros(images, STILL_CELLS, STILL_CELLS, dtype=torch.bool)
-        for points in self.measured:
-            image, d = points.image, points.rays_d
-            label = self.pixels.label_towards(image, d)
-            own = (label == PERSON) | (label == VEHICLE)
-            place = self.pixels.place_towards(image[own], d[own])
-            cell = (place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
-            still[image[own], cell[:, 1], cell[:, 0]] = True
-        return still
+        # Fine texture is never met pixel by pixel, but its neighbours have such colours.
+        low, high = self.pixels.colours_nearby(batch.image, batch.place)
+        unexplained = losses.colour_error(radiance, encode_srgb(radiance).clamp(low, high))
+        return losses.masked_colour_loss(error, unexplained, mask, prices), stays
 
     def geometry_loss(
         self,
@@ -583,8 +570,6 @@ EDGE_SHARE = 0.1  # of the other rays that are drawn from the sky's edges,
 EDGES_AT = 0.5  # from this stage on
 SKY_LOOKS = 64  # directions in which the sky is filled, a step
 OUTSTANDING = 6.0  # times the mean error: the least price of a mask
-SUSPECT = 0.25  # of the price of a mask where the label is of a kind that can move,
-STILL_CELLS = 24  # unless points lie on it in a cell of so many along a photo's sides
 BEND_STEP = 1.0  # of a marching step: over it the density's slope is taken
 POSE_SHARE = POSE_RATE / 1e-2  # of the networks' rate
 SURE_PULL = 4.0  # of the ground loss's weight, once the field's own classes tell ground

@@ -133,11 +133,24 @@ def normal_loss(
     return (weights * (predicted - target).square().sum(-1)).sum() / rays
 
 
+# M that costs least where nothing is amiss: at 0 it would learn no more. Such are M's first values.
+FAINT = 0.018
+
+
 def masked_colour_loss(
-    error: Float[Tensor, "n"], mask: Float[Tensor, "n"], price: Float[Tensor, "n"]
+    error: Float[Tensor, "n"],
+    unexplained: Float[Tensor, "n"],
+    mask: Float[Tensor, "n"],
+    price: Float[Tensor, "n"],
 ) -> Float[Tensor, ""]:
-    """Mean of (1 - M)·error + price·M: see `transients.py`."""
-    return ((1.0 - mask) * error + price * mask).mean()
+    """Mean of (1 - M)·error + price·M, where M weighs what is unexplained: see `transients.py`.
+
+    Colours learn from their error, as far as M lets them; M from the error that no pixel nearby
+    explains.
+    """
+    trusted = 1.0 - mask
+    paid = price * (mask - FAINT * mask.log())
+    return (trusted.detach() * error + trusted * unexplained.detach() + paid).mean()
 
 
 FAR = 0.05  # of `distance_measure`

@@ -26,6 +26,7 @@ GROUND_SHARE = 0.5  # or ground
 STANDING_SHARE = 0.5  # or things that stand on it
 AT_MOST = 2**22  # pixels drawn at once where masks hide nearly all
 IN_MEMORY = 2_000_000_000  # bytes that the colours of all photos may take there, or their labels
+NEARBY = 1  # pixels to all sides whose colours a pixel may have, too, before it counts as wrong
 EDGE = 2  # pixels to both sides that are such an edge
 
 
@@ -184,6 +185,22 @@ class TrainingPixels:
             inside, pixel = self.pixel_towards(image, rays_d)
             out[inside] = self.usable[pixel]
         return out
+
+    def colours_nearby(
+        self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Least and largest display sRGB, by channel, of the pixels up to `NEARBY` away."""
+        width, height = self.width[image], self.height[image]
+        x, y = (place[:, 0] * width).long(), (place[:, 1] * height).long()
+        pixels = [
+            self.pixel_start[image]
+            + (y + down).clamp_min(0).minimum(height - 1) * width
+            + (x + right).clamp_min(0).minimum(width - 1)
+            for down in range(-NEARBY, NEARBY + 1)
+            for right in range(-NEARBY, NEARBY + 1)
+        ]
+        low, high = torch.aminmax(self.rgb[torch.stack(pixels)], dim=0)
+        return low.float() / 255.0, high.float() / 255.0
 
     @property
     def knows_sky(self) -> bool:

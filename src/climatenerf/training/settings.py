@@ -35,7 +35,7 @@ class Losses:
     bend: float = 0.0
     """The density's normals differ from the predicted ones: moves matter, costs a third more, and
     wants normals above 0."""
-    transient: float = 0.04
+    transient: float = 0.02
     """Price of a pixel that is taken for transient, in squared display values; 0: none is."""
 
 

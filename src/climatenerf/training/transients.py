@@ -3,18 +3,27 @@
 A passer-by is seen by one photo only and cannot be explained by a static scene. Each image has a
 mask M in [0,1] over it; where M is 1 its colours do not count, at a price. Minimising
 (1 - M) · error + price · M turns M on just where the error stays above the price (paper,
-"Transient Object Occlusion"; the price is its mask regulariser).
+"Transient Object Occlusion"; the price is its mask regulariser). The error that M weighs is what
+no pixel nearby explains: fine texture, never met pixel by pixel, is no passer-by.
 """
 
+from collections.abc import Sequence
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from climatenerf.scene.classes import PERSON, VEHICLE
+from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.points import PointRays
 
 CELLS = (6, 12, 24, 48)  # along each side of an image, of the mask's levels
 HIDDEN = 16
 MASKED = 0.5  # of M: such a pixel is of a passer-by
 FEATURES = 2
+SUSPECT = 0.1  # of the price of a mask where the label is of a kind that can move,
+STILL_CELLS = 24  # unless points lie on it in a cell of so many along a photo's sides
 
 
 class TransientMasks(nn.Module):
@@ -75,3 +84,43 @@ class TransientMasks(nn.Module):
             )
             found.append(looked[0, :, 0].T)
         return torch.cat(found, dim=-1)
+
+
+def can_move(label: UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Which merged classes are of things that come and go."""
+    return (label == PERSON) | (label == VEHICLE)
+
+
+def still_cells(
+    pixels: TrainingPixels, measured: Sequence[PointRays], images: int
+) -> Bool[Tensor, "images cells cells"]:
+    """Where in each image points lie on what its label says can move.
+
+    A point is found by several photos in one place: a parked car, or a cairn that a network takes
+    for a person.
+    """
+    still = torch.zeros(images, STILL_CELLS, STILL_CELLS, dtype=torch.bool)
+    for points in measured:
+        own = can_move(pixels.label_towards(points.image, points.rays_d))
+        image = points.image[own]
+        place = pixels.place_towards(image, points.rays_d[own])
+        cell = (place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
+        still[image, cell[:, 1], cell[:, 0]] = True
+    return still
+
+
+def prices_of_masks(
+    price: float,
+    label: UInt8[Tensor, "n"],
+    image: Int[Tensor, "n"],
+    place: Float[Tensor, "n 2"],
+    still: Bool[Tensor, "images cells cells"],
+) -> Float[Tensor, "n"]:
+    """What it costs to mask pixels, at (x, y) of images in (0,1).
+
+    What can move is suspected sooner; but a word alone removes nothing, and what several photos
+    show in one place has not moved.
+    """
+    cell = (place * STILL_CELLS).long().clamp_max(STILL_CELLS - 1)
+    movable = can_move(label) & ~still[image, cell[:, 1], cell[:, 0]]
+    return torch.where(movable, price * SUSPECT, price)
