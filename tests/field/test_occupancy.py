@@ -165,7 +165,7 @@ def test_density_met_by_rays_is_remembered():
     d = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
     samples = field.march(o, d, torch.zeros(200), torch.full((200,), 1e9))
     which = samples.t > 1.0
-    field.keep_occupied(o, d, samples, which)
+    field.keep_occupied(o, d, samples, which.nonzero()[:, 0])
     ray = samples.ray_index()
     cells, _ = field._cells(field.to_grid(o[ray] + samples.t[:, None] * d[ray]))
     known = field.occupancy.density.view(-1)
@@ -173,3 +173,20 @@ def test_density_met_by_rays_is_remembered():
     untouched = torch.ones(known.shape[0], dtype=torch.bool)
     untouched[cells[which]] = False
     assert (known[untouched] == 0).all()
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5])
+def test_known_cells_found_at_once_are_occupied_ones_from_everywhere(share):
+    occupancy = Occupancy(2, 16)
+    generator = torch.Generator().manual_seed(0)
+    occupancy.occupied = (torch.rand(2, 16, 16, 16, generator=generator) < share).to(torch.uint8)
+    drawn = occupancy._spread(4000, generator)
+    found = occupancy._known_at_once(drawn, 1000)
+    exact = occupancy._known(drawn, 1000)
+    held = occupancy.occupied.view(-1)
+    assert found.shape == (1000,) and torch.isin(found, drawn).all()
+    assert (held[found] > 0).float().mean() > (0.99 if share == 0.5 else 0.05)
+    if share == 0.5:  # some are left out, and not those at the end
+        assert abs(found.float().mean() / exact.float().mean() - 1) < 0.1
+    else:
+        assert set(exact.tolist()) <= set(found.tolist())

@@ -15,7 +15,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import JITFunction
 
 from climatenerf.field.presets import PRESETS, FieldSize
-from climatenerf.ops import gpu, gpu_network, gpu_render
+from climatenerf.ops import gpu, gpu_network, gpu_render, gpu_witness
 from climatenerf.scene.classes import SOLID
 
 CARD = GPUTarget("cuda", int(sys.argv[1]) if len(sys.argv) > 1 else 80, 32)
@@ -76,6 +76,10 @@ def compile_all() -> None:
     gpu.distortion_forward(some, some, some, whole, real[:, 0])
     gpu.distortion_backward(some, some, some, whole, real[:, 0], some)
     gpu.merge_order(some, whole, some, whole, whole, order)
+    maps, few = torch.zeros(s, dtype=torch.uint8), torch.zeros(2, dtype=torch.long)
+    views = maps, few, torch.zeros(2, 2, dtype=torch.long), torch.zeros(2, 4), torch.zeros(2, 4, 4)
+    for count in (views, tuple(each[:1] for each in views)):
+        gpu_witness.voices_of(u, some, count, (1, 0.1, 0.5), maps)
     gpu.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
     for size in PRESETS.values():  # their widths are constants of the kernels
         rays = torch.zeros(n, size.colour_hidden), order

@@ -23,7 +23,7 @@ os.environ["TRITON_INTERPRET"] = str(int(DEVICE == "cpu"))  # it is read where a
 triton = pytest.importorskip("triton", reason="Triton is for Linux")
 import triton.language as tl  # noqa: E402
 
-from climatenerf.ops import gpu, gpu_march, gpu_network, gpu_render  # noqa: E402
+from climatenerf.ops import gpu, gpu_march, gpu_network, gpu_render, gpu_witness  # noqa: E402
 
 # The interpreter's numbers are NumPy's, which warns where a hash's products wrap around.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -50,6 +50,7 @@ def gpu_kernels(monkeypatch):
     for module in (gpu, gpu_march, gpu_network):
         monkeypatch.setattr(module, "SAMPLES", 16)
     monkeypatch.setattr(gpu, "LIST", 4)
+    monkeypatch.setattr(gpu_witness, "PLACES", 64)
     monkeypatch.setattr(gpu, "ENTRIES", 16)
     monkeypatch.setattr(gpu_network, "PROGRAMS", 2)  # each goes through several tiles
 
@@ -342,6 +343,27 @@ def test_adam_leaves_entries_without_gradient_alone(generator):
     assert torch.equal(ours.cpu()[~some], start[~some])
 
 
+def test_places_that_views_agree_on(generator):
+    """Three views in a row look along z over maps that differ in size, on 300 places around."""
+    sizes = torch.tensor([[12, 16], [20, 10], [12, 16]])
+    maps = [torch.randint(0, 9, (h, w), generator=generator) for h, w in sizes.tolist()]
+    ends = torch.tensor([each.numel() for each in maps]).cumsum(0)
+    pinholes = torch.tensor([[9.0, 9.0, 8.0, 6.0], [12.0, 11.0, 5.0, 10.0], [9.0, 9.0, 8.0, 6.0]])
+    c2w = torch.eye(4).repeat(3, 1, 1)
+    c2w[:, 0, 3] = torch.tensor([-0.3, 0.0, 0.4])
+    x = torch.tensor([0.5, 0.5, 2.0]) * random(generator, 300, 3) + torch.tensor([0.0, 0.0, 2.0])
+    radius = 0.4 * torch.rand(300, generator=generator)
+    row = torch.cat([each.view(-1) for each in maps]).to(torch.uint8)
+    views = row, torch.cat([ends[:1] * 0, ends[:-1]]), sizes, pinholes, c2w
+    for least in ((1, 0.5, 0.2), (2, 0.7, 0.5)):
+        ours = dispatch.voices_of(
+            x.to(DEVICE), radius.to(DEVICE), tuple(each.to(DEVICE) for each in views), least
+        ).cpu()
+        real = reference.voices_of(x, radius, [each.float() for each in maps], pinholes, c2w, least)
+        # Rounding may put a place that lies on a pixel's border into its neighbour.
+        assert (ours != real).sum() <= 1 and 10 < real.sum() < 200
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("card", ["80", "90"])
 def test_all_kernels_compile_for_cuda(card, tmp_path):
@@ -354,7 +376,7 @@ def test_all_kernels_compile_for_cuda(card, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     kernels = {
         name
-        for module in (gpu, gpu_march, gpu_network, gpu_render)
+        for module in (gpu, gpu_march, gpu_network, gpu_render, gpu_witness)
         for name in vars(module)
         if is_launched(module, name)
     }

@@ -12,8 +12,10 @@ from climatenerf.training import ground_map
 from climatenerf.training.carving import Carving
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import PointRays
+from climatenerf.training.rooms import Rooms
 from climatenerf.training.settings import FitSettings
 
+EXACT = Rooms(fixed=False)
 TRAIN_ID = {BUILDING: 2, TERRAIN: 9, SKY: 10}
 
 
@@ -192,8 +194,9 @@ def rim(shift):
 
 
 def asked(found, x, d, t, classed=False):
-    far, _ = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit, classed)
-    return torch.zeros(len(x), dtype=torch.bool).index_fill(0, far, True)
+    q = found.field.to_grid(x)
+    far, _, pulled = found.far_from_ground(q, d, t / found.field.unit, EXACT, classed)
+    return torch.zeros(len(x), dtype=torch.bool).index_fill(0, far[pulled], True)
 
 
 def test_the_air_beside_the_tower_costs_and_the_tower_does_not():
@@ -278,9 +281,10 @@ def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
     d = (foot - o) / way[:, None]
     t = way * torch.tensor([0.7, 1.0, 1.2, 1.0])  # above, on and under the ground; on the tower
     x = o + t[:, None] * d
-    far, goal = found.far_from_ground(found.field.to_grid(x), d, t / found.field.unit)
-    assert far.tolist() == [0, 2]
-    assert torch.allclose(goal * found.field.unit, way[[0, 2]], atol=0.15)
+    q = found.field.to_grid(x)
+    far, goal, pulled = found.far_from_ground(q, d, t / found.field.unit, EXACT)
+    assert far[pulled].tolist() == [0, 2]
+    assert torch.allclose(goal[pulled] * found.field.unit, way[[0, 2]], atol=0.15)
 
 
 def test_what_stands_is_spared_with_a_rim_about_it():

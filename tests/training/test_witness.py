@@ -156,13 +156,12 @@ def test_the_kernel_matches_its_twin():
         cameras, c2w, [labels(*each) for each in zip(cameras, c2w, strict=True)], [SKY], 0.1
     )
     x, radius = places(), 0.3 * torch.rand(4000, generator=torch.Generator().manual_seed(1))
-    ends = found.starts + found.sizes.prod(1)
+    row, starts, sizes, *views = found.views
     reach = [
-        torch.from_numpy(found.reach[start:end].reshape(size).astype(np.float32))
-        for start, end, size in zip(found.starts, ends, found.sizes, strict=True)
+        row[start : start + h * w].view(h, w).float()
+        for start, (h, w) in zip(starts.tolist(), sizes.tolist(), strict=True)
     ]
     least = (witness.LEAST_VOICES, found.share, found.apart)
-    views = (torch.from_numpy(found.pinholes), torch.from_numpy(found.c2w))
     real = reference.voices_of(x, radius, reach, *views, least)
     ours = found.agreed(x, radius)
     # Rounding may put a place that lies on a pixel's border into its neighbour.

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from climatenerf.field import activations, directions
@@ -204,6 +204,7 @@ class Field(nn.Module):
         jitter: Float[Tensor, "n"] | None = None,
         stop: float = 1e-3,
         thin: float | None = None,
+        room: int | None = None,
     ) -> Samples:
         """Samples of rays where matter is, without gradient.
 
@@ -217,6 +218,7 @@ class Field(nn.Module):
             stop: transmittance at which a ray ends.
             thin: optical depth below which a sample counts as empty; default: the field's, which is
                 of the steps of a camera's rays. Rays that begin beside matter have finer ones.
+            room: how many samples there are to be, the rest 0; default: as many as it takes.
         """
         thin = self.thin if thin is None else thin
         if jitter is None:
@@ -228,6 +230,7 @@ class Field(nn.Module):
             (STEP_MIN * step_scale, STEP_CONE * step_scale, thin),
             stop,
             self._net(),
+            room,
         )
         return Samples(offsets, t * self.unit, dt * self.unit, sigma / self.unit)
 
@@ -295,7 +298,9 @@ class Field(nn.Module):
     ) -> Float[Tensor, "n 3"]:
         """As `density_normal`, by differences over `step` (grid units), with gradients to the
         parameters: the corners of a tetrahedron give the slope by four densities."""
-        corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+        k = torch.arange(4)
+        x, y = 1.0 - 2.0 * (k // 2), 1.0 - 2.0 * (k % 2)
+        corners = torch.stack([x, y, x * y], dim=-1)
         around = q[:, None] + step[:, None, None] * corners
         flat = around.reshape(-1, 3)
         thinned = flat.square().sum(-1).clamp_min(1.0).log()
@@ -309,13 +314,12 @@ class Field(nn.Module):
         rays_o: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         samples: Samples,
-        which: Bool[Tensor, "s"],
+        some: Int[Tensor, "k"],
     ) -> None:
         """Tells the occupancy of density met at some samples of rays (world m).
 
         A thin surface fills little of its cells; looks at random places miss it again and again.
         """
-        some = which.nonzero()[:, 0]
         ray = samples.ray_index()[some]
         cells, inside = self._cells(self.to_grid(rays_o[ray] + samples.t[some, None] * rays_d[ray]))
         density = self.occupancy.density.view(-1)

@@ -89,8 +89,7 @@ class Occupancy(torch.nn.Module):
             count = max(1, int(total * fraction / 2))
             anywhere = self._spread(count, generator)
             drawn = self._spread(4 * count, generator)
-            known = drawn[held[drawn] > 0]
-            known = known[:: max(1, known.shape[0] // count)]
+            known = (self._known_at_once if drawn.is_cuda else self._known)(drawn, count)
             half = integers(generator, 0, max(1, known.shape[0]), known.shape[0] // 2)
             cells = torch.cat([anywhere, known, self._neighbours(known[half], generator)])
         centre, size = self.cell_centres(cells)
@@ -103,6 +102,20 @@ class Occupancy(torch.nn.Module):
             threshold = self._thresholds(anywhere[:: max(1, count // FOR_MEAN)])
             dense = flat[cells] * size > threshold[cells // self.side**3]
             held[cells] = (dense & ~self.barred.view(-1)[cells]).to(torch.uint8)
+
+    def _known(self, drawn: Int[Tensor, "m"], count: int) -> Int[Tensor, "n"]:
+        """Those of some cells that are occupied, thinned out to about `count`."""
+        known = drawn[self.occupied.view(-1)[drawn] > 0]
+        return known[:: max(1, known.shape[0] // count)]
+
+    def _known_at_once(self, drawn: Int[Tensor, "m"], count: int) -> Int[Tensor, "count"]:
+        """As `_known`, without a GPU's having to count them: `count`, if need be with any other.
+
+        In no order, so that what is left out is spread evenly.
+        """
+        mixed = drawn[torch.randperm(drawn.shape[0], device=drawn.device)]
+        found = torch.nonzero_static(self.occupied.view(-1)[mixed], size=count, fill_value=0)[:, 0]
+        return mixed[found]
 
     def _spread(self, count: int, generator: torch.Generator) -> Int[Tensor, "n"]:
         """About `count` cells at equal distances from a random one on.
@@ -132,7 +145,7 @@ class Occupancy(torch.nn.Module):
         cascade = cells // self.side**3
         depth = self.density.view(-1)[cells] * 2.0 ** (cascade + 1) / self.side
         total = torch.zeros(count).index_add(0, cascade, depth)
-        number = torch.bincount(cascade, minlength=count).clamp_min(1)
+        number = torch.zeros(count).index_add(0, cascade, torch.ones_like(depth)).clamp_min(1)
         return (total / number).clamp_max(OPACITY)
 
     def _threshold(self) -> None:

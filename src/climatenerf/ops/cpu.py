@@ -544,11 +544,12 @@ def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correc
 
 
 @njit(cache=True, parallel=True)
-def voices_of(x, radius, reach, starts, sizes, pinholes, c2w, least, agreed):
+def voices_of(x, radius, views, least, agreed):
     """Which places enough views see before nothing but sky, or ground: see `reference.voices_of`.
 
-    Args: the maps of all views in one row, reach, each from starts [v] on and of sizes [v, 2].
+    Args: views: their maps in one row, each from starts [v] on and of sizes [v, 2], pinholes, c2w.
     """
+    reach, starts, sizes, pinholes, c2w = views
     least_voices, least_share, apart = least
     views = c2w.shape[0]
     for i in prange(x.shape[0]):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.ops import cpu, cpu_network, reference
@@ -89,7 +89,8 @@ def hash_encode(
 class _RenderWeights(torch.autograd.Function):
     @staticmethod
     def forward(ctx, tau, offsets, kernels):
-        weights, left = torch.empty_like(tau), tau.new_empty(offsets.shape[0] - 1)
+        # Zeros: what follows the last ray's samples belongs to none.
+        weights, left = torch.zeros_like(tau), tau.new_empty(offsets.shape[0] - 1)
         kernels.weights_forward(_array(tau), _array(offsets), _array(weights), _array(left))
         ctx.kernels = kernels
         ctx.save_for_backward(tau, offsets)
@@ -98,7 +99,7 @@ class _RenderWeights(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad_w, grad_t):
         tau, offsets = ctx.saved_tensors
-        grad = torch.empty_like(tau)
+        grad = torch.zeros_like(tau)
         ctx.kernels.weights_backward(
             _array(tau), _array(offsets), _array(grad_w), _array(grad_t), _array(grad)
         )
@@ -130,7 +131,7 @@ class _Accumulate(torch.autograd.Function):
     def backward(ctx, grad):
         weights, values, offsets = ctx.saved_tensors
         given = values.T if ctx.kernels is cpu else values
-        grad_w, grad_v = torch.empty_like(weights), values.new_empty(given.shape)
+        grad_w, grad_v = torch.zeros_like(weights), values.new_zeros(given.shape)
         ctx.kernels.accumulate_backward(
             *map(_array, (weights, given, offsets, grad, grad_w, grad_v))
         )
@@ -158,7 +159,7 @@ class _Surface(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad_logits, grad_apart):
         weights, raw, target, offsets = ctx.saved_tensors
-        grad = raw.new_empty(raw.shape[1], raw.shape[0])
+        grad = raw.new_zeros(raw.shape[1], raw.shape[0])
         given = (weights, raw.T, target, offsets, grad_logits, grad_apart, grad)
         cpu.surface_backward(*map(_array, given))
         return None, grad.T, None, None
@@ -196,7 +197,7 @@ class _Distortion(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         weights, s, ds, offsets = ctx.saved_tensors
-        grad_w = torch.empty_like(weights)
+        grad_w = torch.zeros_like(weights)
         ctx.kernels.distortion_backward(*map(_array, (weights, s, ds, offsets, grad, grad_w)))
         return grad_w, None, None, None, None
 
@@ -355,6 +356,35 @@ def merge_order(
 
 # --- without gradients ---------------------------------------------------------------------------
 
+Views = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""Maps of some views in one row (8 bits), where each starts, sizes (rows, columns), fx fy cx cy,
+c2w."""
+
+
+def voices_of(
+    x: Float[Tensor, "n 3"],
+    radius: Float[Tensor, "n"],
+    views: Views,
+    least: tuple[int, float, float],
+) -> Bool[Tensor, "n"]:
+    """See `reference.voices_of`."""
+    kernels = _kernels(x, radius, *views)
+    if kernels is None:
+        reach, starts, sizes, pinholes, c2w = views
+        corners = zip(starts.tolist(), sizes.tolist(), strict=True)
+        maps = [reach[start : start + h * w].view(h, w) for start, (h, w) in corners]
+        return reference.voices_of(x, radius, maps, pinholes, c2w, least)
+    agreed = torch.empty_like(radius, dtype=torch.uint8)
+    given = _array(x), _array(radius), tuple(map(_array, views)), least
+    if kernels is cpu:
+        cpu.voices_of(*given, _array(agreed))
+    else:
+        from climatenerf.ops import gpu_witness
+
+        gpu_witness.voices_of(*given, agreed)
+    return agreed.bool()
+
+
 Net = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 """Table and resolutions of an encoding; w1, b1, w2, b2 of the network of one hidden layer on it."""
 Cells = tuple[Int[Tensor, "k w w w"] | UInt8[Tensor, "k g g g"], UInt8[Tensor, "k b b b"]]
@@ -364,7 +394,7 @@ Cells = tuple[Int[Tensor, "k w w w"] | UInt8[Tensor, "k g g g"], UInt8[Tensor, "
 def _cpu_net(net: Net) -> tuple:
     """With the weights turned: a unit's lie side by side."""
     table, resolutions, w1, b1, w2, b2 = net
-    return *map(_array, (table, resolutions, w1.T, b1, w2.T)), np.float32(b2[0].item())
+    return *map(_array, (table, resolutions, w1.T, b1, w2.T)), _array(b2)[0]
 
 
 @torch.no_grad()
@@ -409,7 +439,7 @@ def positions(
     if kernels is None:
         o, d = (torch.repeat_interleave(each, offsets.diff(), dim=0) for each in rays)
         return reference.contract(o + t[:, None] * d)
-    u = t.new_empty(t.shape[0], 3)
+    u = t.new_zeros(t.shape[0], 3)
     kernels.grid_positions(*map(_array, (*rays, offsets, t, u)))
     return u
 
@@ -466,6 +496,7 @@ def march(
     steps: tuple[float, float, float],
     stop: float,
     net: Net,
+    total: int | None = None,
 ) -> tuple[Int[Tensor, "n+1"], Float[Tensor, "3 s"]]:
     """See `reference.march`: all rays' samples, packed, and their offsets.
 
@@ -476,6 +507,8 @@ def march(
         steps: the smallest one, the step per length, the optical depth below which one is empty.
         stop: transmittance at which a ray ends.
         net: of the density.
+        total: length of the samples' list; what is over is 0, the last at least, and samples that
+            find no room are left out. None: as many as there are, for which a GPU has to be asked.
 
     Returns:
         Offsets; t, dt (grid units) and sigma (1/grid unit) of the samples.
@@ -488,19 +521,24 @@ def march(
     weights = _cpu_net(net) if kernels is cpu else tuple(map(_array, net))
     # The room for samples is used again and again: fresh memory would cost more than marching.
     room = _array(_room(rays[0], at_once, kernels is cpu))
-    counts, parts = [], []
+    parts, ends = [], [torch.zeros_like(spans[:1, 0], dtype=torch.long)]
+    out = None if total is None else spans.new_zeros(3, total)
     for o, d, span in zip(*(x.split(at_once) for x in (*rays, spans)), strict=True):
         count = o.new_zeros(o.shape[0], dtype=torch.long)
         kernels.march(
             _array(o), _array(d), _array(span), occupied, steps, stop, weights, room, _array(count)
         )
-        offsets = torch.cat([count.new_zeros(1), count.cumsum(0)])
-        part = o.new_empty(3, int(offsets[-1]))
-        kernels.pack(room, _array(offsets), _array(part))
-        counts.append(count)
-        parts.append(part)
-    offsets = torch.cat([counts[0].new_zeros(1), torch.cat(counts).cumsum(0)])
-    return offsets, torch.cat(parts, dim=1)
+        begin = ends[-1][-1:]
+        own = count.cumsum(0)
+        if out is None:
+            part = o.new_empty(3, int(own[-1]))
+            kernels.pack(room, _array(torch.cat([own[:1] * 0, own])), _array(part))
+            parts.append(part)
+            ends.append(begin + own)
+        else:
+            ends.append((begin + own).clamp_max(out.shape[1] - 1))
+            kernels.pack(room, _array(torch.cat([begin, ends[-1]])), _array(out))
+    return torch.cat(ends), torch.cat(parts, dim=1) if out is None else out
 
 
 @torch.no_grad()

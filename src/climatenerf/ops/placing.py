@@ -23,10 +23,18 @@ def array_of(tensor: Tensor) -> np.ndarray:
 
 def uniform(generator: torch.Generator, *shape: int) -> Float[Tensor, "..."]:
     """Random numbers in [0,1)."""
-    return torch.rand(shape, generator=generator, device="cpu").to(torch.get_default_device())
+    return sent(torch.rand(shape, generator=generator, device="cpu"))
 
 
 def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> Int[Tensor, "..."]:
     """Random whole numbers from low to high - 1."""
     drawn = torch.randint(low, high, shape, generator=generator, device="cpu")
-    return drawn.to(torch.get_default_device())
+    return sent(drawn)
+
+
+def sent(tensor: Tensor) -> Tensor:
+    """Numbers of the CPU on the device in use; on a GPU they arrive before they are asked for."""
+    device = torch.get_default_device()
+    if device.type != "cuda":
+        return tensor.to(device)
+    return tensor.pin_memory().to(device, non_blocking=True)

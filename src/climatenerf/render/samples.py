@@ -12,7 +12,10 @@ LEAST_TAU = 1e-3  # optical depth of samples that count as empty; later in a fit
 
 @dataclass
 class Samples:
-    """Samples of n rays, packed by ray, front to back."""
+    """Samples of n rays, packed by ray, front to back.
+
+    Lists may be longer than that takes: what follows is all zeros, and counts as the last ray's.
+    """
 
     offsets: Int[Tensor, "rays+1"]
     """Samples of ray r are offsets[r]:offsets[r + 1]."""
@@ -25,12 +28,13 @@ class Samples:
 
     def ray_index(self) -> Int[Tensor, "s"]:
         """The ray each sample belongs to."""
-        counts = self.offsets[1:] - self.offsets[:-1]
-        return torch.repeat_interleave(torch.arange(counts.shape[0], device=counts.device), counts)
+        # A step at each ray's beginning; none is waited for, as counts of repetitions would be.
+        steps = torch.zeros(self.t.shape[0] + 1, dtype=torch.long, device=self.offsets.device)
+        begins = self.offsets[1:-1]
+        steps.index_add_(0, begins, torch.ones_like(begins))
+        return steps[:-1].cumsum(0)
 
 
 def offsets_of(ray: Int[Tensor, "s"], rays: int) -> Int[Tensor, "rays+1"]:
     """Where each ray's samples begin in a packed list whose samples' rays are `ray`, ascending."""
-    offsets = torch.zeros(rays + 1, dtype=torch.long, device=ray.device)
-    offsets[1:] = torch.bincount(ray, minlength=rays).cumsum(0)
-    return offsets
+    return torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))

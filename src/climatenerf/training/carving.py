@@ -21,6 +21,7 @@ from climatenerf.training.ground_map import draw_ground
 from climatenerf.training.in_view import before_a_camera, in_view
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import PointRays
+from climatenerf.training.rooms import Rooms
 from climatenerf.training.settings import FitSettings
 
 
@@ -36,6 +37,7 @@ class Carving:
     ):
         self.field, self.pixels, self.points = field, pixels, points
         self.carves, self.moves = settings.carve, settings.refine_poses
+        self.solid = placed(SOLID)
         self.knows_ground = settings.losses.ground > 0 and points is not None
         self.find_ground()
         self.bar()
@@ -173,39 +175,45 @@ class Carving:
         q: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         t: Float[Tensor, "n"],
+        rooms: Rooms,
         classed: bool = False,
-    ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
+    ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Bool[Tensor, "k"]]:
         """Which samples of rays to the ground lie too far from it, and where (t) they should.
 
         Only those where most photos see ground, away from what stands on it, and with `classed`
         those that the field takes for ground, away from steps; t in grid units.
+
+        Returns:
+            Samples off the ground (in a fixed room the last again and again), where they should be,
+            and to which of them all the rest applies.
         """
         if self.ground is None:
-            return torch.zeros(0, dtype=torch.long), t[:0]
+            return torch.zeros(0, dtype=torch.long), t[:0], t[:0] > 0
         over, known = self.ground.over(q)
         ahead, _ = self.ground.over(q + STEP * rays_d)
         nearing = (over - ahead) / STEP
         off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
-        far = (known & (nearing > LEAST_NEARING) & (off != 0)).nonzero()[:, 0]
+        far = rooms.chosen("far", known & (nearing > LEAST_NEARING) & (off != 0))
         cells, _ = self.field._cells(q[far])
         pulled = torch.zeros(far.shape[0], dtype=torch.bool)
         if classed:
             pulled = self.taken_for_ground(q[far]) & ~self.stepped.view(-1)[cells]
-        rest = (~pulled & ~self.stands.view(-1)[cells]).nonzero()[:, 0]
+        rest = rooms.chosen("rest", ~pulled & ~self.stands.view(-1)[cells])
         pulled[rest] = self.shows_ground(q[far[rest]], torch.zeros(rest.shape[0]))
-        far = far[pulled]
-        return far, (t[far] + off[far] / nearing[far]).clamp_min(0.0)
+        # Rays that do not near the ground, in a room's rest: 0/0.
+        on = off[far] / nearing[far].clamp_min(LEAST_NEARING)
+        return far, (t[far] + on).clamp_min(0.0), pulled
 
     @torch.no_grad()
     def taken_for_ground(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether matter at q (grid units) is ground by the field's own classes."""
         _, logits = self.field.surface_at(reference.contract(q))
-        return on_the_ground(placed(SOLID)[logits.argmax(-1)])
+        return on_the_ground(self.solid[logits.argmax(-1)])
 
 
 def on_the_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Whether merged classes are such as lie on the ground."""
-    return torch.isin(label, torch.tensor(GROUND, dtype=label.dtype))
+    return torch.stack([label == kind for kind in GROUND]).any(0)
 
 
 def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:

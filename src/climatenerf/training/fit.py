@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.field.colour_space import encode_srgb
@@ -25,6 +25,7 @@ from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets
 from climatenerf.scene.classes import SKY, SOLID_OF, UNKNOWN, VEGETATION
 from climatenerf.training import losses
 from climatenerf.training.carving import Carving, on_the_ground
+from climatenerf.training.choosing import choose
 from climatenerf.training.gradients import scale_gradient
 from climatenerf.training.monocular import RelativeDepth
 from climatenerf.training.optimiser import GridAdam
@@ -32,6 +33,7 @@ from climatenerf.training.pixels import HORIZON, Batch, TrainingPixels
 from climatenerf.training.points import PointRays, joined
 from climatenerf.training.poses import RATE as POSE_RATE
 from climatenerf.training.poses import PoseCorrections
+from climatenerf.training.rooms import Rooms
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.sky_fill import fill_sky
 from climatenerf.training.transients import (
@@ -85,6 +87,7 @@ class Fitting:
         self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near)
         self.masks, self.poses = TransientMasks(images), PoseCorrections(images)
         self.relative = RelativeDepth(images)
+        self.rooms = Rooms(torch.get_default_device().type == "cuda")
         self.generator = torch.Generator().manual_seed(settings.seed)
         if not settings.sky_labels:
             self.pixels = pixels = pixels.without_sky()
@@ -104,9 +107,9 @@ class Fitting:
         kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]
         # A head that has met one class alone, or nothing but ground, would say so of everything.
         classed = kinds.numel() > 1 and not bool(on_the_ground(kinds).all())
-        weigh = settings.losses
+        self.classed = settings.losses.classes > 0 and classed
         # Normals are learned later.
-        self.field.learned[:] = torch.tensor([False, weigh.classes > 0 and classed])
+        self.field.learned[:] = torch.tensor([False, self.classed])
         self.field.sky_grid.requires_grad_(self.knows_sky)
         grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
         grids += [self.field.surface_grid] if size.surface_levels else []
@@ -195,29 +198,26 @@ class Fitting:
         twin.field.density_normal(torch.zeros(16, 3))
 
     def step(self, batch: Batch) -> tuple[float, int]:
-        """One optimiser step; returns the mean squared display error and the samples used."""
+        """One optimiser step; returns the mean squared display error and the samples used.
+
+        On a GPU those of two steps before, samples as they would be of so many rays.
+        """
         settings, field = self.settings, self.field
         n = batch.rays_o.shape[0]
         if settings.refine_poses:
             rays = self.poses.rays(batch.rays_o, batch.rays_d, batch.image, field.unit)
             batch = replace(batch, rays_o=rays[0], rays_d=rays[1])
         rays_o, rays_d = batch.rays_o.detach(), batch.rays_d.detach()
-        samples = field.march(
-            rays_o,
-            rays_d,
-            torch.full((n,), self.near()),
-            torch.full((n,), 1e9),
-            self.step_scale,
-            uniform(self.generator, n),
-            stop=1e-4,
-        )
+        self.rooms.begin(n)
+        samples = self.march("samples", rays_o, rays_d, self.near(), torch.full((n,), 1e9))
         # Lengths from here on in grid units.
         t, dt = samples.t / field.unit, samples.dt / field.unit
         tau = samples.sigma * samples.dt
         before, _ = dispatch.render_weights(tau, samples.offsets)
-        field.keep_occupied(rays_o, rays_d, samples, before > SEEN_WEIGHT)
+        heavy = self.rooms.chosen("heavy", before > SEEN_WEIGHT)
+        field.keep_occupied(rays_o, rays_d, samples, heavy)
         self.thin_out(tau, before)
-        kept, chance = self.choose(before)
+        kept, chance = choose(before, samples.dt > 0, self.rooms, self.generator)
         u = self.positions(batch, samples, kept)
         # Near a camera many rays crowd into little space that few other cameras see, and haze there
         # is learned first. Gradients scaled with the distance squared, as the rays' spread, undo
@@ -230,7 +230,7 @@ class Fitting:
         weights, left = dispatch.render_weights(tau, samples.offsets)
 
         share = weights[kept] / chance
-        seen = (share.detach() > LEAST_WEIGHT).nonzero()[:, 0]
+        seen = self.rooms.chosen("seen", share.detach() > LEAST_WEIGHT)
         ray = samples.ray_index()[kept][seen]
         radiance = self.radiance(batch, u[seen], ray, share[seen], left, spread[seen])
         error = losses.colour_error(radiance, batch.rgb)
@@ -240,14 +240,14 @@ class Fitting:
             batch, u[seen], ray, share[seen].detach(), samples, kept[seen]
         )
         if settings.losses.sky_fill:
-            d, colour = self.fill.draw(SKY_LOOKS, self.generator)
-            shown = field.sky_colour(d, field.mean_embedding.detach().expand(d.shape[0], -1))
-            apart = losses.colour_error(shown, encode_srgb(colour)).sum() / SKY_LOOKS
-            loss = loss + settings.losses.sky_fill * apart
+            d, colour, unseen = self.fill.draw(SKY_LOOKS, self.generator)
+            shown = field.sky_colour(d, field.mean_embedding.detach().expand(SKY_LOOKS, -1))
+            apart = losses.colour_error(shown, encode_srgb(colour)) * unseen
+            loss = loss + settings.losses.sky_fill * apart.mean()
         if settings.refine_poses:
             loss = loss + self.poses.loss()
 
-        used = samples.t.shape[0]
+        used = samples.offsets[-1]
         if settings.losses.points and self.measured:
             some = max(n // POINT_SHARE, 16)
             drawn = [each.draw(some, self.generator) for each in self.measured]
@@ -262,7 +262,9 @@ class Fitting:
             group["lr"] = settings.net_rate * decay * group["shares"][self.stage > REFINE_AT]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * decay)
-        return error.mean().item(), used
+        told = self.rooms.late("error", error.mean()), self.rooms.late("used", used / n)
+        self.rooms.next_step()
+        return told[0], round(told[1] * n)
 
     def positions(
         self, batch: Batch, samples: Samples, kept: Int[Tensor, "k"]
@@ -324,10 +326,10 @@ class Fitting:
             if self.settings.opaque_sky:
                 loss = loss + weigh.sky * losses.far_sky_loss(distance, batch.is_sky)
             else:
-                which = self.sky_samples(batch, samples, weights.detach())
+                which, empty = self.sky_samples(batch, samples, weights.detach())
                 # Leaves against the sky come first, clean edges last: too early, crowns are lost.
                 grown = min(1.0, max(SKY_AT_FIRST, 2 * self.stage - 0.5))
-                loss = loss + grown * weigh.sky * losses.sky_loss(weights[which], n)
+                loss = loss + grown * weigh.sky * losses.sky_loss(weights[which] * empty, n)
         if weigh.ground and self.carving.ground is not None:
             loss = loss + weigh.ground * self.ground_loss(batch, samples, weights, t)
         solid = left.detach() < 0.5
@@ -360,26 +362,27 @@ class Fitting:
         """
         ray = samples.ray_index()
         heavy = weights.detach() > GROUND_WEIGHT
-        some = (on_the_ground(batch.label)[ray] & heavy).nonzero()[:, 0]
+        some = self.rooms.chosen("ground", on_the_ground(batch.label)[ray] & heavy)
         own = ray[some]
         d = batch.rays_d.detach()[own]
         q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
         # Later the field has learned what is ground, so lumps by what stands are pulled as well,
         # and all harder: less goes with them.
-        classed = self.stage > self.classed_at and bool(self.field.learned[1])
-        far, goal = self.carving.far_from_ground(q, d, t[some], classed)
+        classed = self.stage > self.classed_at and self.classed
+        far, goal, pulled = self.carving.far_from_ground(q, d, t[some], self.rooms, classed)
         some, pull = some[far], SURE_PULL if classed else 1.0
-        return pull * losses.ground_loss(weights[some], t[some], goal, batch.rays_o.shape[0])
+        own = weights[some] * pulled
+        return pull * losses.ground_loss(own, t[some], goal, batch.rays_o.shape[0])
 
     def sky_samples(
         self, batch: Batch, samples: Samples, weights: Float[Tensor, "s"]
-    ) -> Int[Tensor, "k"]:
-        """Indices of samples on sky rays, where other photos see sky too and no point is known."""
+    ) -> tuple[Int[Tensor, "k"], Bool[Tensor, "k"]]:
+        """Samples on sky rays; whether other photos see sky there too, and no point is known."""
         ray = samples.ray_index()
-        asked = ((batch.label == SKY)[ray] & (weights > LEAST_WEIGHT)).nonzero()[:, 0]
+        asked = self.rooms.chosen("sky", (batch.label == SKY)[ray] & (weights > LEAST_WEIGHT))
         own = ray[asked]
         x = batch.rays_o.detach()[own] + samples.t[asked, None] * batch.rays_d.detach()[own]
-        return asked[self.carving.shows_sky(x)]
+        return asked, self.carving.shows_sky(x)
 
     def surface_loss(
         self,
@@ -398,19 +401,20 @@ class Fitting:
         if not (weigh.classes or weigh.normals or weigh.bend):
             return u.sum() * 0.0
         n = max(batch.rays_o.shape[0] // SURFACE_SHARE, 1)
-        some = slice(0, int(torch.searchsorted(ray, n)))
+        some = self.rooms.below("surface", ray, n)
         raw = self.field.surface_raw(u[some].detach())
-        own, of = share[some], ray[some]
+        of = ray[some]
+        own = share[some] * (of < n)
         q = goal = None
         if (weigh.normals or weigh.bend) and self.stage > REFINE_AT:
             at = samples.t[index[some], None]
             q = self.field.to_grid(batch.rays_o.detach()[of] + at * batch.rays_d.detach()[of])
             if weigh.normals:
-                self.field.learned[0] = self.stage > NORMALS_AT
+                self.field.learned[0].fill_(self.stage > NORMALS_AT)
                 goal = self.field.density_normal(q)
         logits, apart = dispatch.surface(own, raw, goal, offsets_of(of, n))
         loss = weigh.normals * apart.sum() / n
-        if weigh.classes and self.pixels.label is not None and self.field.knows_classes:
+        if weigh.classes and self.pixels.label is not None and self.classed:
             target = self.solid_of[batch.label[:n].long()]
             loss = loss + weigh.classes * losses.class_loss(logits, target, target != UNKNOWN)
         if weigh.bend and q is not None:
@@ -419,29 +423,47 @@ class Fitting:
             loss = loss + weigh.bend * losses.normal_loss(own, bent, shown, n)
         return loss
 
-    def depth_loss(self, measured: PointRays) -> tuple[Float[Tensor, ""], int]:
+    def march(
+        self,
+        name: str,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        near: float,
+        far: Float[Tensor, "n"],
+    ) -> Samples:
+        """`Field.march` as a fit does it; in fixed rooms with zeros behind the last sample."""
+        n, room = rays_o.shape[0], None
+        if self.rooms.fixed:
+            room = self.rooms.room(name, n * dispatch.CAPACITY)
+        samples = self.field.march(
+            rays_o,
+            rays_d,
+            torch.full((n,), near),
+            far,
+            self.step_scale,
+            uniform(self.generator, n),
+            stop=1e-4,
+            room=room,
+        )
+        self.rooms.took(name, samples.offsets[-1])
+        return samples
+
+    def depth_loss(self, measured: PointRays) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
         """`losses.depth_loss` of rays to sparse points (in grid units); and the samples used."""
-        field, n = self.field, measured.depth.shape[0]
+        field = self.field
         if self.settings.refine_poses:
             rays = (measured.rays_o, measured.rays_d, measured.image)
             rays_o, rays_d = (each.detach() for each in self.poses.rays(*rays, field.unit))
             measured = replace(measured, rays_o=rays_o, rays_d=rays_d)
-        samples = field.march(
-            measured.rays_o,
-            measured.rays_d,
-            torch.full((n,), field.near),
-            2 * measured.depth,  # what is far behind the point shows nowhere
-            self.step_scale,
-            uniform(self.generator, n),
-            stop=1e-4,
-        )
+        far = 2 * measured.depth  # what is behind that shows nowhere
+        samples = self.march("points", measured.rays_o, measured.rays_d, field.near, far)
         u = field.sample_positions(measured.rays_o, measured.rays_d, samples)
         tau = field.density_with_gradient(u) * (samples.dt / field.unit)
         weights, left = dispatch.render_weights(tau, samples.offsets)
         loss = losses.depth_loss(
             weights, left, samples.t / field.unit, measured.depth / field.unit, samples.ray_index()
         )
-        return loss, samples.t.shape[0]
+        return loss, samples.offsets[-1]
 
     def near(self) -> float:
         """Ray length (m) from which matter is believed at present."""
@@ -455,21 +477,11 @@ class Fitting:
         grown = min(1.0, max(0.0, (self.stage - THIN_FROM) / (FINE_AT - THIN_FROM)))
         goal = LEAST_TAU * (self.settings.thin / LEAST_TAU) ** grown
         denser = 2 * self.field.thin
-        if goal > self.field.thin and weights[tau < denser].sum() < THIN_SHARE * weights.sum():
+        if goal <= self.field.thin:
+            return
+        share = (weights * (tau < denser)).sum() / weights.sum()  # no light at all: NaN, not less
+        if self.rooms.late(f"thinner than {denser:.3g}", share) < THIN_SHARE:
             self.field.thin = min(goal, denser)
-
-    def choose(self, weights: Float[Tensor, "s"]) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
-        """Indices of the samples that get colour and gradients, and the chance that each had.
-
-        Early on rays cross haze, with hundreds of samples that hardly weigh: about `CHOSEN` a ray
-        are drawn in proportion to their weights, each standing for those like it. Where surfaces
-        are found all that weigh are taken.
-        """
-        chance = (CHOSEN * weights).clamp(LEAST_CHANCE, 1.0)
-        # Systematic sampling: drawn ones are spread evenly among those like them.
-        passed = chance.double().cumsum(0) + uniform(self.generator, 1).double()
-        kept = (passed.floor() > (passed - chance).floor()).nonzero()[:, 0]
-        return kept, chance[kept]
 
     def radiance(
         self,
@@ -496,7 +508,9 @@ class Fitting:
         drawn = torch.zeros(n).index_add(0, ray, share.detach())
         # 1e-3: rays of which nothing was drawn, 0/0.
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
-        skyward = (left.detach() > LEAST_WEIGHT).nonzero()[:, 0]
+        through = left.detach() > LEAST_WEIGHT
+        skyward = torch.arange(n) if self.rooms.fixed else through.nonzero()[:, 0]
+        left = left * through
         sky = self.field.sky_colour(batch.rays_d[skyward], appearance[skyward])
         if self.knows_sky:
             # It learns from its own pixels; then it may learn fast, and in detail. What nobody has
@@ -557,11 +571,9 @@ MASK_SHARES = (0.0, 10.0)
 # Matter nearer than this to a camera (grid units) is not believed at first: what stands near is
 # seen from elsewhere too, and a wall before each camera would satisfy every photo.
 FIRST_NEAR = 0.6
-CHOSEN = 32  # samples of a ray that get colour and gradients, about
 # Samples that weigh more show that their cell is occupied. A lamp post fills a tenth of the first,
 # large cells, and what is pruned hardly ever comes back.
 SEEN_WEIGHT = 0.05
-LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
 SURFACE_SHARE = 4  # rays for one whose classes and normals are learned from
 UNSURE_FLAT = 0.3  # of the flatness's weight where no label says what it is: a statue is not flat
 TRIPLE_SHARE = 1 / 6  # of the rays that are the middle of three in a line

@@ -35,18 +35,14 @@ class RelativeDepth:
             image: of each ray.
             counts: rays that show matter and have a relative depth.
         """
-        if not bool(counts.any()):
-            return inverse_z.sum() * 0.0
-        x, d, own = inverse_z[counts], relative[counts], image[counts]
-        fixed, goal = x.detach().double(), d.double()
-        rows = torch.stack(
-            [torch.ones_like(fixed), fixed, goal, fixed**2, fixed * goal, goal**2], dim=-1
-        )
-        self.sums = (KEPT * self.sums).index_add(0, own, rows)
+        d = torch.where(counts, relative, 0.0)
+        fixed, goal = torch.where(counts, inverse_z.detach(), 0.0).double(), d.double()
+        rows = torch.stack([counts.double(), fixed, goal, fixed**2, fixed * goal, goal**2], dim=-1)
+        self.sums = (KEPT * self.sums).index_add(0, image, rows)
         scale, shift, spread = self.affine()
-        known = spread[own] > 0
-        off = scale[own] * x + shift[own] - d
-        squared = (off.square() / spread[own].clamp_min(1e-12))[known]  # flat d: 0/0, not known
+        known = counts & (spread[image] > 0)
+        off = torch.where(known, scale[image] * inverse_z + shift[image] - d, 0.0)
+        squared = off.square() / spread[image].clamp_min(1e-12)  # flat d: 0/0, not known
         return squared.clamp_max(4.0).sum() / inverse_z.shape[0]
 
     def affine(self) -> tuple[Float[Tensor, "v"], Float[Tensor, "v"], Float[Tensor, "v"]]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from climatenerf.errors import UserError
-from climatenerf.ops.placing import array_of, integers, placed
+from climatenerf.ops.placing import array_of, integers, placed, sent
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
 from climatenerf.training.in_view import pyramids
@@ -93,11 +93,13 @@ class TrainingPixels:
         shapes = [(camera.height, camera.width) for camera in self.cameras]
         rgb, _ = in_one_row(shapes, images, np.uint8, 0, channels=3)
         self.rgb = placed(rgb)
-        self.usable, self.share = None, 1.0
+        self.usable, self.drawable, self.share = None, None, 1.0
+        self.spacings = torch.tensor(SPACINGS)
+        self.axes = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
         usable = (None if mask is None else mask > 0 for mask in masks or ())
         flat, shown = in_one_row(shapes, usable, np.bool_, True)
         if flat.size:
-            self.usable = placed(flat)
+            self.usable, self.drawable = placed(flat), torch.from_numpy(flat)
             self.share = int(flat.sum()) / flat.size
         self.label = None
         self.witness = None
@@ -271,14 +273,14 @@ class TrainingPixels:
         Hidden ones are drawn and left out: a list of the others would take more than the photos.
         """
         total = self.rgb.shape[0]
-        if self.usable is None:
+        if self.drawable is None:
             return integers(generator, 0, total, n)
-        found = torch.zeros(0, dtype=torch.long)
+        found = torch.zeros(0, dtype=torch.long, device="cpu")
         while found.shape[0] < n:
             more = min(int((n - found.shape[0]) / self.share) + 1, AT_MOST)
-            pixel = integers(generator, 0, total, more)
-            found = torch.cat([found, pixel[self.usable[pixel]]])
-        return found[:n]
+            pixel = torch.randint(0, total, (more,), generator=generator, device="cpu")
+            found = torch.cat([found, pixel[self.drawable[pixel]]])
+        return sent(found[:n])
 
     def sides(
         self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator
@@ -288,9 +290,8 @@ class TrainingPixels:
         Where one lies outside the image or its mask, the pixel itself stands for both.
         """
         m = image.shape[0]
-        spacing = torch.tensor(SPACINGS)[integers(generator, 0, len(SPACINGS), m)]
-        axis = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
-        step = axis[integers(generator, 0, len(axis), m)] * spacing[:, None]
+        spacing = self.spacings[integers(generator, 0, len(SPACINGS), m)]
+        step = self.axes[integers(generator, 0, len(self.axes), m)] * spacing[:, None]
         width, height = self.width[image], self.height[image]
         x, y = within % width, within.div(width, rounding_mode="floor")
         inside = (x >= spacing) & (x < width - spacing) & (y >= spacing) & (y < height - spacing)

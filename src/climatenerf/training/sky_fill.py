@@ -35,13 +35,12 @@ class SkyFill:
 
     def draw(
         self, n: int, generator: torch.Generator
-    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-        """About n random directions that no photo shows, even over the sphere; their colours."""
-        at = uniform(generator, n, 2) * torch.tensor([float(ROWS), float(COLUMNS)])
-        row, column = at.long().unbind(-1)
-        unseen = self.unseen[row, column]
-        at, row, column = at[unseen], row[unseen], column[unseen]
-        return direction(at[:, 0], at[:, 1]), self.colour[row, column]
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+        """n random directions, even over the sphere; their colours; which no photo shows."""
+        across, along = uniform(generator, n, 2).unbind(-1)
+        y, x = across * ROWS, along * COLUMNS
+        row, column = y.long(), x.long()
+        return direction(y, x), self.colour[row, column], self.unseen[row, column]
 
 
 def direction(row: Float[Tensor, "n"], column: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:

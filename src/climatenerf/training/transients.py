@@ -74,11 +74,11 @@ class TransientMasks(nn.Module):
             x, y = (place * side - 0.5).clamp(0, side - 1).unbind(-1)
             y = y.clamp(rounding, side - 1 - rounding)
             picture = level.reshape(images * side, side, FEATURES).permute(2, 0, 1)
-            middle = torch.stack([x + 0.5, y + 0.5 + image * side], dim=-1)
-            size = torch.tensor([side / 2, images * side / 2])
+            across = (x + 0.5) / (side / 2) - 1
+            down = (y + 0.5 + image * side) / (images * side / 2) - 1
             looked = F.grid_sample(
                 picture[None],
-                (middle / size - 1)[None, None],
+                torch.stack([across, down], dim=-1)[None, None],
                 padding_mode="border",
                 align_corners=False,
             )

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from climatenerf.ops import cpu
-from climatenerf.ops.placing import array_of, placed
+from climatenerf.ops import dispatch
+from climatenerf.ops.placing import placed
 from climatenerf.scene.cameras import Camera
 from climatenerf.scene.classes import UNKNOWN
 
@@ -43,29 +43,22 @@ class Witness:
         chosen = np.unique(np.linspace(0, len(labelled) - 1, VOICES).round().astype(int))
         asked = [labelled[i] for i in chosen]
         maps = [depth_within(cameras[i], np.isin(labels[i], classes)) for i in asked]
-        self.reach = np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])
-        self.sizes = np.array([each.shape for each, _ in maps])
-        self.starts = np.append(0, self.sizes.prod(1).cumsum()[:-1])
-        self.pinholes = np.array([pinhole for _, pinhole in maps], np.float32)
-        self.c2w = np.ascontiguousarray(np.asarray(c2w, np.float32)[asked])
-        eyes = self.c2w[:, :3, 3]
+        sizes = np.array([each.shape for each, _ in maps], np.int64)
+        poses = np.ascontiguousarray(np.asarray(c2w, np.float32)[asked])
+        self.views = (
+            placed(np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])),
+            placed(np.append(0, sizes.prod(1).cumsum()[:-1]).astype(np.int64)),
+            placed(sizes),
+            placed(np.array([pinhole for _, pinhole in maps], np.float32)),
+            placed(poses),
+        )
+        eyes = poses[:, :3, 3]
         self.apart = APART * float(np.linalg.norm(eyes - eyes.mean(0), axis=-1).mean())
 
     def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether enough views see nothing else within `radius` (m) of places x (world m)."""
-        out = np.empty(x.shape[0], bool)
-        cpu.voices_of(
-            np.ascontiguousarray(array_of(x)),
-            array_of(radius),
-            self.reach,
-            self.starts,
-            self.sizes,
-            self.pinholes,
-            self.c2w,
-            (LEAST_VOICES, self.share, self.apart),
-            out,
-        )
-        return placed(out)
+        least = (LEAST_VOICES, self.share, self.apart)
+        return dispatch.voices_of(x, radius, self.views, least)
 
 
 def depth_within(

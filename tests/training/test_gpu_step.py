@@ -1,0 +1,60 @@
+"""A whole step of a fit by the GPU's kernels, in Triton's interpreter, against the CPU's."""
+
+import os
+
+import pytest
+import torch
+from test_rooms import begun, learned_in
+
+from climatenerf.ops import cpu, dispatch
+
+os.environ.setdefault("TRITON_INTERPRET", "1")  # it is read where a kernel is defined
+pytest.importorskip("triton", reason="Triton is for Linux")
+
+from climatenerf.ops import gpu, gpu_march, gpu_network, gpu_witness  # noqa: E402
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
+
+
+def by(kernels, monkeypatch):
+    def given(tensor):
+        tensor = tensor.detach().contiguous()
+        return tensor.numpy() if kernels is cpu else tensor
+
+    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: kernels)
+    monkeypatch.setattr(dispatch, "_array", given)
+
+
+def test_a_step_by_the_gpus_kernels_learns_what_one_by_the_cpus_does(scene, monkeypatch):
+    """In large tiles: the interpreter takes milliseconds for an operation, however long."""
+    for module in (gpu, gpu_network, gpu_march):
+        monkeypatch.setattr(module, "SAMPLES", 4096)
+    for module, name, size in (
+        (gpu_march, "RAYS", 64),
+        (gpu, "LIST", 64),
+        (gpu, "ENTRIES", 2**16),
+        (gpu_witness, "PLACES", 4096),
+        (dispatch, "CAPACITY", 128),
+    ):
+        monkeypatch.setattr(module, name, size)
+    results = []
+    for kernels in (cpu, gpu):
+        by(kernels, monkeypatch)
+        fitting = begun(scene, kernels is gpu)
+        with torch.no_grad():  # colours of their own, which gradients reach
+            generator = torch.Generator().manual_seed(7)
+            for grid in fitting.grid_adam.tables:
+                grid.copy_(0.1 * torch.randn(grid.shape, generator=generator))
+        for _ in range(2):  # the second in rooms that fit
+            batch = fitting.pixels.draw(60, torch.Generator().manual_seed(2), 10, 0.1)
+            fitting.relative.sums.zero_()
+            told, gradients = learned_in(fitting, batch)
+        results.append((told, gradients))
+    (exact, wanted), (late, found) = results
+    assert late[0] == pytest.approx(exact[0], rel=1e-3) and late[1] == pytest.approx(
+        exact[1], abs=9
+    )
+    assert wanted.keys() == found.keys()
+    for name, gradient in wanted.items():
+        off = (found[name] - gradient).norm()
+        assert off <= 1e-3 * gradient.norm() + 1e-9, name
