@@ -24,7 +24,7 @@ from climatenerf.field.extent import find_extent  # noqa: E402
 from climatenerf.field.presets import PRESETS  # noqa: E402
 from climatenerf.render.view import render_view  # noqa: E402
 from climatenerf.scene import Scene, load_image  # noqa: E402
-from climatenerf.training import fit  # noqa: E402
+from climatenerf.training import choosing, fit  # noqa: E402
 from climatenerf.training.run import load_pixels  # noqa: E402
 from climatenerf.training.settings import Losses  # noqa: E402
 
@@ -40,10 +40,11 @@ VARIANTS = {
 
 
 def heldout_psnr(scene: Scene, seed: int, variant: dict) -> float:
-    """Mean over the held-out views after a fit; names in capitals are the module's constants."""
-    before = {name: getattr(fit, name) for name in variant if name.isupper()}
-    for name in before:
-        setattr(fit, name, variant[name])
+    """Mean over the held-out views after a fit; names in capitals are the modules' constants."""
+    of = {name: module for module in (fit, choosing) for name in variant if name in vars(module)}
+    before = {name: getattr(module, name) for name, module in of.items()}
+    for name, module in of.items():
+        setattr(module, name, variant[name])
     own = {name: value for name, value in variant.items() if not name.isupper()}
     settings = fit.FitSettings(
         preset="tiny", minutes=None, steps=400, samples_per_step=2**15, seed=seed, **own
@@ -53,7 +54,7 @@ def heldout_psnr(scene: Scene, seed: int, variant: dict) -> float:
     fitting = fit.Fitting(load_pixels(scene, 1), len(views), extent, settings)
     fitting.run(lambda _: None)
     for name, value in before.items():
-        setattr(fit, name, value)
+        setattr(of[name], name, value)
     found = []
     for view in scene.of_split("heldout"):
         photo = load_image(view, scene).astype(np.float32) / 255

@@ -5,7 +5,8 @@ python benchmarks/gpu.py RUN --capture ../shared/data/fox
 `step`: million samples a second of one optimiser step on the field of RUN, every sample through
 every head, as in `engine.py`, beside eager PyTorch on the same device. `fit`: the capture from
 nothing: samples a second in practice, and seconds until the held-out photos reach so many dB
-(reading and matching photos are counted, measuring and compiling are not). `frames`: seconds and
+(reading and matching photos are counted, measuring and compiling are not); `waits`: how often a
+step waits for the card there, by PyTorch's own count, and at which lines. `frames`: seconds and
 frames a second of a view of RUN in each size, clean and with water on about 40 % of it. Memory is
 each part's peak on the device.
 `--device cpu` tries the same without a GPU; its figures are the CPU's.
@@ -13,6 +14,8 @@ each part's peak on the device.
 
 import argparse
 import sys
+import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +29,7 @@ from frame_time import frames
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import on
-from climatenerf.scene import load_scene
+from climatenerf.scene import load_scene, read_scene
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings, settings_of
 
@@ -71,6 +74,23 @@ def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> di
     return rows
 
 
+def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300) -> dict[str, Any]:
+    """How often a step of a fit waits for the card, in its last third, and where that is."""
+    fitting = begin(read_scene(capture), replace(settings, minutes=None, steps=steps), downscale)
+    met, ends = [], []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            fitting.run(lambda _: ends.append(len(caught)))
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+        met = [f"{Path(each.filename).name}:{each.lineno}" for each in caught]
+    late = ends[2 * len(ends) // 3]
+    places = Counter(met[late:]).most_common(10)
+    return {"of_a_step": (ends[-1] - late) / (len(ends) / 3), "places": dict(places)}
+
+
 def measured(part: Callable[[], Any], device: str) -> dict[str, Any]:
     """What a part finds, and its peak memory on the device; if it fails, the others still run."""
     if device == "cuda":
@@ -109,6 +129,8 @@ def main() -> None:
     }
     if options.capture:
         settings = replace(settings_of(options.preset, device), minutes=options.minutes, seed=seed)
+        if device == "cuda":
+            parts["waits"] = lambda: waits(options.capture, settings, options.downscale)
         parts["fit"] = lambda: time_to_psnr(
             options.capture, settings, options.downscale, options.every, GOALS
         )

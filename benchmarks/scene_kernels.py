@@ -88,7 +88,7 @@ def places(random: np.random.Generator, pixels: TrainingPixels, count: int) -> J
     assert witness is not None, "the reference street has labels"
     x = torch.from_numpy(random.normal(0, 8, (count, 3)).astype(np.float32))
     radius = torch.full((count,), 0.1)
-    asked = count * len(witness.c2w)
+    asked = count * len(witness.views[-1])
     return Job(lambda: witness.agreed(x, radius), "places seen", asked, 0.5, 13)
 
 

@@ -19,7 +19,9 @@ from climatenerf.cli.fit import Fit, fit_settings, resuming
 from climatenerf.cli.render import LAYER_NAMES, appearance_of
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.presets import PRESETS
+from climatenerf.render import movie
 from climatenerf.scene import load_scene
+from climatenerf.scene.images import read_rgb
 from climatenerf.storage import read_safetensors, write_safetensors
 from climatenerf.training.settings import PAPER, Losses
 
@@ -239,15 +241,43 @@ def test_a_shorter_render_leaves_nothing_of_the_longer_one_before_it(run_folder,
     assert len(told["frames"]) == 1 and told["weather"]["smog"]["visibility"] == "50 m"
 
 
-@pytest.mark.parametrize("name", ["frames/0000.png", "movie.mp4", "movie.json", "depth/0000.npz"])
+OURS = ["frames/0000.png", "movie.mp4", "movie.json", "depth/0000.npz", "preview.png"]
+
+
+@pytest.mark.parametrize("name", OURS)
 def test_a_render_overwrites_nothing_that_it_did_not_make(run_folder, tmp_path, capsys, name):
     mine = tmp_path / "mine" / name
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b'{"mine": 1}')
     words = ["render", run_folder, "-o", tmp_path / "mine", "--layers", "depth", *SMALL]
+    words += ["--preview"]
     assert mine.name in complaint(capsys, *words)
     assert mine.read_bytes() == b'{"mine": 1}'
     assert [p for p in (tmp_path / "mine").rglob("*") if p.is_file()] == [mine]
+
+
+def test_a_preview_shows_each_frame_early_and_goes(run_folder, tmp_path, monkeypatch):
+    """And the frames are those of a render without one."""
+    written = []
+    write = movie.write_png
+
+    def noted(path, picture, text):
+        written.append((path.name, path.parent.name, picture.copy()))
+        write(path, picture, text)
+
+    monkeypatch.setattr(movie, "write_png", noted)
+    words = ["render", str(run_folder), *map(str, SMALL)]
+    assert cli.main([*words, "-o", str(tmp_path / "early"), "--preview"]) == 0
+    names = [name for name, *_ in written]
+    assert names == ["preview.png"] * 3 + ["0000.png"] + ["preview.png"] * 3 + ["0001.png"]
+    off = [np.abs(each[2].astype(int) - written[3][2]).mean() for each in written[:3]]
+    assert off[0] > off[1] > off[2] == 0
+    assert not (tmp_path / "early" / "preview.png").exists()
+    assert cli.main([*words, "-o", str(tmp_path / "plain")]) == 0
+    for index in range(2):
+        frame = f"frames/{index:04d}.png"
+        same = [read_rgb(tmp_path / folder / frame) for folder in ("early", "plain")]
+        assert np.array_equal(*same)
 
 
 def test_a_path_that_asks_for_huge_frames(run_folder, tmp_path, capsys):

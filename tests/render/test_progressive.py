@@ -5,7 +5,6 @@ from test_trace import CAMERA, flooded, looking, street
 
 from climatenerf.render import progressive
 from climatenerf.render.frame import render_frame
-from climatenerf.render.progressive import progressive_frames
 from climatenerf.render.world import World
 from climatenerf.scene.cameras import Camera
 from climatenerf.weather.parameters import Smog
@@ -13,6 +12,12 @@ from climatenerf.weather.smog import medium
 
 WORLD = World(street(), air=medium(Smog(visibility=40.0), 0.0), water=flooded())
 POSE = looking((0.0, 1.0, -0.2))
+
+
+def shown(world, camera, *options):
+    pictures = []
+    frame, layers = render_frame(world, camera, POSE, *options, show=pictures.append)
+    return pictures, frame, layers
 
 
 def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
@@ -24,9 +29,12 @@ def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
 
     trace = progressive.trace
     monkeypatch.setattr(progressive, "trace", counted)
-    pictures = list(progressive_frames(WORLD, CAMERA, POSE))
-    frame, _ = render_frame(WORLD, CAMERA, POSE)
-    assert np.array_equal(pictures[-1], frame)
+    pictures, frame, layers = shown(WORLD, CAMERA)
+    exact, exact_layers = render_frame(WORLD, CAMERA, POSE)
+    assert np.array_equal(pictures[-1], exact) and np.array_equal(frame, exact)
+    assert layers.keys() == exact_layers.keys()
+    for name, values in exact_layers.items():
+        assert np.array_equal(layers[name], values, equal_nan=True), name
     assert sum(traced) == CAMERA.width * CAMERA.height and traced[0] < sum(traced) / 15
     for picture, spacing in zip(pictures, progressive.SPACINGS, strict=True):
         known = frame[::spacing, ::spacing]
@@ -35,8 +43,17 @@ def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
         assert np.array_equal(picture, filled[: CAMERA.height, : CAMERA.width])
 
 
+def test_several_rays_a_pixel_show_whole_pictures():
+    pictures, frame, _ = shown(WORLD, CAMERA, 2)
+    assert [each.shape for each in pictures] == [frame.shape] * 3
+    assert np.array_equal(pictures[-1], frame)
+    assert np.array_equal(frame, render_frame(WORLD, CAMERA, POSE, 2)[0])
+    off = [np.abs(each.astype(int) - frame).mean() for each in pictures]
+    assert off[0] > off[1] > off[2] == 0
+
+
 def test_sides_that_no_spacing_divides():
     for width, height in ((7, 5), (2, 1)):
         camera = Camera(width, height, 6.0, 6.0, width / 2, height / 2)
-        *_, last = progressive_frames(World(street()), camera, POSE)
-        assert np.array_equal(last, render_frame(World(street()), camera, POSE)[0])
+        pictures, _, _ = shown(World(street()), camera)
+        assert np.array_equal(pictures[-1], render_frame(World(street()), camera, POSE)[0])

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from climatenerf.render.stage import Stage
 
 MOST_RAYS = 2**26  # in one frame: 6 GB
+PREVIEW = "preview.png"
 LAYER_NAMES = ("depth", "normal", "label", "water_depth", "transmittance", "snow_thickness",
                "mask_water", "mask_snow", "mask_smog")  # fmt: skip
 
@@ -52,6 +53,8 @@ class Render:
     """Rays per pixel along each side."""
     appearance: str = "mean"
     """Exposure and light of the frames: mean, or those of a training photo such as 0012.jpg."""
+    preview: bool = False
+    """Show the frame at work early, in OUT/preview.png: coarse at first, finer pass by pass."""
     layers: tuple[Literal["all", *LAYER_NAMES], ...] = ()  # type: ignore[valid-type]
     """Layers to keep beside the frames."""
     layer_format: tuple[Literal["npz", "png", "exr"], ...] = ("npz",)
@@ -118,7 +121,7 @@ def render_run(
         progress.say(note)
     fps = check_fps(path.fps or options.fps)
     check_amount(path.size, options.supersample)
-    check_place(options.out, len(path))
+    check_place(options.out, len(path), options.preview)
     stage = prepare_stage(field, scene, weather, path, fps)
     movie = render_movie(
         stage,
@@ -129,6 +132,7 @@ def render_run(
         layers,
         options.layer_format,
         shown=shown,
+        preview=options.preview,
     )
     progress.result(f"movie: {movie}")
     return 0
@@ -182,11 +186,12 @@ def check_amount(size: tuple[int, int], supersample: int) -> None:
         )
 
 
-def check_place(out: Path, frames: int) -> None:
+def check_place(out: Path, frames: int, preview: bool = False) -> None:
     """Refuses a folder in which a render would overwrite what is not an earlier render's."""
     ours = files_of_render(out)
     planned = [out / "frames" / f"{index:04d}.png" for index in range(frames)]
     planned += [out / name for name in ("movie.mp4", "movie.json") if not ours]
+    planned += [out / PREVIEW] if preview else []  # a render takes its own away
     for name in LAYER_NAMES:
         planned += [p for p in (out / name).glob("*") if p.stem.isdecimal()]
     for path in planned:
@@ -222,10 +227,12 @@ def render_movie(
     formats: Sequence[Literal["npz", "png", "exr"]] = ("npz",),
     title: str = "render",
     shown: int | None = None,
+    preview: bool = False,
 ) -> Path:
     """Writes out/frames/*.png, out/movie.mp4, the layers and the sidecar; returns the movie.
 
-    `shown` is the training view whose appearance the field shows, as the sidecar tells.
+    `shown` is the training view whose appearance the field shows, as the sidecar tells; with
+    `preview` out/preview.png shows the frame at work while it becomes finer.
     """
     from climatenerf.render.frame import render_frame
     from climatenerf.render.layers import SIMULATED, FrameRecord, save_layers, write_sidecar
@@ -240,6 +247,7 @@ def render_movie(
     about |= {"supersample": supersample, "frames_wanted": len(path)}
     if stage.waves is not None:
         about["significant_wave_height_m"] = stage.waves.significant_height
+    early = (lambda seen: write_png(out / PREVIEW, seen, SIMULATED)) if preview else None
     bar, writer = progress.Bar(title, len(path)), MovieWriter(out / "movie.mp4", path.size, fps)
     try:
         with bar, writer:
@@ -250,9 +258,8 @@ def render_movie(
             for index in range(len(path)):
                 time = index / fps
                 camera, c2w = path.cameras[index], path.c2w[index]
-                picture, found = render_frame(
-                    stage.at(time), camera, c2w, supersample, "normal" in layers, "label" in layers
-                )
+                wanted = supersample, "normal" in layers, "label" in layers, early
+                picture, found = render_frame(stage.at(time), camera, c2w, *wanted)
                 name = f"{index:04d}"
                 (out / "movie.json").unlink(missing_ok=True)  # from here on it would be wrong
                 write_png(out / "frames" / f"{name}.png", picture, SIMULATED)
@@ -263,6 +270,8 @@ def render_movie(
                 records.append(FrameRecord(file, time, camera, c2w, kept, weather, measured(found)))
                 bar.advance()
     finally:
+        if preview:
+            (out / PREVIEW).unlink(missing_ok=True)
         # Also of a render that was stopped, or that has no movie: frames without it are no data.
         if records:
             weather, seed = weather_to_table(stage.weather), stage.weather.base.seed

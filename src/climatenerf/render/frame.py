@@ -1,5 +1,6 @@
 """One frame: rays of a camera traced, averaged over sub-pixels, encoded."""
 
+from collections.abc import Callable
 from dataclasses import fields
 
 import numpy as np
@@ -11,6 +12,7 @@ from climatenerf.field.colour_space import encode_srgb
 from climatenerf.field.field import Field
 from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.normals import plane_normals
+from climatenerf.render.progressive import trace_coarse_first
 from climatenerf.render.surface import see_surface
 from climatenerf.render.trace import trace
 from climatenerf.render.view import camera_rays
@@ -26,6 +28,7 @@ def render_frame(
     supersample: int = 1,
     normals: bool = False,
     labels: bool = False,
+    show: Callable[[UInt8[np.ndarray, "h w 3"]], None] | None = None,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
     """The display picture (8 bit) and the measured layers of one camera.
 
@@ -37,8 +40,9 @@ def render_frame(
             taken from the ray next to the pixel's centre.
         normals: also the layer `normal`.
         labels: also the layer `label`, of a field that has learned classes.
+        show: called with the display picture as it becomes finer; see `progressive`.
     """
-    linear, layers = see_frame(world, camera, c2w, supersample, normals, labels)
+    linear, layers = see_frame(world, camera, c2w, supersample, normals, labels, show)
     return encoded_8bit(linear), layers
 
 
@@ -73,15 +77,25 @@ def see_frame(
     supersample: int = 1,
     normals: bool = False,
     labels: bool = False,
+    show: Callable[[UInt8[np.ndarray, "h w 3"]], None] | None = None,
 ) -> tuple[Float[Tensor, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
     """As `render_frame`, but the picture in linear light."""
     height, width = camera.height, camera.width
     fine = camera.resized(width * supersample, height * supersample)
     rays = traced_rays(fine, c2w)
     rays_d = rays[1]
-    seen = trace(world, *rays)
-    linear = seen.rgb.view(height, supersample, width, supersample, 3).mean((1, 3))
     shape = (height, supersample, width, supersample)
+
+    def averaged(rgb: Tensor) -> Float[Tensor, "h w 3"]:
+        return rgb.reshape(*shape, 3).mean((1, 3))
+
+    if show is None:
+        seen = trace(world, *rays)
+    else:
+        seen = trace_coarse_first(
+            world, rays, fine.width, lambda rgb: show(encoded_8bit(averaged(rgb)))
+        )
+    linear = averaged(seen.rgb)
     layers = {
         each.name: _middle(getattr(seen, each.name), shape)
         for each in fields(seen)

@@ -1,41 +1,48 @@
-"""A frame that shows early: a sixteenth of its pixels all over it, then a quarter, then all.
+"""A frame that shows early: a sixteenth of its rays all over it, then a quarter, then all.
 
-What a ray sees does not depend on the rays beside it, so none is traced twice, and the last picture
-is that of `render_frame`, but for roundings.
+What a ray sees does not depend on the rays beside it, so none is traced twice, and what is seen in
+the end is what `trace` sees, but for roundings.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 
-import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
+from torch import Tensor
 
-from climatenerf.render.frame import encoded_8bit, traced_rays
-from climatenerf.render.trace import trace
+from climatenerf.render.trace import Seen, trace
 from climatenerf.render.world import World
-from climatenerf.scene.cameras import Camera
 
-SPACINGS = (4, 2, 1)  # pixels between those that are known after each pass
+SPACINGS = (4, 2, 1)  # rays between those that are known after each pass
+
+Rays = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]
 
 
-def progressive_frames(
-    world: World, camera: Camera, c2w: Float[np.ndarray, "4 4"]
-) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Display pictures (8 bit) of one camera, each finer than the one before, the last complete.
+def trace_coarse_first(
+    world: World, rays: Rays, width: int, show: Callable[[Float[Tensor, "h w 3"]], None]
+) -> Seen:
+    """`trace` of a picture's rays, row by row, coarse ones first.
 
-    A pixel that is not known yet shows the nearest known one above and left of it. World, camera
-    and c2w as in `render_frame`; one ray a pixel, no layers.
+    Args:
+        world: field and weather.
+        rays: origins (m), unit directions, pixel angles and rolls, as `trace` takes them.
+        width: rays in a row.
+        show: called with each pass's picture in linear light, the last but for roundings complete.
+            A ray that is not known yet shows the nearest known one above and left of it.
     """
-    rays = traced_rays(camera, c2w)
-    row, column = torch.meshgrid(
-        torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
-    )
-    linear = torch.zeros(camera.height, camera.width, 3)
-    known = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    n = rays[0].shape[0]
+    row, column = torch.arange(n) // width, torch.arange(n) % width
+    linear, known = torch.zeros(n, 3), torch.zeros(n, dtype=torch.bool)
+    order, parts = [], []
     for spacing in SPACINGS:
-        asked = (row % spacing == 0) & (column % spacing == 0) & ~known
-        some = asked.flatten().nonzero()[:, 0]
+        some = ((row % spacing == 0) & (column % spacing == 0) & ~known).nonzero()[:, 0]
         if some.numel():
-            linear[asked] = trace(world, *(each[some] for each in rays)).rgb
-            known |= asked
-        yield encoded_8bit(linear[row // spacing * spacing, column // spacing * spacing])
+            parts.append(trace(world, *(each[some] for each in rays)))
+            order.append(some)
+            linear[some], known[some] = parts[-1].rgb, True
+        nearest = row // spacing * spacing * width + column // spacing * spacing
+        show(linear[nearest].view(-1, width, 3))
+    place = torch.cat(order).argsort()
+    return Seen(
+        **{key: torch.cat([getattr(p, key) for p in parts])[place] for key in Seen.__annotations__}
+    )
