@@ -4,10 +4,12 @@ python benchmarks/gallery.py street RUN
 python benchmarks/gallery.py ditch RUN --level "-1.5 m" --visibility "60 m" --snow "15 cm"
 
 python benchmarks/gallery.py ditch RUN --surfaces
+python benchmarks/gallery.py street-busy RUN --passers-by
 
 A sheet NAME.jpg of at most 150 KB, marked as simulated: rows clean, flood, smog, snow and all at
 once, columns along the camera path. With --surfaces NAME-surfaces.jpg: colours, depth, normals and
-classes of held-out views.
+classes of held-out views. With --passers-by NAME-passers-by.jpg: fitted photos of which most was
+masked, what was in red, and the field from there.
 """
 
 import argparse
@@ -16,6 +18,7 @@ from pathlib import Path
 
 import common
 import numpy as np
+import torch
 from PIL import Image
 
 from climatenerf.field.checkpoint import load_field
@@ -24,7 +27,10 @@ from climatenerf.render.frame import render_frame
 from climatenerf.render.world import World
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_image
+from climatenerf.storage import read_safetensors
 from climatenerf.training.ablation import depth_picture, normal_picture
+from climatenerf.training.folder import OPTIMISER
+from climatenerf.training.transients import MASKED, TransientMasks
 
 # Road, building, vegetation, terrain, sky, person, vehicle, as Cityscapes paints them.
 PAINT = np.zeros((256, 3), np.uint8)
@@ -75,6 +81,31 @@ def surfaces(run: Path, columns: int) -> Rows:
     return [row for row in rows if row[1]]
 
 
+def passers_by(run: Path, columns: int) -> Rows:
+    """Some of the dozen most masked photos, the same with the mask, the field in their light."""
+    field, scene = load_field(run), load_scene(run)
+    views, state = scene.of_split("train"), read_safetensors(run / OPTIMISER)[0]
+    masks = TransientMasks(len(views))
+    own = {key.removeprefix("masks."): value for key, value in state.items() if "masks." in key}
+    masks.load_state_dict({key: torch.as_tensor(value) for key, value in own.items()})
+    most = np.argsort(-masks.shares().numpy())[:12]
+    rows: Rows = [("photo", []), ("masked", []), ("field", [])]
+    for i in np.sort(most)[:: max(1, 12 // columns)][:columns]:
+        view, photo = views[i], load_image(views[i], scene)
+        y, x = ((np.arange(side) + 0.5) / side for side in photo.shape[:2])
+        place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
+        with torch.no_grad():
+            mask = masks(torch.full((len(place),), int(i)), torch.from_numpy(place)) > MASKED
+        marked = photo.copy()
+        marked[mask.view(photo.shape[:2]).numpy()] = (220, 20, 60)
+        field.shown = field.embeddings[[int(i)]].detach()
+        world = World(field, field.near)
+        picture, _ = render_frame(world, scene.cameras[view.camera], scene.c2w_world(view))
+        for row, each in zip(rows, (photo, marked, picture), strict=True):
+            row[1].append(each)
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("name")
@@ -87,11 +118,15 @@ def main() -> None:
     parser.add_argument("--columns", type=int, default=4)
     parser.add_argument("--supersample", type=int, default=2)
     parser.add_argument("--out", type=Path, default=GALLERY)
-    parser.add_argument("--surfaces", action="store_true")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--surfaces", action="store_true")
+    kinds.add_argument("--passers-by", action="store_true")
     options = parser.parse_args()
-    name = f"{options.name}-surfaces" if options.surfaces else options.name
+    name = options.name
     if options.surfaces:
-        rows = surfaces(options.run, options.columns)
+        name, rows = f"{name}-surfaces", surfaces(options.run, options.columns)
+    elif options.passers_by:
+        name, rows = f"{name}-passers-by", passers_by(options.run, options.columns)
     else:
         rows = weathers(options.run, options)
     sheet = contact_sheet(rows, options.columns, cell_width=320)
