@@ -57,6 +57,30 @@ def test_rotations_are_rotations_and_known_ones():
     assert torch.allclose(quarter @ torch.tensor([1.0, 0, 0]), torch.tensor([0.0, 1, 0]), atol=1e-6)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-4, 0.0316, 0.0317, 0.3, 3.0])
+def test_rotations_are_the_exponential_with_its_gradients(size):
+    """Also on both sides of where the series end."""
+    generator = torch.Generator().manual_seed(0)
+    turn = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1) * size
+    weights = torch.randn(20, 3, 3, generator=generator)
+
+    def exponential(turn):
+        x, y, z = turn.unbind(-1)
+        none = 0 * x
+        rows = [none, -z, y, z, none, -x, -y, x, none]
+        return torch.linalg.matrix_exp(torch.stack(rows, dim=-1).view(-1, 3, 3))
+
+    found = []
+    for function, kind in ((rotations, torch.float32), (exponential, torch.float64)):
+        given = turn.detach().clone().to(kind).requires_grad_()
+        out = function(given)
+        (out * weights.to(kind)).sum().backward()
+        assert given.grad is not None
+        found.append((out.detach().double(), given.grad.double()))
+    assert torch.allclose(found[0][0], found[1][0], atol=3e-7 * max(1, size))
+    assert torch.allclose(found[0][1], found[1][1], atol=3e-5)
+
+
 def test_no_correction_leaves_rays_and_poses_as_they_are_and_has_finite_gradients():
     poses = PoseCorrections(3)
     image = torch.tensor([0, 2, 1])

@@ -5,6 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 RATE = 2e-3  # rad and grid units a step, at first
+SMALL = 1e-3  # squared angle below which the series' next term is 1e-8 and less
 PULL = 1e-2  # towards the given poses, so that the scene does not drift as a whole
 
 
@@ -41,8 +42,19 @@ class PoseCorrections(nn.Module):
 
 
 def rotations(turn: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
-    """Rotation matrices of rotation vectors (exponential of the cross-product matrix)."""
+    """Rotation matrices of rotation vectors, by Rodrigues' formula.
+
+    The exponential of the cross-product matrix; `torch.linalg.matrix_exp` would wait for a GPU.
+    """
     x, y, z = turn.unbind(-1)
     none = torch.zeros_like(x)
     cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1).view(-1, 3, 3)
-    return torch.linalg.matrix_exp(cross)
+    squared = turn.square().sum(-1)
+    small = squared < SMALL
+    # Where the angle is 0 the root has no gradient, and 0/0: there the series stand in.
+    angle = torch.where(small, 1.0, squared).sqrt()
+    first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
+    half = angle / 2  # (1 - cos) / angle², without its loss of digits
+    second = torch.where(small, 0.5 - squared / 24, 0.5 * (half.sin() / half).square())
+    one = torch.eye(3, dtype=turn.dtype)
+    return one + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)
