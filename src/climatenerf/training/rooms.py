@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from climatenerf.ops.placing import array_of
+
 LATE = 2  # steps until the card's numbers are read: when it still has the last one to do
 SPARE = 1.5  # times what the last steps took
 LEAST = 1024  # entries of a room, where there are so many
@@ -43,7 +45,8 @@ class Rooms:
 
     def took(self, name: str, count: Int[Tensor, ""]) -> None:
         """Tells the entries that a list took, for its next rooms."""
-        self.noted[A_RAY + name] = count.detach() / self.rays
+        if self.fixed:
+            self.noted[A_RAY + name] = count.detach() / self.rays
 
     def chosen(self, name: str, mask: Bool[Tensor, "n"]) -> Int[Tensor, "k"]:
         """Indices where a mask is set, ascending.
@@ -94,7 +97,7 @@ class Rooms:
             names, numbers, arrived = self.sent.popleft()
             if arrived is not None:
                 arrived.synchronize()
-            for name, value in zip(names, numbers.tolist(), strict=True):
+            for name, value in zip(names, array_of(numbers).tolist(), strict=True):
                 if name.startswith(A_RAY):
                     kind = name.removeprefix(A_RAY)
                     self.taken[kind] = max(value, FORGET * self.taken.get(kind, 0.0))
