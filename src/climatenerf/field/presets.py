@@ -38,7 +38,7 @@ class FieldSize:
 
 PRESETS = {
     "cpu": FieldSize(),
-    # Tables that a GPU's memory and bandwidth carry easily; not measured on one yet.
+    # Tables that a GPU's memory and bandwidth carry easily; of its scores nothing is known yet.
     "gpu": FieldSize(
         geometry_levels=12,
         geometry_log2_rows=19,
