@@ -41,7 +41,8 @@ VARIANTS = {
 
 def heldout_psnr(scene: Scene, seed: int, variant: dict) -> float:
     """Mean over the held-out views after a fit; names in capitals are the modules' constants."""
-    of = {name: module for module in (fit, choosing) for name in variant if name in vars(module)}
+    capitals = [name for name in variant if name.isupper()]
+    of = {name: choosing if name in vars(choosing) else fit for name in capitals}
     before = {name: getattr(module, name) for name, module in of.items()}
     for name, module in of.items():
         setattr(module, name, variant[name])

@@ -6,7 +6,6 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_fit import with_labels
 
-from climatenerf.ops import placing
 from climatenerf.training import rooms as module
 from climatenerf.training.rooms import Rooms
 from climatenerf.training.settings import Losses
@@ -115,13 +114,17 @@ def test_a_step_in_fixed_rooms_waits_for_nothing(scene, batch_of, monkeypatch):
     fitting = begun(scene, True)
     for _ in range(4):
         fitting.step(batch_of(fitting))
-    monkeypatch.setattr(placing, "array_of", None)
+    fitting.reached, fitting.field.thin = 0.6, 0.002  # ever denser samples count as empty
     sending = fitting.rooms.next_step
     fitting.rooms.next_step = lambda: None
-    with Watch() as watch:
-        fitting.step(batch_of(fitting))
-        fitting.field.occupancy._known_at_once(torch.arange(4000), 1000)
+    with monkeypatch.context() as patch:
+        for way in ("cpu", "tolist"):  # to the processor, that a watch does not see
+            patch.setattr(torch.Tensor, way, None)
+        with Watch() as watch:
+            fitting.step(batch_of(fitting))
+            fitting.field.occupancy._known_at_once(torch.arange(4000), 1000)
     assert not watch.met, watch.met
+    assert any(name.startswith("thinner") for name in fitting.rooms.noted)
     fitting.rooms.next_step = sending
     fitting.rooms.next_step()
     # That the watch sees what there is to see:

@@ -521,7 +521,7 @@ def march(
     weights = _cpu_net(net) if kernels is cpu else tuple(map(_array, net))
     # The room for samples is used again and again: fresh memory would cost more than marching.
     room = _array(_room(rays[0], at_once, kernels is cpu))
-    parts, ends = [], [torch.zeros_like(spans[:1, 0], dtype=torch.long)]
+    parts, ends = [], [spans.new_zeros(1, dtype=torch.long)]
     out = None if total is None else spans.new_zeros(3, total)
     for o, d, span in zip(*(x.split(at_once) for x in (*rays, spans)), strict=True):
         count = o.new_zeros(o.shape[0], dtype=torch.long)
@@ -531,8 +531,8 @@ def march(
         begin = ends[-1][-1:]
         own = count.cumsum(0)
         if out is None:
-            part = o.new_empty(3, int(own[-1]))
-            kernels.pack(room, _array(torch.cat([own[:1] * 0, own])), _array(part))
+            part = o.new_empty(3, int(count.sum()))
+            kernels.pack(room, _array(torch.cat([ends[0], own])), _array(part))
             parts.append(part)
             ends.append(begin + own)
         else:

@@ -5,6 +5,7 @@ gradient; opaque matter ends a ray), evaluates the samples again with gradients,
 those that weigh, composites in linear light, and compares with the photos as displayed.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -434,7 +435,8 @@ class Fitting:
         """`Field.march` as a fit does it; in fixed rooms with zeros behind the last sample."""
         n, room = rays_o.shape[0], None
         if self.rooms.fixed:
-            room = self.rooms.room(name, n * dispatch.CAPACITY)
+            most = max(4 * self.settings.samples_per_step, 2**16)  # where nothing is known yet
+            room = self.rooms.room(name, min(n * dispatch.CAPACITY, most))
         samples = self.field.march(
             rays_o,
             rays_d,
@@ -480,7 +482,8 @@ class Fitting:
         if goal <= self.field.thin:
             return
         share = (weights * (tau < denser)).sum() / weights.sum()  # no light at all: NaN, not less
-        if self.rooms.late(f"thinner than {denser:.3g}", share) < THIN_SHARE:
+        name = f"thinner by {round(math.log2(denser / LEAST_TAU))}"  # not those of a lower bound
+        if self.rooms.late(name, share, math.inf) < THIN_SHARE:
             self.field.thin = min(goal, denser)
 
     def radiance(

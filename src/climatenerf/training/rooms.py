@@ -69,15 +69,19 @@ class Rooms:
         self.took(name, (ascending < limit).sum())
         return slice(0, self.room(name, ascending.shape[0]))
 
-    def late(self, name: str, value: Float[Tensor, ""] | Int[Tensor, ""]) -> float:
+    def late(
+        self, name: str, value: Float[Tensor, ""] | Int[Tensor, ""], unknown: float | None = None
+    ) -> float:
         """A number to decide by: this step's, or of fixed rooms one of two steps before.
 
-        Waits for the first.
+        As long as there is none, `unknown`; without it the first are waited for.
         """
         if not self.fixed:
             return float(value.detach())
         self.noted[name] = value.detach()
-        return self.known[name] if name in self.known else float(value.detach())
+        if name in self.known:
+            return self.known[name]
+        return float(value.detach()) if unknown is None else unknown
 
     def next_step(self) -> None:
         """Ends a step: sends its numbers off, and takes in those that should have come by now."""

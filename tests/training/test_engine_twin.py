@@ -1,0 +1,49 @@
+"""The step that `benchmarks/engine.py` measures, and its twin in plain PyTorch: they are one."""
+
+import os
+import sys
+from pathlib import Path
+from unittest import mock
+
+import torch
+from toy_fit import begin
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
+with mock.patch.dict(os.environ):  # the benchmarks' variables of threads are theirs alone
+    import engine
+sys.path.pop(0)
+
+
+def learned(field, at, plain):
+    for parameter in field.parameters():
+        parameter.grad = None
+    if plain:
+        with engine.plain_pytorch():
+            loss = engine.loss_of(field, at)
+            loss.backward()
+    else:
+        loss = engine.loss_of(field, at)
+        loss.backward()
+    named = {name: p.grad for name, p in field.named_parameters() if p.grad is not None}
+    return float(loss.detach()), {name: each.clone() for name, each in named.items()}
+
+
+def test_the_measured_step_and_its_twin_have_one_loss_and_the_same_gradients(scene):
+    fitting = begin(scene, steps=10)
+    field = fitting.field
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():  # as after some steps: structure in the grids, matter in sight
+        for name, parameter in field.named_parameters():
+            if name.endswith("_grid"):
+                parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
+        field.geometry_net[-1].add_(2.0)
+    for table in fitting.grid_adam.tables:
+        del table.grad_buffer  # gradients are to be seen
+    at = engine.drawn(fitting, 30_000)
+    ours, gradients = learned(field, at, False)
+    twin, wanted = learned(field, at, True)
+    assert abs(ours - twin) < 1e-5 * abs(twin)
+    assert gradients.keys() == wanted.keys() and len(wanted) > 20
+    for name, gradient in wanted.items():
+        off = (gradients[name] - gradient).norm()
+        assert gradient.norm() > 0 and off < 1e-3 * gradient.norm(), (name, off, gradient.norm())
