@@ -143,7 +143,7 @@ class Drawn:
 def drawn(fitting: Fitting, samples: int) -> Drawn:
     """Rays with about so many samples."""
     field, rays = fitting.field, 512
-    while True:
+    for _ in range(50):  # rays differ: a few may never come near enough
         batch = fitting.pixels.draw(rays, fitting.generator)
         n = batch.rays_o.shape[0]
         near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
