@@ -58,18 +58,17 @@ def runs(tmp_path_factory):
         patch.setitem(PRESETS, "tiny", TINY)
         for name, device in (("cpu", contextlib.nullcontext()), ("toy", on_toy())):
             with device:
-                for steps in (30, 60):
+                # Few: sooner or later a rounding decides whether a ray has one sample more, and
+                # Adam, whose steps know no size of gradients, makes another fit of it.
+                for steps in (20, 40):
                     chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**12}
-                    # Masks rest where nothing pulls at them, and there roundings decide what
-                    # Adam, whose steps know no size of gradients, makes of them.
-                    losses = Losses(transient=0.0)
-                    settings = FitSettings(steps=steps, refine_poses=True, losses=losses, **chosen)
+                    settings = FitSettings(steps=steps, refine_poses=True, **chosen)
                     fit_scene(
                         scene,
                         folder / name,
                         settings,
                         1,
-                        steps > 30,
+                        steps > 20,
                         lambda _: None,
                         lambda *_: None,
                     )
@@ -89,11 +88,11 @@ def test_a_fit_is_the_same_on_both(runs):
     _, folder = runs
     ours, theirs = load_field(folder / "cpu"), load_field(folder / "toy")
     for (name, a), b in zip(ours.state_dict().items(), theirs.state_dict().values(), strict=True):
-        # Activations round otherwise there, and Adam makes much of the smallest gradients.
+        # Activations round otherwise there.
         alike = torch.isclose(a.float(), b.float(), rtol=1e-3, atol=1e-4).float().mean()
-        assert alike > 0.95, (name, alike)
+        assert alike > 0.99, (name, alike)
     found = [read_json(folder / name / "metrics.json")["psnr"] for name in ("cpu", "toy")]
-    assert abs(found[0] - found[1]) < 0.05, found
+    assert abs(found[0] - found[1]) < 0.005, found
 
 
 @pytest.mark.slow
