@@ -7,8 +7,9 @@ every head, as in `engine.py`, beside eager PyTorch on the same device. `fit`: t
 nothing: samples a second in practice, and seconds until the held-out photos reach so many dB
 (reading and matching photos are counted, measuring and compiling are not); `waits`: how often a
 step waits for the card there, by PyTorch's own count, and at which lines. `frames`: seconds and
-frames a second of a view of RUN in each size, clean and with water on about 40 % of it. Memory is
-each part's peak on the device.
+frames a second of a view of RUN in each size, clean and with water on about 40 % of it, and of
+clean ones the samples a second (those that a march finds before a ray ends). Memory is each part's
+peak on the device.
 `--device cpu` tries the same without a GPU; its figures are the CPU's.
 """
 
@@ -26,15 +27,19 @@ import torch
 from engine import drawn, our_step, time_to_psnr, twin_step
 from frame_time import frames
 
+from climatenerf.cli.render import parse_size
 from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import on
+from climatenerf.render.camera_path import camera_path
+from climatenerf.render.view import RENDER_STEP, camera_rays
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings, settings_of
 
 GOALS = (20, 22, 24, 25)  # dB
 WEATHERS = ("clean", "flood")
+AT_ONCE = 2**15  # rays, whose samples are counted
 
 
 def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
@@ -71,7 +76,23 @@ def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> di
             name: {**found[name], "frames_per_s": 1 / found[name]["seconds"]["median"]}
             for name in WEATHERS
         }
+        of_clean = samples_of_frame(run, size, view)
+        rows[size]["clean"]["samples"] = of_clean
+        rows[size]["clean"]["samples_per_s"] = of_clean * rows[size]["clean"]["frames_per_s"]
     return rows
+
+
+def samples_of_frame(run: Path, size: str, view: str) -> int:
+    """Samples that a clean frame's rays have until they end."""
+    field = load_field(run)
+    path = camera_path(view, load_scene(run), 1, parse_size(size))
+    rays_o, rays_d = camera_rays(path.cameras[0], path.c2w[0])
+    count = 0
+    for o, d in zip(rays_o.split(AT_ONCE), rays_d.split(AT_ONCE), strict=True):
+        near = torch.full((o.shape[0],), field.near)
+        samples = field.march(o, d, near, torch.full_like(near, 1e9), RENDER_STEP)
+        count += samples.t.shape[0]
+    return count
 
 
 def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300) -> dict[str, Any]:

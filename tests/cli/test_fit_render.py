@@ -257,7 +257,9 @@ def test_a_render_overwrites_nothing_that_it_did_not_make(run_folder, tmp_path, 
 
 
 def test_a_preview_shows_each_frame_early_and_goes(run_folder, tmp_path, monkeypatch):
-    """And the frames are those of a render without one."""
+    """And the frames are those of a render without one; what a killed render left is none's."""
+    (tmp_path / "early").mkdir()
+    movie.write_png(tmp_path / "early" / "preview.png", np.zeros((2, 2, 3), np.uint8), "killed")
     written = []
     write = movie.write_png
 

@@ -52,7 +52,7 @@ def begun(scene, fixed):
     pixels = fitting.pixels
     depth = torch.rand(pixels.rgb.shape[0], generator=torch.Generator().manual_seed(1))
     pixels.relative = torch.where(depth > 0.9, torch.nan, depth)
-    assert fitting.carving.ground is not None and fitting.knows_sky and fitting.classed
+    assert fitting.carving.ground is not None and fitting.knows_sky and fitting.learns_classes
     fitting.rooms = Rooms(fixed)
     fitting.grid_adam.step = lambda rate: None
     fitting.net_adam.step = lambda: None

@@ -191,7 +191,7 @@ def check_place(out: Path, frames: int, preview: bool = False) -> None:
     ours = files_of_render(out)
     planned = [out / "frames" / f"{index:04d}.png" for index in range(frames)]
     planned += [out / name for name in ("movie.mp4", "movie.json") if not ours]
-    planned += [out / PREVIEW] if preview else []  # a render takes its own away
+    planned += [out / PREVIEW] if preview and not is_simulated(out / PREVIEW) else []
     for name in LAYER_NAMES:
         planned += [p for p in (out / name).glob("*") if p.stem.isdecimal()]
     for path in planned:
@@ -200,6 +200,17 @@ def check_place(out: Path, frames: int, preview: bool = False) -> None:
                 f"{path} was not made by the render that {out} holds, and would be overwritten;"
                 " choose another folder with -o, or remove it"
             )
+
+
+def is_simulated(path: Path) -> bool:
+    """Whether a file is a PNG of ours: a render that is killed leaves its preview."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return "simulated" in picture.info
+    except OSError:  # also what is no picture, or none
+        return False
 
 
 def prepare_stage(field, scene, weather: KeyframedWeather, path: "CameraPath", fps: float):
@@ -270,12 +281,12 @@ def render_movie(
                 records.append(FrameRecord(file, time, camera, c2w, kept, weather, measured(found)))
                 bar.advance()
     finally:
-        if preview:
-            (out / PREVIEW).unlink(missing_ok=True)
         # Also of a render that was stopped, or that has no movie: frames without it are no data.
         if records:
             weather, seed = weather_to_table(stage.weather), stage.weather.base.seed
             write_sidecar(out / "movie.json", stage.scene, records, weather, seed, about)
+        if preview:
+            (out / PREVIEW).unlink(missing_ok=True)
     # A longer render before this one has left frames and layers that are not of this weather.
     for stale in before - files_of_render(out):
         stale.unlink(missing_ok=True)

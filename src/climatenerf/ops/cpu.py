@@ -551,10 +551,9 @@ def voices_of(x, radius, views, least, agreed):
     """
     reach, starts, sizes, pinholes, c2w = views
     least_voices, least_share, apart = least
-    views = c2w.shape[0]
     for i in prange(x.shape[0]):
         voices, watching, first, spread = 0, 0, 0, False
-        for v in range(views):
+        for v in range(c2w.shape[0]):
             pose, pinhole = c2w[v], pinholes[v]
             dx, dy, dz = x[i, 0] - pose[0, 3], x[i, 1] - pose[1, 3], x[i, 2] - pose[2, 3]
             z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]

@@ -496,7 +496,7 @@ def march(
     steps: tuple[float, float, float],
     stop: float,
     net: Net,
-    total: int | None = None,
+    room: int | None = None,
 ) -> tuple[Int[Tensor, "n+1"], Float[Tensor, "3 s"]]:
     """See `reference.march`: all rays' samples, packed, and their offsets.
 
@@ -507,7 +507,7 @@ def march(
         steps: the smallest one, the step per length, the optical depth below which one is empty.
         stop: transmittance at which a ray ends.
         net: of the density.
-        total: length of the samples' list; what is over is 0, the last at least, and samples that
+        room: length of the samples' list; what is over is 0, the last at least, and samples that
             find no room are left out. None: as many as there are, for which a GPU has to be asked.
 
     Returns:
@@ -519,25 +519,24 @@ def march(
     at_once = CPU_RAYS if kernels is cpu else GPU_RAYS
     occupied = tuple(map(_array, cells))
     weights = _cpu_net(net) if kernels is cpu else tuple(map(_array, net))
-    # The room for samples is used again and again: fresh memory would cost more than marching.
-    room = _array(_room(rays[0], at_once, kernels is cpu))
+    # Used again and again: fresh memory would cost more than marching.
+    scratch = _array(_scratch(rays[0], at_once, kernels is cpu))
     parts, ends = [], [spans.new_zeros(1, dtype=torch.long)]
-    out = None if total is None else spans.new_zeros(3, total)
+    out = None if room is None else spans.new_zeros(3, room)
     for o, d, span in zip(*(x.split(at_once) for x in (*rays, spans)), strict=True):
         count = o.new_zeros(o.shape[0], dtype=torch.long)
-        kernels.march(
-            _array(o), _array(d), _array(span), occupied, steps, stop, weights, room, _array(count)
-        )
+        given = _array(o), _array(d), _array(span)
+        kernels.march(*given, occupied, steps, stop, weights, scratch, _array(count))
         begin = ends[-1][-1:]
         own = count.cumsum(0)
         if out is None:
             part = o.new_empty(3, int(count.sum()))
-            kernels.pack(room, _array(torch.cat([ends[0], own])), _array(part))
+            kernels.pack(scratch, _array(torch.cat([ends[0], own])), _array(part))
             parts.append(part)
             ends.append(begin + own)
         else:
             ends.append((begin + own).clamp_max(out.shape[1] - 1))
-            kernels.pack(room, _array(torch.cat([begin, ends[-1]])), _array(out))
+            kernels.pack(scratch, _array(torch.cat([begin, ends[-1]])), _array(out))
     return torch.cat(ends), torch.cat(parts, dim=1) if out is None else out
 
 
@@ -574,8 +573,8 @@ def composite(
     return out
 
 
-def _room(rays_o: Tensor, at_once: int, by_block: bool) -> Tensor:
-    """Room for the samples of some rays: in blocks of rays, or a column for each."""
+def _scratch(rays_o: Tensor, at_once: int, by_block: bool) -> Tensor:
+    """Memory for the samples of some rays: in blocks of rays, or a column for each."""
     n = min(at_once, max(rays_o.shape[0], 1))
     if by_block:
         return rays_o.new_empty(3, -(-n // cpu.RAY_BLOCK), cpu.RAY_BLOCK * CAPACITY)

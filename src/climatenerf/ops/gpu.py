@@ -1,10 +1,11 @@
 """GPU kernels in Triton, for blocks of samples or rays; `reference.py` specifies them.
 
 Function by function the interface of `cpu.py`, on tensors of the device, but for what is packed or
-turned for a CPU (`dispatch.cells_of`, `_cpu_net`); marching is in `gpu_march.py`, encodings with
-their networks are in `gpu_network.py`. Triton comes with PyTorch for CUDA, compiles at the first
-launch, and has a C compiler build what starts kernels. Its interpreter runs the same code on the
-CPU (TRITON_INTERPRET=1), which is how it is tested without a GPU.
+turned for a CPU (`dispatch.cells_of`, `_cpu_net`). Marching is in `gpu_march.py`, whole rays are in
+`gpu_render.py`, encodings with their networks in `gpu_network.py`, witnesses in `gpu_witness.py`.
+Triton comes with PyTorch for CUDA, compiles at the first launch, and has a C compiler build what
+starts kernels. Its interpreter runs the same code on the CPU (TRITON_INTERPRET=1), which is how it
+is tested without a GPU.
 """
 
 # Triton's functions have no types that pyright could know.

@@ -160,7 +160,8 @@ def _backward(
         sum_odd += tl.dot(tl.trans(back), second, input_precision=FAST)
         if LEARNS:
             at, known = _of_rays(grad_shared, rays[1], i, some, SIZES)
-            tl.atomic_add(at, back, mask=known & active, sem="relaxed")
+            # Without zeros: what fills a list has none but these, all of one ray.
+            tl.atomic_add(at, back, mask=known & (back != 0.0), sem="relaxed")
         even, odd, _bias = first_layer(w1, b1, SIZES)
         # Gradients to the features take the features' place.
         tl.store(at_first, tl.dot(back, tl.trans(even), input_precision=FAST), mask=there)

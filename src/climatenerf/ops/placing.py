@@ -2,7 +2,8 @@
 
 Work is done on the device of the `with torch.device(...)` block around it: what torch makes lies
 there by itself, and this brings the rest. A fit's random numbers (but for its networks' first
-values) are drawn on the CPU, so that a seed means much the same on every device.
+values and the order of occupied cells) are drawn on the CPU, so that a seed means much the same on
+every device.
 """
 
 import numpy as np

@@ -108,9 +108,9 @@ class Fitting:
         kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]
         # A head that has met one class alone, or nothing but ground, would say so of everything.
         classed = kinds.numel() > 1 and not bool(on_the_ground(kinds).all())
-        self.classed = settings.losses.classes > 0 and classed
+        self.learns_classes = settings.losses.classes > 0 and classed
         # Normals are learned later.
-        self.field.learned[:] = torch.tensor([False, self.classed])
+        self.field.learned[:] = torch.tensor([False, self.learns_classes])
         self.field.sky_grid.requires_grad_(self.knows_sky)
         grids = [self.field.geometry_grid, self.field.appearance_grid, self.field.sky_grid]
         grids += [self.field.surface_grid] if size.surface_levels else []
@@ -369,7 +369,7 @@ class Fitting:
         q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
         # Later the field has learned what is ground, so lumps by what stands are pulled as well,
         # and all harder: less goes with them.
-        classed = self.stage > self.classed_at and self.classed
+        classed = self.stage > self.classed_at and self.learns_classes
         far, goal, pulled = self.carving.far_from_ground(q, d, t[some], self.rooms, classed)
         some, pull = some[far], SURE_PULL if classed else 1.0
         own = weights[some] * pulled
@@ -415,7 +415,7 @@ class Fitting:
                 goal = self.field.density_normal(q)
         logits, apart = dispatch.surface(own, raw, goal, offsets_of(of, n))
         loss = weigh.normals * apart.sum() / n
-        if weigh.classes and self.pixels.label is not None and self.classed:
+        if weigh.classes and self.pixels.label is not None and self.learns_classes:
             target = self.solid_of[batch.label[:n].long()]
             loss = loss + weigh.classes * losses.class_loss(logits, target, target != UNKNOWN)
         if weigh.bend and q is not None:

@@ -143,13 +143,15 @@ def masked_colour_loss(
     mask: Float[Tensor, "n"],
     price: Float[Tensor, "n"],
 ) -> Float[Tensor, ""]:
-    """Mean of (1 - M)·error + price·M, where M weighs what is unexplained: see `transients.py`.
+    """(1 - M)·error + price·(M - `FAINT` log M): see `transients.py`. Meant for its gradients.
 
     Colours learn from their error, as far as M lets them; M from the error that no pixel nearby
-    explains.
+    explains, (1 - M)·unexplained. The value is the mean of both and of what M costs. The logarithm
+    holds an M that nothing pulls at near `FAINT`: at 0 it would learn no more.
     """
     trusted = 1.0 - mask
-    paid = price * (mask - FAINT * mask.log())
+    # 1e-6: of an M that is 0 in 32 bits, log 0 and in its gradient 0/0.
+    paid = price * (mask - FAINT * mask.clamp_min(1e-6).log())
     return (trusted.detach() * error + trusted * unexplained.detach() + paid).mean()
 
 

@@ -30,8 +30,10 @@ class Rooms:
         self.rays = 1
         self.taken: dict[str, float] = {}
         self.known: dict[str, float] = {}
+        # Of this step, of entries a ray and of other numbers; and of those that are on their way.
+        self.counted: dict[str, Tensor] = {}
         self.noted: dict[str, Tensor] = {}
-        self.sent: deque[tuple[list[str], Tensor, torch.cuda.Event | None]] = deque()
+        self.sent: deque[tuple[list[str], list[str], Tensor, torch.cuda.Event | None]] = deque()
 
     def begin(self, rays: int) -> None:
         """Begins a step of so many rays, with which what it takes grows."""
@@ -46,7 +48,7 @@ class Rooms:
     def took(self, name: str, count: Int[Tensor, ""]) -> None:
         """Tells the entries that a list took, for its next rooms."""
         if self.fixed:
-            self.noted[A_RAY + name] = count.detach() / self.rays
+            self.counted[name] = count.detach() / self.rays
 
     def chosen(self, name: str, mask: Bool[Tensor, "n"]) -> Int[Tensor, "k"]:
         """Indices where a mask is set, ascending.
@@ -85,9 +87,10 @@ class Rooms:
 
     def next_step(self) -> None:
         """Ends a step: sends its numbers off, and takes in those that should have come by now."""
-        if not self.noted:
+        noted = [*self.counted.values(), *self.noted.values()]
+        if not noted:
             return
-        numbers = torch.stack([each.float() for each in self.noted.values()])
+        numbers = torch.stack([each.float() for each in noted])
         arrived = None
         if numbers.is_cuda:
             there = torch.empty(numbers.shape, device="cpu", pin_memory=True)
@@ -95,18 +98,13 @@ class Rooms:
             arrived = torch.cuda.Event()
             arrived.record()
             numbers = there
-        self.sent.append((list(self.noted), numbers, arrived))
-        self.noted = {}
+        self.sent.append((list(self.counted), list(self.noted), numbers, arrived))
+        self.counted, self.noted = {}, {}
         while len(self.sent) >= (LATE if self.known else 1):
-            names, numbers, arrived = self.sent.popleft()
+            counted, noted, numbers, arrived = self.sent.popleft()
             if arrived is not None:
                 arrived.synchronize()
-            for name, value in zip(names, array_of(numbers).tolist(), strict=True):
-                if name.startswith(A_RAY):
-                    kind = name.removeprefix(A_RAY)
-                    self.taken[kind] = max(value, FORGET * self.taken.get(kind, 0.0))
-                else:
-                    self.known[name] = value
-
-
-A_RAY = "a ray: "  # of which numbers the names begin so
+            values = array_of(numbers).tolist()
+            for name, value in zip(counted, values[: len(counted)], strict=True):
+                self.taken[name] = max(value, FORGET * self.taken.get(name, 0.0))
+            self.known.update(zip(noted, values[len(counted) :], strict=True))

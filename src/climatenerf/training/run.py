@@ -344,7 +344,7 @@ def restore(fitting: Fitting, run: Path) -> None:
     with torch.no_grad():
         fitting.field.load_state_dict(field.state_dict())
     fitting.field.learned |= learned
-    fitting.classed = fitting.field.knows_classes
+    fitting.learns_classes = fitting.field.knows_classes
     fitting.field.unit, fitting.field.near, fitting.field.thin = field.unit, field.near, field.thin
     arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
     try:

@@ -4,9 +4,11 @@ A passer-by is seen by one photo only and cannot be explained by a static scene.
 mask M in [0,1] over it; where M is 1 its colours do not count, at a price. Minimising
 (1 - M) · error + price · M turns M on just where the error stays above the price (paper,
 "Transient Object Occlusion"; the price is its mask regulariser). The error that M weighs is what
-no pixel nearby explains: fine texture, never met pixel by pixel, is no passer-by.
+no pixel nearby explains: fine texture, never met pixel by pixel, is no passer-by. A logarithm of M
+beside its price keeps M from wearing out (`losses.masked_colour_loss`).
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -15,6 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from climatenerf.scene.classes import PERSON, VEHICLE
+from climatenerf.training.losses import FAINT
 from climatenerf.training.pixels import TrainingPixels
 from climatenerf.training.points import PointRays
 
@@ -36,7 +39,7 @@ class TransientMasks(nn.Module):
             [nn.Parameter(1e-2 * torch.randn(images, side, side, FEATURES)) for side in CELLS]
         )
         last = nn.Linear(HIDDEN, 1)
-        nn.init.constant_(last.bias, -4.0)  # all is believed to begin with
+        nn.init.constant_(last.bias, math.log(FAINT / (1 - FAINT)))  # all is believed at first
         self.net = nn.Sequential(nn.Linear(FEATURES * len(CELLS), HIDDEN), nn.ReLU(), last)
 
     def forward(self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
