@@ -97,6 +97,7 @@ class AnalyticField:
         t_max: Tensor,
         step_scale: float = 1.0,
         *,
+        stop: float = 1e-3,
         thin: float | None = None,
     ) -> Samples:
         """Samples from where each ray enters a solid (inside `bounds`) until it is opaque.

@@ -17,6 +17,8 @@ from random_field import random_field
 from climatenerf.field import field as field_module
 from climatenerf.field.activations import plain_radiance
 from climatenerf.ops import cpu, dispatch, reference
+from climatenerf.render import view as view_module
+from climatenerf.render.view import composited
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 os.environ["TRITON_INTERPRET"] = str(int(DEVICE == "cpu"))  # it is read where a kernel is defined
@@ -276,13 +278,15 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     o[0] = field.centre + 40 * field.unit  # outside all cells, looking away
     d[0] = torch.nn.functional.normalize(o[0] - field.centre, dim=-1)
     near = torch.full((n,), 0.2)
-    monkeypatch.setattr(field_module, "LEAST_WEIGHT", least)
+    for module in (field_module, view_module):
+        monkeypatch.setattr(module, "LEAST_WEIGHT", least)
     with torch.no_grad():
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
     by(cpu, monkeypatch)
     field.shown = field.embeddings[[1]].detach()
-    real = field.composited(o, d, near, 4.0, stop)
+    assert field.composited(o, d, near, 4.0, stop) is None
+    real = composited(field, o, d, near, 4.0, stop)
     assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.4).sum() > 3, (
         "some see matter, one does not"
     )
@@ -292,7 +296,7 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     field = field.to(DEVICE)
     field.occupancy.packed = None  # as the other kernels read it
     with torch.device(DEVICE):
-        found = field.composited(o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop)
+        found = composited(field, o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop)
     assert not marched, "one launch"
     for ours, theirs in zip(found, real, strict=True):
         # Where a step ends on a cell's face, rounding may put it on either side.

@@ -11,7 +11,7 @@ from random_field import directions, random_field
 
 from climatenerf.render import trace as trace_module
 from climatenerf.render.frame import render_frame
-from climatenerf.render.samples import LEAST_TAU
+from climatenerf.render.samples import LEAST_TAU, Samples
 from climatenerf.render.trace import trace
 from climatenerf.render.world import Water, World
 from climatenerf.scene.cameras import Camera
@@ -192,9 +192,9 @@ def test_a_bed_s_rays_leave_out_next_to_nothing(monkeypatch):
     """They begin at the water, with short steps, of which each is thin; the eye's do not."""
     asked, march = [], AnalyticField.march
 
-    def noting(self, *rays, thin=None):
+    def noting(self, *rays, stop=1e-3, thin=None):
         asked.append(thin)
-        return march(self, *rays, thin=thin)
+        return march(self, *rays, stop=stop, thin=thin)
 
     monkeypatch.setattr(AnalyticField, "march", noting)
     linear(World(street()))
@@ -460,29 +460,47 @@ def test_no_parameters_give_nan():
             assert (seen.rgb >= 0).all()
 
 
-class Unknown:
-    """A field that the renderer knows nothing of but what it promises."""
+class Nothing:
+    """Matter that is nowhere."""
 
-    def __init__(self, field):
-        self.bounds, self.march, self.density = field.bounds, field.march, field.density
-        self.colour, self.sky = field.colour, field.sky
+    def march(self, rays_o, rays_d, t_min, t_max):
+        none = torch.zeros(0)
+        return Samples(torch.zeros(len(t_min) + 1, dtype=torch.long), none, none, none)
+
+    def colour(self, x):
+        return torch.zeros_like(x)
+
+    def thickness(self, x):
+        return torch.zeros(len(x))
+
+    def normal(self, x):
+        return torch.zeros_like(x)
 
 
-def test_without_weather_a_short_way_leads_to_the_same(monkeypatch):
+@pytest.mark.parametrize("water", [None, flooded(wind_speed=4.0)])
+def test_what_meets_no_weather_takes_a_short_way_to_the_same(monkeypatch, water):
+    """Also reflected rays, and what lies under water; where matter could be leads the long way."""
     field = random_field()
     with torch.no_grad():
         field.geometry_net[-1] += 2.0
+    if water is not None:
+        water = dataclasses.replace(water, level=float(field.centre[2]))
     plain, taken = trace_module._see_plain, []
     monkeypatch.setattr(
-        trace_module, "_see_plain", lambda *given: taken.append(given) or plain(*given)
+        trace_module, "_see_plain", lambda *given: taken.append(given[1]) or plain(*given)
     )
     d = directions(300)
     o = (field.centre + torch.tensor([0.0, 0.0, 1.5])).expand(300, 3)
     angle = torch.full((300,), 0.01)
-    short = trace(World(field, 0.1), o, d, angle)
-    assert len(taken) == 1
-    long = trace(World(Unknown(field), 0.1), o, d, angle)
-    assert len(taken) == 1
+    short = trace(World(field, 0.1, water=water), o, d, angle)
+    if water is None:
+        assert sum(map(len, taken)) == 300
+    else:
+        rise = (d[:, 2] >= 0).sum()
+        assert len(taken[0]) == rise and sum(map(len, taken)) > rise + 100, "and what is mirrored"
+    taken.clear()
+    long = trace(World(field, 0.1, matter=Nothing(), water=water), o, d, angle)
+    assert not taken
     assert torch.isfinite(long.depth).float().mean() > 0.1
     for each in dataclasses.fields(short):
         ours, theirs = getattr(short, each.name), getattr(long, each.name)

@@ -20,7 +20,7 @@ from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.vectors import unit as unit_vector
-from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
+from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples
 from climatenerf.scene.classes import SOLID
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
@@ -242,33 +242,21 @@ class Field(nn.Module):
         t_min: Float[Tensor, "n"],
         step_scale: float = 1.0,
         stop: float = 1e-3,
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """What rays see of matter, in the appearance shown; arguments as those of `march`.
-
-        Returns:
-            Linear radiance, transmittance left, and the weighted sum of the samples' lengths (m).
-        """
-        n = rays_o.shape[0]
-        shared = self._seen_from(rays_d, self.shown_embedding.expand(n, -1))
+        thin: float | None = None,
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]] | None:
+        """`render.view.composited` of rays in one launch on a GPU; None elsewhere."""
+        shared = self._seen_from(rays_d, self.shown_embedding.expand(rays_o.shape[0], -1))
         endless, start = torch.full_like(t_min, 1e9), torch.zeros_like(t_min)
         found = dispatch.composite(
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, endless, start], dim=-1),
             self.occupancy.cells(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin if thin is None else thin),
             (stop, LEAST_WEIGHT),
             self._net(),
             ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
         )
-        if found is not None:
-            return found[:, :3], found[:, 4], found[:, 3] * self.unit
-        samples = self.march(rays_o, rays_d, t_min, endless, step_scale, stop=stop)
-        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-        far = dispatch.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
-        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
-        u, ray = self.sample_positions(rays_o, rays_d, samples)[keep], samples.ray_index()[keep]
-        colour = self._coloured(u, ray, shared)
-        return dispatch.accumulate(weights[keep], colour, offsets_of(ray, n)), left, far
+        return None if found is None else (found[:, :3], found[:, 4], found[:, 3] * self.unit)
 
     def sample_positions(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], samples: Samples

@@ -13,11 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
 from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
-from climatenerf.render.view import RENDER_STEP, rays_at_once
-from climatenerf.render.world import SKY_OPACITY, TINY, Seen, Water, World
+from climatenerf.render.view import RENDER_STEP, composited, rays_at_once
+from climatenerf.render.world import SKY_OPACITY, TINY, FieldLike, Seen, Water, World
 from climatenerf.weather import flood as water_physics
 from climatenerf.weather import smog, waves
 
@@ -60,8 +59,13 @@ def trace(
                 bounces=BOUNCES,
             )
         )
+    return _together(parts, slice(None))
+
+
+def _together(parts: list[Seen], order: Int[Tensor, "n"] | slice) -> Seen:
+    """What all the parts' rays see, one part after the other, in another order."""
     return Seen(
-        **{key: torch.cat([getattr(p, key) for p in parts]) for key in Seen.__annotations__}
+        **{key: torch.cat([getattr(p, key) for p in parts])[order] for key in Seen.__annotations__}
     )
 
 
@@ -79,9 +83,20 @@ def _trace(
     water = world.water if bounces > 0 else None
     # Reflections are blurred by the waves: coarser steps do for them.
     step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
-    plain = water is None and world.air is None and world.matter is None
-    if plain and isinstance(world.field, Field):
-        return _see_plain(world.field, rays_o, rays_d, t_min, step_scale)
+    if world.air is None and world.matter is None:
+        if water is None:
+            return _see_plain(world.field, rays_o, rays_d, t_min, step_scale)
+        # Most reflected rays rise, and see what they would without weather.
+        meets = water_physics.plane_distance(rays_o, rays_d, water.level) < torch.inf
+        meets = meets | (rays_o[:, 2] < water.level)
+        if not bool(meets.all()):
+            dry, wet = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
+            parts = [_see_plain(world.field, rays_o[dry], rays_d[dry], t_min[dry], step_scale)]
+            if wet.numel():
+                given = (rays_o[wet], rays_d[wet], pixel_angle[wet])
+                turn = None if roll is None else roll[wet]
+                parts.append(_trace(world, *given, turn, t_min[wet], bounces))
+            return _together(parts, torch.cat([dry, wet]).argsort())
     samples, is_matter = _all_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
@@ -177,11 +192,11 @@ def _trace(
 
 
 def _see_plain(
-    field: Field, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
+    field: FieldLike, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
 ) -> Seen:
     """What rays see of the scene without weather: as `_trace`, in one go on a GPU."""
     n = t_min.shape[0]
-    rgb, left, far = field.composited(rays_o, rays_d, t_min, step_scale)
+    rgb, left, far = composited(field, rays_o, rays_d, t_min, step_scale)
     skyward = (left > LEAST_WEIGHT).nonzero()[:, 0]
     rgb = rgb.index_add(0, skyward, left[skyward, None] * field.sky(rays_d[skyward]))
     depth = far / (1 - left).clamp_min(TINY)
@@ -392,23 +407,11 @@ def _other_side(
     down = (~below & shows & (direction[:, 2] < 0)).nonzero()[:, 0]
     if down.numel():
         o, d = start[down], direction[down]
-        zero, far = torch.zeros(down.shape[0]), torch.full_like(o[:, 0], 1e9)
+        zero = torch.zeros(down.shape[0])
         # A bed is seen as it is; its steps are fine.
-        samples = world.field.march(o, d, zero, far, RENDER_STEP, thin=LEAST_TAU)
-        weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-        ray = samples.ray_index()
-        keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
-        x = o[ray[keep]] + samples.t[keep, None] * d[ray[keep]]
+        matter, left, length = composited(world.field, o, d, zero, RENDER_STEP, thin=LEAST_TAU)
         opacity = (1 - left).clamp_min(TINY)
-        dry = (
-            dispatch.accumulate(
-                weights[keep],
-                world.field.colour(x, d, ray[keep]),
-                offsets_of(ray[keep], down.shape[0]),
-            )
-            / opacity[:, None]
-        )
-        path = _sum(weights * samples.t, samples.offsets) / opacity
+        dry, path = matter / opacity[:, None], length / opacity
         light = water_physics.light_cosine(water.flood, water.sun_elevation)
         passed = water_physics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
         behind[down] = water_physics.bed_radiance(dry, water.irradiance, water.flood.ior)

@@ -12,6 +12,7 @@ from climatenerf.field.field import Field
 from climatenerf.ops import dispatch
 from climatenerf.ops.placing import array_of, placed
 from climatenerf.render.samples import LEAST_WEIGHT, offsets_of
+from climatenerf.render.world import FieldLike
 from climatenerf.scene.cameras import Camera
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
@@ -65,6 +66,36 @@ def weighed_samples(
 
 
 @torch.no_grad()
+def composited(
+    field: FieldLike,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    t_min: Float[Tensor, "n"],
+    step_scale: float = RENDER_STEP,
+    stop: float = 1e-3,
+    thin: float | None = None,
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """What rays see of matter, in the appearance shown; arguments as those of `Field.march`.
+
+    Returns:
+        Linear radiance, transmittance left, and the weighted sum of the samples' lengths (m).
+    """
+    if isinstance(field, Field):
+        at_once = field.composited(rays_o, rays_d, t_min, step_scale, stop, thin)
+        if at_once is not None:
+            return at_once
+    endless = torch.full_like(t_min, 1e9)
+    samples = field.march(rays_o, rays_d, t_min, endless, step_scale, stop=stop, thin=thin)
+    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    far = dispatch.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
+    keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+    ray = samples.ray_index()[keep]
+    colour = field.colour(rays_o[ray] + samples.t[keep, None] * rays_d[ray], rays_d, ray)
+    offsets = offsets_of(ray, t_min.shape[0])
+    return dispatch.accumulate(weights[keep], colour, offsets), left, far
+
+
+@torch.no_grad()
 def field_radiance(
     field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
@@ -73,7 +104,7 @@ def field_radiance(
     size = rays_at_once(rays_o)
     for o, d in zip(rays_o.split(size), rays_d.split(size), strict=True):
         near = torch.full((o.shape[0],), field.near)
-        matter, left, _ = field.composited(o, d, near, RENDER_STEP)
+        matter, left, _ = composited(field, o, d, near)
         out.append(matter + left[:, None] * field.sky(d))
     return torch.cat(out)
 

@@ -29,9 +29,13 @@ class FieldLike(Protocol):
         t_max: Tensor,
         step_scale: float = 1.0,
         *,
+        stop: float = 1e-3,
         thin: float | None = None,
     ) -> Samples:
-        """Samples where matter is, but for those of an optical depth below `thin`."""
+        """Samples where matter is, but for those of an optical depth below `thin`.
+
+        A ray ends where so little light is left as `stop`.
+        """
         ...
 
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
