@@ -32,14 +32,13 @@ from climatenerf.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import on
 from climatenerf.render.camera_path import camera_path
-from climatenerf.render.view import RENDER_STEP, camera_rays
+from climatenerf.render.view import RENDER_STEP, camera_rays, rays_at_once
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings, settings_of
 
 GOALS = (20, 22, 24, 25)  # dB
 WEATHERS = ("clean", "flood")
-AT_ONCE = 2**15  # rays, whose samples are counted
 
 
 def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
@@ -87,8 +86,8 @@ def samples_of_frame(run: Path, size: str, view: str) -> int:
     field = load_field(run)
     path = camera_path(view, load_scene(run), 1, parse_size(size))
     rays_o, rays_d = camera_rays(path.cameras[0], path.c2w[0])
-    count = 0
-    for o, d in zip(rays_o.split(AT_ONCE), rays_d.split(AT_ONCE), strict=True):
+    count, some = 0, rays_at_once(rays_o)
+    for o, d in zip(rays_o.split(some), rays_d.split(some), strict=True):
         near = torch.full((o.shape[0],), field.near)
         samples = field.march(o, d, near, torch.full_like(near, 1e9), RENDER_STEP)
         count += samples.t.shape[0]

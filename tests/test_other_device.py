@@ -60,7 +60,7 @@ def runs(tmp_path_factory):
             with device:
                 # Few: sooner or later a rounding decides whether a ray has one sample more, and
                 # Adam, whose steps know no size of gradients, makes another fit of it.
-                for steps in (20, 40):
+                for steps in (12, 24):
                     chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**12}
                     settings = FitSettings(steps=steps, refine_poses=True, **chosen)
                     fit_scene(
@@ -68,7 +68,7 @@ def runs(tmp_path_factory):
                         folder / name,
                         settings,
                         1,
-                        steps > 20,
+                        steps > 12,
                         lambda _: None,
                         lambda *_: None,
                     )

@@ -241,6 +241,19 @@ def test_a_shorter_render_leaves_nothing_of_the_longer_one_before_it(run_folder,
     assert len(told["frames"]) == 1 and told["weather"]["smog"]["visibility"] == "50 m"
 
 
+def test_flags_of_a_weather_that_is_not_there_are_told(run_folder, tmp_path, capsys):
+    words = ["render", str(run_folder), *map(str, SMALL), "--frames", "1", "-o", str(tmp_path)]
+    assert cli.main([*words, "--flood.wind-speed", "4 m/s", "--snow.depth", "1 cm"]) == 0
+    told = capsys.readouterr().err
+    assert "--flood.wind-speed changes nothing without --flood.level" in told
+    assert "--snow" not in told
+    film = tmp_path / "film.toml"
+    film.write_text('[flood]\nlevel = { "0 s" = "1 cm", "1 s" = "2 cm" }\n')
+    given = ["--weather", str(film), "--flood.wind-speed", "4 m/s"]
+    assert cli.main([*words[:-1], str(tmp_path / "film"), *given]) == 0
+    assert "changes nothing" not in capsys.readouterr().err
+
+
 OURS = ["frames/0000.png", "movie.mp4", "movie.json", "depth/0000.npz", "preview.png"]
 
 

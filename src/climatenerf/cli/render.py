@@ -80,6 +80,8 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
     flags = Weather(options.smog, options.flood, options.snow, options.sun, options.seed)
     given = given_flags(sys.argv[1:] if arguments is None else arguments)
     weather = combine(film, flags, given)
+    for name, absent in without_effect(weather, given).items():
+        progress.warn(f"--{name} changes nothing without {absent}")
     layers = LAYER_NAMES if "all" in options.layers else options.layers
     if "exr" in options.layer_format and layers:
         from climatenerf.render.layers import require_exr
@@ -90,6 +92,22 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
 
     with on(options.device):
         return render_run(options, weather, size, layers)
+
+
+def without_effect(weather: KeyframedWeather, given: frozenset[str]) -> dict[str, str]:
+    """Flags of a weather that is not there, and what would bring it."""
+    bring = {
+        "smog": "--smog.visibility or --smog.sigma",
+        "flood": "--flood.level",
+        "snow": "--snow.depth",
+    }
+    found = {}
+    for name in sorted(given):
+        section = name.partition(".")[0]
+        keyed = any(key.startswith(f"{section}.") for key in weather.keyframes)
+        if section in bring and not keyed and not getattr(weather.base, section).present:
+            found[name.replace("_", "-")] = bring[section]
+    return found
 
 
 def render_run(
@@ -115,6 +133,8 @@ def render_run(
                 f"{options.run} was fitted without class labels, so it has no layer label; fit with"
                 " --labels"
             )
+        if "label" in layers:
+            progress.say("no layer label: the run was fitted without class labels")
         layers = tuple(name for name in layers if name != "label")
     path = camera_path(options.path, scene, options.frames, size)
     for note in path.notes:
@@ -209,7 +229,8 @@ def is_simulated(path: Path) -> bool:
     try:
         with Image.open(path) as picture:
             return "simulated" in picture.info
-    except OSError:  # also what is no picture, or none
+    # No file, no picture, or one so large that it is not opened.
+    except (OSError, ValueError, Image.DecompressionBombError):
         return False
 
 

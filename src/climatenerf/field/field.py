@@ -235,7 +235,7 @@ class Field(nn.Module):
         return Samples(offsets, t * self.unit, dt * self.unit, sigma / self.unit)
 
     @torch.no_grad()
-    def composited(
+    def composited_at_once(
         self,
         rays_o: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
@@ -245,6 +245,8 @@ class Field(nn.Module):
         thin: float | None = None,
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]] | None:
         """`render.view.composited` of rays in one launch on a GPU; None elsewhere."""
+        if not dispatch.takes_whole_rays(rays_o, rays_d, self.geometry_grid):
+            return None
         shared = self._seen_from(rays_d, self.shown_embedding.expand(rays_o.shape[0], -1))
         endless, start = torch.full_like(t_min, 1e9), torch.zeros_like(t_min)
         found = dispatch.composite(
@@ -256,7 +258,7 @@ class Field(nn.Module):
             self._net(),
             ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
         )
-        return None if found is None else (found[:, :3], found[:, 4], found[:, 3] * self.unit)
+        return found[:, :3], found[:, 4], found[:, 3] * self.unit
 
     def sample_positions(
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], samples: Samples

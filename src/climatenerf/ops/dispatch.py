@@ -540,6 +540,12 @@ def march(
     return torch.cat(ends), torch.cat(parts, dim=1) if out is None else out
 
 
+def takes_whole_rays(*tensors: Tensor) -> bool:
+    """Whether these are on a GPU, as `composite` wants them."""
+    kernels = _kernels(*tensors)
+    return kernels is not None and kernels is not cpu
+
+
 @torch.no_grad()
 def composite(
     rays: tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]],
@@ -549,8 +555,8 @@ def composite(
     limits: tuple[float, float],
     net: Net,
     colours: tuple[Net, Float[Tensor, "n h"]],
-) -> Float[Tensor, "n 5"] | None:
-    """Whole rays in one launch on a GPU; None elsewhere: march and composite then.
+) -> Float[Tensor, "n 5"]:
+    """Whole rays in one launch, where `takes_whole_rays`; elsewhere march and composite.
 
     Args:
         rays, spans, cells, steps, net: as those of `march`.
@@ -560,9 +566,6 @@ def composite(
     Returns:
         Linear radiance of matter, weighted sum of ray lengths (grid units), transmittance.
     """
-    kernels = _kernels(*rays, *net, *colours[0])
-    if kernels is None or kernels is cpu:
-        return None
     from climatenerf.ops import gpu_render
 
     looks, shared = colours

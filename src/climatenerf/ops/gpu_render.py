@@ -1,6 +1,6 @@
 """Whole rays on a GPU, a block at a time: march, encode, both networks, composite, in one launch.
 
-The twin is the composition of the operations (`Field.composited` on the CPU). Nothing is stored
+The twin is the composition of the operations (`render.view.composited`). Nothing is stored
 for the samples, so memory does not grow with them. In Triton, with the search of `gpu_march.py`.
 """
 

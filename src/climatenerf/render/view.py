@@ -81,7 +81,7 @@ def composited(
         Linear radiance, transmittance left, and the weighted sum of the samples' lengths (m).
     """
     if isinstance(field, Field):
-        at_once = field.composited(rays_o, rays_d, t_min, step_scale, stop, thin)
+        at_once = field.composited_at_once(rays_o, rays_d, t_min, step_scale, stop, thin)
         if at_once is not None:
             return at_once
     endless = torch.full_like(t_min, 1e9)
