@@ -325,6 +325,16 @@ def test_a_network_on_what_needs_no_gradient_learns_the_same(generator):
         assert torch.equal(a, b)
 
 
+def test_gradients_of_no_light_count_as_none(generator):
+    """Numbers that 32 bits do not hold in full are slow on some processors; faint ones count."""
+    layers, _ = network(generator, 8, 16)
+    x = torch.randn(300, 8, generator=generator)
+    for size, counts in ((1e-39, False), (1e-31, False), (1e-25, True)):
+        own = [tuple(leaf(p, torch.float32) for p in pair) for pair in layers]
+        (size * dispatch.mlp(x, own)).sum().backward()
+        assert bool(own[0][0].grad.any()) == counts, size
+
+
 def test_encodings_do_not_depend_on_how_many_threads_share_them(generator):
     table, resolutions = grid(generator)
     u = torch.rand(1000, 3, generator=generator).numpy()
