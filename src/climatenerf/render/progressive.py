@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.render.trace import Seen, trace
-from climatenerf.render.world import World
+from climatenerf.render.world import World, together
 
 SPACINGS = (4, 2, 1)  # rays between those that are known after each pass
 
@@ -42,7 +42,4 @@ def trace_coarse_first(
             linear[some], known[some] = parts[-1].rgb, True
         nearest = row // spacing * spacing * width + column // spacing * spacing
         show(linear[nearest].view(-1, width, 3))
-    place = torch.cat(order).argsort()
-    return Seen(
-        **{key: torch.cat([getattr(p, key) for p in parts])[place] for key in Seen.__annotations__}
-    )
+    return together(parts, torch.cat(order).argsort())

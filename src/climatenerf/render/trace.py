@@ -16,7 +16,7 @@ from torch import Tensor
 from climatenerf.ops import dispatch
 from climatenerf.render.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
 from climatenerf.render.view import RENDER_STEP, composited, rays_at_once
-from climatenerf.render.world import SKY_OPACITY, TINY, FieldLike, Seen, Water, World
+from climatenerf.render.world import SKY_OPACITY, TINY, FieldLike, Seen, Water, World, together
 from climatenerf.weather import flood as water_physics
 from climatenerf.weather import smog, waves
 
@@ -59,14 +59,7 @@ def trace(
                 bounces=BOUNCES,
             )
         )
-    return _together(parts, slice(None))
-
-
-def _together(parts: list[Seen], order: Int[Tensor, "n"] | slice) -> Seen:
-    """What all the parts' rays see, one part after the other, in another order."""
-    return Seen(
-        **{key: torch.cat([getattr(p, key) for p in parts])[order] for key in Seen.__annotations__}
-    )
+    return together(parts, slice(None))
 
 
 def _trace(
@@ -96,7 +89,7 @@ def _trace(
                 given = (rays_o[wet], rays_d[wet], pixel_angle[wet])
                 turn = None if roll is None else roll[wet]
                 parts.append(_trace(world, *given, turn, t_min[wet], bounces))
-            return _together(parts, torch.cat([dry, wet]).argsort())
+            return together(parts, torch.cat([dry, wet]).argsort())
     samples, is_matter = _all_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)

@@ -1,9 +1,11 @@
 """What a ray can meet: the fitted field, and the weather put into it."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -117,6 +119,13 @@ class Seen:
     mask_water: Float[Tensor, "n"]
     mask_snow: Float[Tensor, "n"]
     mask_smog: Float[Tensor, "n"]
+
+
+def together(parts: Sequence[Seen], order: Int[Tensor, "n"] | slice) -> Seen:
+    """What all the parts' rays see, one part after the other, and then in this order."""
+    return Seen(
+        **{key: torch.cat([getattr(p, key) for p in parts])[order] for key in Seen.__annotations__}
+    )
 
 
 SKY_OPACITY = 0.5  # rays with more sky than this on them have no surface
