@@ -29,21 +29,22 @@ from frame_time import frames
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.field import activations, directions
+from climatenerf.core.classes import SOLID
+from climatenerf.core.device import uniform
+from climatenerf.core.samples import Samples
+from climatenerf.core.vectors import unit
+from climatenerf.field import activations
+from climatenerf.field import spherical_harmonics as directions
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.field import Field
+from climatenerf.field.hash_field import Field
 from climatenerf.ops import dispatch, reference
-from climatenerf.ops.placing import uniform
-from climatenerf.ops.vectors import unit
-from climatenerf.render.samples import Samples
 from climatenerf.scene import load_scene, read_scene
-from climatenerf.scene.classes import SOLID
 from climatenerf.training import losses
-from climatenerf.training.fit import Fitting, Report
+from climatenerf.training.dataset import Batch
 from climatenerf.training.optimiser import GridAdam
-from climatenerf.training.pixels import Batch
 from climatenerf.training.run import begin, evaluate
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.trainer import Fitting, Report
 
 GOALS = (20, 22, 24)  # dB
 STEPS = 5  # of ours for one of a twin's

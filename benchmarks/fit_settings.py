@@ -15,16 +15,17 @@ from pathlib import Path
 import common  # first: sets the threads' variables
 import numpy as np
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / p) for p in ("", "training")]
+sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests")]
 
-from toy_scene import CAMERA, TINY, make_scene  # noqa: E402
+from support.toy_scene import CAMERA, TINY, make_scene  # noqa: E402
 
 from climatenerf.evaluation.metrics import psnr  # noqa: E402
-from climatenerf.field.extent import find_extent  # noqa: E402
+from climatenerf.field.normalisation import find_extent  # noqa: E402
 from climatenerf.field.presets import PRESETS  # noqa: E402
-from climatenerf.render.view import render_view  # noqa: E402
+from climatenerf.render.volume import render_view  # noqa: E402
 from climatenerf.scene import Scene, load_image  # noqa: E402
-from climatenerf.training import choosing, fit  # noqa: E402
+from climatenerf.training import sample_selection as choosing  # noqa: E402
+from climatenerf.training import trainer as fit  # noqa: E402
 from climatenerf.training.run import load_pixels  # noqa: E402
 from climatenerf.training.settings import Losses  # noqa: E402
 

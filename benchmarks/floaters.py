@@ -39,8 +39,8 @@ def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
     import mitsuba as mi
 
     sys.path.insert(0, str(ROOT))
-    from street.layout import build_scene
-    from street.render import load, render_view
+    from tools.reference_street.layout import build_scene
+    from tools.reference_street.render import load, render_view
 
     with tempfile.TemporaryDirectory() as meshes:
         street = load(build_scene(), Path(meshes), threads=2)

@@ -19,13 +19,13 @@ import numpy as np
 
 from climatenerf.cli.render import parse_size
 from climatenerf.field.checkpoint import load_field
-from climatenerf.render.camera_path import CameraPath, camera_path
+from climatenerf.paths.camera_path import CameraPath, camera_path
 from climatenerf.render.frame import render_frame
-from climatenerf.render.stage import prepare
-from climatenerf.render.world import World
+from climatenerf.render.session import prepare
 from climatenerf.scene import load_scene
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
+from climatenerf.weather.world import World
 
 
 def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:

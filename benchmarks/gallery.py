@@ -21,16 +21,16 @@ import numpy as np
 import torch
 from PIL import Image
 
+from climatenerf.core.storage import read_safetensors
 from climatenerf.field.checkpoint import load_field
-from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
+from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.render.frame import render_frame
-from climatenerf.render.world import World
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_image
-from climatenerf.storage import read_safetensors
-from climatenerf.training.ablation import depth_picture, normal_picture
+from climatenerf.studies.ablation import depth_picture, normal_picture
 from climatenerf.training.folder import OPTIMISER
 from climatenerf.training.transients import MASKED, TransientMasks
+from climatenerf.weather.world import World
 
 # Road, building, vegetation, terrain, sky, person, vehicle, as Cityscapes paints them.
 PAINT = np.zeros((256, 3), np.uint8)

@@ -21,9 +21,10 @@ import torch
 from numba import njit, prange
 
 from climatenerf.field import activations
-from climatenerf.field.field import Field
+from climatenerf.field.hash_field import Field
 from climatenerf.field.presets import PRESETS
-from climatenerf.ops import cpu, dispatch, reference
+from climatenerf.ops import dispatch, reference
+from climatenerf.ops.cpu import kernels as cpu
 
 SAMPLES_PER_RAY = 32
 

@@ -21,12 +21,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from climatenerf.core.classes import MERGED, SKY
 from climatenerf.evaluation.geometry import EMPTY, emptiness_scores, free_space
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import Place, check_views, passing
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene
-from climatenerf.scene.classes import MERGED, SKY
 from climatenerf.scene.images import load_labels
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,7 +36,7 @@ def depths(scene, pose: Float[np.ndarray, "4 4"], size: tuple[int, int], rays: i
     """Ray lengths at random places of each pixel's area, [h, w, rays²]; +inf in the sky."""
     import mitsuba as mi
 
-    from street.render import render_view
+    from tools.reference_street.render import render_view
 
     width, height = size
     asked = mi.load_dict({"type": "aov", "aovs": "t:depth"})
@@ -80,8 +80,8 @@ def main() -> None:
     options = parser.parse_args()
     rays = options.rays
     sys.path.insert(0, str(ROOT))
-    from street.layout import build_scene, measuring_poses
-    from street.render import load
+    from tools.reference_street.layout import build_scene, measuring_poses
+    from tools.reference_street.render import load
 
     truths = read_reference(ROOT / "reference" / "street").truths
     with tempfile.TemporaryDirectory() as scratch:

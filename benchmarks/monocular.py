@@ -24,7 +24,7 @@ from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import Place
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene, read_scene
-from climatenerf.training.ablation import measure_row
+from climatenerf.studies.ablation import measure_row
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 
@@ -45,7 +45,7 @@ def inverse_z(scene, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w"]
     """True inverse z-depth through the pixels' middles; 0 in the sky."""
     import mitsuba as mi
 
-    from street.truth import pixel_rays
+    from tools.reference_street.truth import pixel_rays
 
     rays = pixel_rays(pose, WIDTH, HEIGHT)
     out = np.zeros((HEIGHT, WIDTH))
@@ -69,8 +69,8 @@ def as_networks_give_it(
 def make_capture(folder: Path, seed: int) -> None:
     """The reference street's photos, labels and points, and relative depths."""
     sys.path.insert(0, str(ROOT))
-    from street.layout import build_scene, camera_poses
-    from street.render import load
+    from tools.reference_street.layout import build_scene, camera_poses
+    from tools.reference_street.render import load
 
     for name in ("images", "labels"):
         shutil.copytree(REFERENCE / name, folder / name)

@@ -20,7 +20,7 @@ from climatenerf.evaluation.reference import Truth, read_reference
 from climatenerf.evaluation.scores import Place, check_views, dry_from
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import Camera, load_scene
-from climatenerf.training.ablation import slope_normals
+from climatenerf.studies.ablation import slope_normals
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 

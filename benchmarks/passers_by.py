@@ -19,14 +19,14 @@ import torch
 from jaxtyping import Bool
 from PIL import Image
 
+from climatenerf.core.classes import MERGED, PERSON, UNKNOWN
 from climatenerf.scene import read_scene
-from climatenerf.scene.classes import MERGED, PERSON, UNKNOWN
 from climatenerf.scene.images import load_labels
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene
-from climatenerf.training.fit import Fitting
 from climatenerf.training.run import begin, evaluate
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.trainer import Fitting
 from climatenerf.training.transients import MASKED
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"

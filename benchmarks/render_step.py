@@ -14,7 +14,7 @@ from pathlib import Path
 import common
 
 from climatenerf.field.checkpoint import load_field
-from climatenerf.render import view
+from climatenerf.render import volume as view
 from climatenerf.scene import load_scene
 from climatenerf.training.run import evaluate
 

@@ -17,13 +17,14 @@ import numpy as np
 import torch
 from kernels import bounds
 
-from climatenerf.ops import matching, metaballs
+from climatenerf.ops.cpu import metaballs
+from climatenerf.ops.cpu import plane_sweep as matching
 from climatenerf.scene import read_scene
-from climatenerf.training.matching import distances, pictures_of
-from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.dataset import TrainingPixels
+from climatenerf.training.evidence.multiview_stereo import distances, pictures_of
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings
-from climatenerf.weather.snow_lattice import Deposits, SnowGrid, grow
+from climatenerf.weather.snow.lattice import Deposits, SnowGrid, grow
 
 ROOT = Path(__file__).resolve().parents[1]
 WINDOW = (2 * matching.SIDE + 1) ** 2

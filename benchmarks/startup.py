@@ -29,7 +29,7 @@ COMMANDS = {
     "python, nothing": ["-c", "pass"],
     "import climatenerf": ["-c", "import climatenerf"],
     "import climatenerf.scene": ["-c", "import climatenerf.scene"],
-    "import climatenerf.field.field": ["-c", "import climatenerf.field.field"],
+    "import climatenerf.field.hash_field": ["-c", "import climatenerf.field.hash_field"],
 }
 
 

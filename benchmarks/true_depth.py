@@ -22,7 +22,7 @@ from climatenerf.evaluation.scores import Place
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.scene import Scene
-from climatenerf.training.ablation import measure_row
+from climatenerf.studies.ablation import measure_row
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 
@@ -36,9 +36,9 @@ def with_true_points(capture: Scene, each: int, seed: int) -> Scene:
     import mitsuba as mi
 
     sys.path.insert(0, str(ROOT))
-    from street.layout import build_scene
-    from street.render import load, render_view
-    from street.truth import pixel_rays
+    from tools.reference_street.layout import build_scene
+    from tools.reference_street.render import load, render_view
+    from tools.reference_street.truth import pixel_rays
 
     random = np.random.default_rng(seed)
     points, views, count = [], [], 0

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from climatenerf.field.checkpoint import load_field
-from climatenerf.render.camera_path import camera_path
+from climatenerf.output.layers import SIMULATED
+from climatenerf.output.video import write_png
+from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import render_frame
-from climatenerf.render.layers import SIMULATED
-from climatenerf.render.movie import write_png
-from climatenerf.render.stage import prepare
+from climatenerf.render.session import prepare
 from climatenerf.scene import load_scene, read_scene
-from climatenerf.training.fit import FitSettings, Report
 from climatenerf.training.run import fit_scene
+from climatenerf.training.trainer import FitSettings, Report
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
 

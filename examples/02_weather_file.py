@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from climatenerf.field.checkpoint import load_field
-from climatenerf.render.camera_path import camera_path
-from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
+from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
+from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import render_frame
-from climatenerf.render.stage import prepare
+from climatenerf.render.session import prepare
 from climatenerf.scene import load_scene
 from climatenerf.weather.description import read_weather
 

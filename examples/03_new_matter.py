@@ -14,17 +14,17 @@ from pathlib import Path
 
 from torch import Tensor
 
+from climatenerf.core.samples import Samples
 from climatenerf.field.checkpoint import load_field
-from climatenerf.render.camera_path import camera_path
+from climatenerf.output.layers import SIMULATED
+from climatenerf.output.video import write_png
+from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import render_frame
-from climatenerf.render.layers import SIMULATED
-from climatenerf.render.light import scene_irradiance
-from climatenerf.render.movie import write_png
-from climatenerf.render.samples import Samples
-from climatenerf.render.world import World
+from climatenerf.render.irradiance import scene_irradiance
 from climatenerf.scene import load_scene
 from climatenerf.weather.parameters import Snow
-from climatenerf.weather.snow import BakedSnow, bake_snow
+from climatenerf.weather.snow.layer import BakedSnow, bake_snow
+from climatenerf.weather.world import World
 
 
 @dataclass(frozen=True)

@@ -131,11 +131,11 @@ def test_the_water_mirrors_the_place(fitted, monkeypatch):
     import torch
 
     from climatenerf.field.checkpoint import load_field
-    from climatenerf.render import trace as tracing
-    from climatenerf.render.camera_path import camera_path
-    from climatenerf.render.stage import prepare
-    from climatenerf.render.trace import trace
-    from climatenerf.render.view import RENDER_STEP, camera_rays
+    from climatenerf.paths.camera_path import camera_path
+    from climatenerf.render import integrator as tracing
+    from climatenerf.render.integrator import trace
+    from climatenerf.render.session import prepare
+    from climatenerf.render.volume import RENDER_STEP, camera_rays
     from climatenerf.scene import load_scene
     from climatenerf.weather.description import weather_from_table
 
@@ -183,8 +183,8 @@ def test_sheltered_places_stay_bare(fitted, rendered):
 
     from climatenerf.field.checkpoint import load_field
     from climatenerf.ops import dispatch
-    from climatenerf.render.camera_path import camera_path
-    from climatenerf.render.view import camera_rays
+    from climatenerf.paths.camera_path import camera_path
+    from climatenerf.render.volume import camera_rays
     from climatenerf.scene import load_scene
 
     _, run = fitted

@@ -15,7 +15,7 @@ HEAVY = {"torch", "numba", "mitsuba", "scipy"}
         "climatenerf.scene",
         "climatenerf.weather.parameters climatenerf.weather.units climatenerf.weather.description",
         "climatenerf.cli.fit climatenerf.cli.render climatenerf.cli.demo",
-        "climatenerf.storage climatenerf.field.presets climatenerf.evaluation.metrics",
+        "climatenerf.core.storage climatenerf.field.presets climatenerf.evaluation.metrics",
     ],
 )
 def test_these_load_nothing_heavy(modules):

@@ -6,29 +6,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_device import TOY, kernels_for_toys
-from training.toy_photos import BENT, pattern, photos
-from training.toy_scene import CAMERA, TINY, make_scene
+from support.toy_device import TOY, kernels_for_toys
+from support.toy_photos import BENT, pattern, photos
+from support.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
-from climatenerf.errors import UserError
+from climatenerf.core.device import array_of
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import read_json
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.device import check_triton, on
-from climatenerf.field.extent import find_extent
-from climatenerf.field.field import Field
+from climatenerf.field.hash_field import Field
+from climatenerf.field.normalisation import find_extent
 from climatenerf.field.presets import PRESETS
-from climatenerf.ops.placing import array_of
 from climatenerf.render.frame import render_frame
-from climatenerf.render.stage import prepare
+from climatenerf.render.session import prepare
 from climatenerf.scene import load_image
-from climatenerf.storage import read_json
-from climatenerf.training.carving import Carving
-from climatenerf.training.fit import Fitting
-from climatenerf.training.matching import match_photos
-from climatenerf.training.pixels import TrainingPixels
-from climatenerf.training.points import find_point_rays
+from climatenerf.training.dataset import TrainingPixels
+from climatenerf.training.evidence.free_space import Carving
+from climatenerf.training.evidence.multiview_stereo import match_photos
+from climatenerf.training.evidence.sparse_depth import find_point_rays
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
+from climatenerf.training.trainer import Fitting
 from climatenerf.weather.description import weather_from_table
 
 WEATHER = {

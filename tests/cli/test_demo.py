@@ -59,7 +59,7 @@ def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
 
 
 def test_ctrl_c_while_fitting_ends_it_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
-    from climatenerf.training.fit import Fitting
+    from climatenerf.training.trainer import Fitting
 
     step = Fitting.step
 

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from climatenerf import cli
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import write_json
 from climatenerf.evaluation.report import check_place
-from climatenerf.storage import write_json
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "street"
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
-from scene.scene_builders import names_of, ring, write_colmap
+from support.scene_builders import names_of, ring, write_colmap
 
 from climatenerf import cli
 from climatenerf.cli import fit
@@ -74,7 +74,7 @@ def test_unknown_models_are_refused_before_the_fit(capture, fitted, capsys):
 
 def test_networks_of_the_user_s(capture, fitted, tmp_path, capsys):
     pytest.importorskip("transformers", reason="pip install .[perception]")
-    from perception import networks
+    from support import networks
 
     labels = networks.save_segformer(tmp_path / "segformer")
     depth = networks.save_depth_anything(tmp_path / "depth")

@@ -17,12 +17,12 @@ from PIL import Image
 from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
 from climatenerf.cli.render import LAYER_NAMES, appearance_of
+from climatenerf.core.storage import read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.presets import PRESETS
-from climatenerf.render import movie
+from climatenerf.output import video as movie
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import read_rgb
-from climatenerf.storage import read_safetensors, write_safetensors
 from climatenerf.training.settings import PAPER, Losses
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))

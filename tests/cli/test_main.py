@@ -11,7 +11,7 @@ import pytest
 
 import climatenerf
 from climatenerf import cli
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 
 @dataclass

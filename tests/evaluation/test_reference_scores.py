@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.samples import Samples
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
 from climatenerf.evaluation.scores import depth_spread
-from climatenerf.render.samples import Samples
 from climatenerf.scene import Camera
 from climatenerf.scene.srgb import to_display
 

@@ -10,8 +10,8 @@ from climatenerf.field.activations import (
     radiance,
     thinned_density,
 )
-from climatenerf.field.directions import harmonics, spherical_harmonics
-from climatenerf.ops import cpu_pointwise
+from climatenerf.field.spherical_harmonics import harmonics, spherical_harmonics
+from climatenerf.ops.cpu import activations as cpu_pointwise
 
 # Around every branch of the curve: black, the toe's end (raw -0.620), white (0.5), far up and down.
 RAW = torch.cat(

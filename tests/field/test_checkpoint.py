@@ -6,14 +6,14 @@ import os
 import numpy as np
 import pytest
 import torch
-from random_field import directions, points, random_field
+from support.random_field import directions, points, random_field
 
-from climatenerf.errors import UserError
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.storage import read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import FILE_NAME, SCHEMA_VERSION, load_field, save_field
-from climatenerf.render.samples import LEAST_TAU
-from climatenerf.render.view import render_view
-from climatenerf.scene.cameras import Camera
-from climatenerf.storage import read_safetensors, write_safetensors
+from climatenerf.render.volume import render_view
 
 CAMERA = Camera(32, 24, 25.0, 25.0, 16.0, 12.0)
 

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from random_field import random_field
+from support.random_field import random_field
 
 from climatenerf.field.occupancy import OPACITY, Occupancy
 

@@ -12,20 +12,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from random_field import random_field
+from support.random_field import random_field
 
-from climatenerf.field import field as field_module
+from climatenerf.field import hash_field as field_module
 from climatenerf.field.activations import plain_radiance
-from climatenerf.ops import cpu, dispatch, reference
-from climatenerf.render import view as view_module
-from climatenerf.render.view import composited
+from climatenerf.ops import dispatch, reference
+from climatenerf.ops.cpu import kernels as cpu
+from climatenerf.render import volume as view_module
+from climatenerf.render.volume import composited
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 os.environ["TRITON_INTERPRET"] = str(int(DEVICE == "cpu"))  # it is read where a kernel is defined
 triton = pytest.importorskip("triton", reason="Triton is for Linux")
 import triton.language as tl  # noqa: E402
 
-from climatenerf.ops import gpu, gpu_march, gpu_network, gpu_render, gpu_witness  # noqa: E402
+from climatenerf.ops.triton import fused_render as gpu_render  # noqa: E402
+from climatenerf.ops.triton import kernels as gpu  # noqa: E402
+from climatenerf.ops.triton import marching as gpu_march  # noqa: E402
+from climatenerf.ops.triton import network as gpu_network  # noqa: E402
+from climatenerf.ops.triton import visual_hull as gpu_witness  # noqa: E402
 
 # The interpreter's numbers are NumPy's, which warns where a hash's products wrap around.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -373,7 +378,7 @@ def test_places_that_views_agree_on(generator):
 def test_all_kernels_compile_for_cuda(card, tmp_path):
     """Triton brings all that it takes; no GPU is needed."""
     environment = {**os.environ, "TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}
-    script = Path(__file__).with_name("compile_kernels.py")
+    script = Path(__file__).parents[1] / "support" / "compile_kernels.py"
     done = subprocess.run(
         [sys.executable, str(script), card], env=environment, capture_output=True, text=True
     )

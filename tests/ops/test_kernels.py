@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops import cpu, dispatch, lanes, reference
+from climatenerf.ops import dispatch, reference
+from climatenerf.ops.cpu import kernels as cpu
+from climatenerf.ops.cpu import simd as lanes
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops import metaballs
-from climatenerf.ops.metaballs import BRICK, HEIGHT_UNIT, RADIUS, REACH, STORED, Lattice
+from climatenerf.ops.cpu import metaballs
+from climatenerf.ops.cpu.metaballs import BRICK, HEIGHT_UNIT, RADIUS, REACH, STORED, Lattice
 from climatenerf.ops.metaballs_reference import metaball_kernel, metaball_sums
 
 SPACING = 0.05

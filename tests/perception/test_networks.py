@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.perception import models
 from climatenerf.perception.monocular import load_depth
 from climatenerf.perception.segmentation import CITYSCAPES, load_segmentation, train_ids
 
 pytest.importorskip("transformers", reason="pip install .[perception]")
-from perception import networks
+from support import networks
 
 
 def test_names_decide_the_train_id():

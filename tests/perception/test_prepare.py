@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from scene.scene_builders import names_of, ring, write_colmap
+from support.scene_builders import names_of, ring, write_colmap
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.perception import prepare, prepare_depth, prepare_labels
 from climatenerf.scene import read_scene
 from climatenerf.scene.images import load_labels, load_relative_depth
@@ -167,7 +167,7 @@ def test_photos_that_differ_by_suffix_alone_have_files_of_their_own(capture):
 
 def test_a_network_takes_the_place_of_what_another_made(capture, tmp_path):
     pytest.importorskip("transformers", reason="pip install .[perception]")
-    from perception import networks
+    from support import networks
 
     one = str(networks.save_segformer(tmp_path / "segformer-tiny"))
     two = str(networks.save_segformer(tmp_path / "two", seed=1))
@@ -185,7 +185,7 @@ def test_a_network_takes_the_place_of_what_another_made(capture, tmp_path):
 
 def test_depth_is_made_and_read(capture, tmp_path):
     pytest.importorskip("transformers", reason="pip install .[perception]")
-    from perception import networks
+    from support import networks
 
     model = str(networks.save_depth_anything(tmp_path / "depth-anything-v2-small"))
     told = Told()

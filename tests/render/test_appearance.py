@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from random_field import random_field
 from scipy.spatial.transform import Rotation
+from support.random_field import random_field
 
 from climatenerf.render.appearance import nearby_appearance
 

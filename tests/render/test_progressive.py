@@ -1,14 +1,14 @@
 """Frames that show early, on a street in closed form that is flooded and in smog."""
 
 import numpy as np
-from test_trace import CAMERA, flooded, looking, street
+from test_integrator import CAMERA, flooded, looking, street
 
+from climatenerf.core.cameras import Camera
 from climatenerf.render import progressive
 from climatenerf.render.frame import render_frame
-from climatenerf.render.world import World
-from climatenerf.scene.cameras import Camera
 from climatenerf.weather.parameters import Smog
-from climatenerf.weather.smog import medium
+from climatenerf.weather.smog.medium import medium
+from climatenerf.weather.world import World
 
 WORLD = World(street(), air=medium(Smog(visibility=40.0), 0.0), water=flooded())
 POSE = looking((0.0, 1.0, -0.2))

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import torch
-from random_field import random_field
+from support.random_field import random_field
 
+from climatenerf.core.cameras import Camera
+from climatenerf.core.classes import BUILDING, CLASS_NAMES, SKY, SOLID
 from climatenerf.render.frame import see_frame
-from climatenerf.render.surface import see_surface
-from climatenerf.render.view import camera_rays
-from climatenerf.render.world import World
-from climatenerf.scene.cameras import Camera
-from climatenerf.scene.classes import BUILDING, CLASS_NAMES, SKY, SOLID
+from climatenerf.render.heads import see_surface
+from climatenerf.render.volume import camera_rays
+from climatenerf.weather.world import World
 
 CAMERA = Camera(32, 24, 25.0, 25.0, 16.0, 12.0)
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_builders import names_of, ring, write_images
+from support.scene_builders import names_of, ring, write_images
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import Camera, Scene, View, read_scene
-from climatenerf.scene.colmap import read_colmap
 from climatenerf.scene.export import export_colmap, export_transforms, quaternion
-from climatenerf.scene.transforms_json import read_transforms
+from climatenerf.scene.readers.colmap import read_colmap
+from climatenerf.scene.readers.transforms_json import read_transforms
 
 CAMERAS = (
     Camera(32, 24, 30.0, 31.0, 16.2, 11.9, k1=0.01, k2=-0.002, p1=1e-4, p2=-2e-4),

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from scene_builders import names_of, ring, write_colmap, write_images
+from support.scene_builders import names_of, ring, write_colmap, write_images
 
 from climatenerf.cli import main
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import load_scene, read_scene, save_scene
 from climatenerf.scene.images import load_labels
 

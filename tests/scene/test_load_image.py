@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import Camera, Scene, View, load_image
 from climatenerf.scene.images import (
     downscaled_camera,

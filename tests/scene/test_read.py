@@ -3,9 +3,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from scene_builders import PINHOLE, names_of, ring, write_colmap, write_images, write_transforms
+from support.scene_builders import (
+    PINHOLE,
+    names_of,
+    ring,
+    write_colmap,
+    write_images,
+    write_transforms,
+)
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import load_image, read_scene, save_scene
 from climatenerf.scene.images import load_labels, load_mask
 

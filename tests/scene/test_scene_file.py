@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scene_builders import names_of, ring, write_colmap, write_images
+from support.scene_builders import names_of, ring, write_colmap, write_images
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import load_scene, read_scene, save_scene
 from climatenerf.scene import scene as scene_module
-from climatenerf.scene.ply import read_points, write_points
+from climatenerf.scene.readers.ply import read_points, write_points
 
 POINTS = np.random.default_rng(1).normal(size=(50, 3))
 

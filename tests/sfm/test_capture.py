@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from photo_builders import exif, photo
 from PIL import Image
+from support.photo_builders import exif, photo
 
 from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene

@@ -115,7 +115,7 @@ def others(folder):
 @pytest.mark.slow
 def test_a_photo_of_200_megapixels(tmp_path):
     """Of noise, so that it is no easy one; decoding it may take memory, but not many times over."""
-    from climatenerf.sfm.intake import LONGEST, take_in
+    from climatenerf.sfm.photo_import import LONGEST, take_in
 
     (tmp_path / "in").mkdir()
     rng = np.random.default_rng(0)

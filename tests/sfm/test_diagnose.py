@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from climatenerf.sfm.diagnose import diagnose, turned_only, verified_matches
 from climatenerf.sfm.exif import Exif
-from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.photo_import import Intake, Picture
 from climatenerf.sfm.reconstruct import _names, groups_of
 
 PAIR = 2147483647

@@ -1,8 +1,8 @@
 import math
 
 import pytest
-from photo_builders import exif, photo
 from PIL import Image
+from support.photo_builders import exif, photo
 
 from climatenerf.sfm.exif import read_exif
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from photo_builders import exif
 from PIL import Image
+from support.photo_builders import exif
 
 from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene

@@ -7,10 +7,10 @@ import subprocess
 
 import numpy as np
 import pytest
-from photo_builders import exif, photo
+from support.photo_builders import exif, photo
 
 from climatenerf.scene import Camera, Scene, View
-from climatenerf.scene.known_length import read_marks
+from climatenerf.scene.alignment.known_length import read_marks
 from climatenerf.sfm.mark_page import write_mark_page
 
 BROWSER = next(

@@ -1,9 +1,9 @@
 """Which pictures below a folder count as the user's photos."""
 
 import pytest
-from photo_builders import photo
+from support.photo_builders import photo
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.sfm.photos import find_photos
 from climatenerf.sfm.scene_folder import FORMER, RECORD
 

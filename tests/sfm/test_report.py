@@ -5,7 +5,7 @@ from PIL import Image
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.sfm.diagnose import Lost
 from climatenerf.sfm.exif import Exif
-from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.photo_import import Intake, Picture
 from climatenerf.sfm.reconstruct import Model
 from climatenerf.sfm.report import ground_coverage, sky_coverage, write_report
 

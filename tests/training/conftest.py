@@ -1,7 +1,7 @@
 """The toy scene and its small field, for all tests of fits that do not make their own."""
 
 import pytest
-from toy_scene import TINY, make_scene
+from support.toy_scene import TINY, make_scene
 
 from climatenerf.field.presets import PRESETS
 

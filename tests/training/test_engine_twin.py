@@ -6,7 +6,7 @@ from pathlib import Path
 from unittest import mock
 
 import torch
-from toy_fit import begin
+from support.toy_fit import begin
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 with mock.patch.dict(os.environ):  # the benchmarks' variables of threads are theirs alone

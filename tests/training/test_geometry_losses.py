@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.scene.cameras import Camera
-from climatenerf.scene.classes import SKY
+from climatenerf.core.cameras import Camera
+from climatenerf.core.classes import SKY
 from climatenerf.training import losses
-from climatenerf.training.pixels import TrainingPixels
+from climatenerf.training.dataset import TrainingPixels
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 30.0, 25.0)
 

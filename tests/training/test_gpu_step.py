@@ -4,16 +4,20 @@ import os
 
 import pytest
 import torch
-from test_rooms import begun, learned_in
+from test_static_shapes import begun, learned_in
 
-from climatenerf.ops import cpu, dispatch
+from climatenerf.ops import dispatch
+from climatenerf.ops.cpu import kernels as cpu
 
 os.environ.setdefault("TRITON_INTERPRET", "1")  # it is read where a kernel is defined
 pytest.importorskip("triton", reason="Triton is for Linux")
 if os.environ["TRITON_INTERPRET"] != "1":
     pytest.skip("kernels run on the GPU that is here", allow_module_level=True)
 
-from climatenerf.ops import gpu, gpu_march, gpu_network, gpu_witness  # noqa: E402
+from climatenerf.ops.triton import kernels as gpu
+from climatenerf.ops.triton import marching as gpu_march
+from climatenerf.ops.triton import network as gpu_network
+from climatenerf.ops.triton import visual_hull as gpu_witness
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 

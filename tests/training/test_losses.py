@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from toy_fit import begin
+from support.toy_fit import begin
 
+from climatenerf.core.classes import ROAD, SKY, UNKNOWN
 from climatenerf.ops import dispatch
-from climatenerf.scene.classes import ROAD, SKY, UNKNOWN
-from climatenerf.training import fit, losses
-from climatenerf.training.fit import scale_gradient
+from climatenerf.training import losses
+from climatenerf.training import trainer as fit
 from climatenerf.training.settings import Losses
+from climatenerf.training.trainer import scale_gradient
 
 
 def test_colour_loss_is_the_error_of_display_values():

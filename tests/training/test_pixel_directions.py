@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.scene.cameras import Camera
+from climatenerf.core.cameras import Camera
 from climatenerf.training.pixel_directions import Directions
 
 PLAIN = Camera(50, 37, 40.0, 44.0, 20.0, 19.0)

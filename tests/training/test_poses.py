@@ -3,14 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_scene import TINY, make_scene
+from support.toy_scene import TINY, make_scene
 
-from climatenerf.field.extent import find_extent
+from climatenerf.field.normalisation import find_extent
 from climatenerf.field.presets import PRESETS
-from climatenerf.training.fit import Fitting
 from climatenerf.training.poses import PoseCorrections, rotations
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.trainer import Fitting
 
 
 @pytest.fixture(autouse=True)

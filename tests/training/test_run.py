@@ -7,26 +7,26 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from toy_scene import CAMERA, TINY, make_scene
+from support.toy_scene import CAMERA, TINY, make_scene
 
-from climatenerf.errors import UserError
+from climatenerf.core.classes import BUILDING, SKY, VEGETATION
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.evaluation.metrics import psnr_cc
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.field import Field
+from climatenerf.field.hash_field import Field
 from climatenerf.field.presets import PRESETS
 from climatenerf.render.appearance import nearby_appearance
-from climatenerf.render.view import render_view
+from climatenerf.render.volume import render_view
 from climatenerf.scene import load_scene
-from climatenerf.scene.classes import BUILDING, SKY, VEGETATION
 from climatenerf.scene.scene import with_split
-from climatenerf.storage import read_json, read_safetensors, write_json, write_safetensors
-from climatenerf.training import carving as carving_module
 from climatenerf.training import run as run_module
+from climatenerf.training.evidence import free_space as carving_module
+from climatenerf.training.evidence.sparse_depth import PointRays
+from climatenerf.training.evidence.visual_hull import Witness
 from climatenerf.training.optimiser import GridAdam
-from climatenerf.training.points import PointRays
 from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
 from climatenerf.training.settings import PAPER, FitSettings, Losses
-from climatenerf.training.witness import Witness
 
 
 @pytest.fixture(scope="module")
@@ -587,7 +587,7 @@ def test_the_appearance_grid_alone_decays(toy, tmp_path, monkeypatch):
         seen.append([(table.shape, decay) for table, decay in zip(tables, decays, strict=True)])
         return GridAdam(tables, decays)
 
-    monkeypatch.setattr("climatenerf.training.fit.GridAdam", watched)
+    monkeypatch.setattr("climatenerf.training.trainer.GridAdam", watched)
     fitted(toy, tmp_path / "run", steps=1)
     field = load_field(tmp_path / "run")
     grids = (field.geometry_grid, field.appearance_grid, field.sky_grid, field.surface_grid)

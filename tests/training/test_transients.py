@@ -1,8 +1,8 @@
 import torch
 
 from climatenerf.training import losses
-from climatenerf.training.fit import MASK_SHARES
 from climatenerf.training.settings import FitSettings, Losses
+from climatenerf.training.trainer import MASK_SHARES
 from climatenerf.training.transients import TransientMasks
 
 PRICE = Losses().transient

@@ -6,7 +6,7 @@ import tomllib
 
 import pytest
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.weather.description import (
     KeyframedWeather,
     combine,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 import tyro
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.weather import parameters, units
 from climatenerf.weather.parameters import Flood, Smog, Snow, Sun, Weather, check
 

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import climatenerf
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 # Before torch and Numba are imported, unless the user has chosen otherwise. Both bring an OpenMP
 # run time of their own. Idle threads of the one that spin for long after each parallel region take

@@ -18,23 +18,24 @@ from climatenerf.cli.fit import (
     parse_known_lengths,
     with_known_lengths,
 )
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import explain, make_folder
 from climatenerf.scene import Camera, Scene, read_scene, save_scene
-from climatenerf.scene.colmap import read_colmap
-from climatenerf.scene.georeference import (
+from climatenerf.scene.alignment.georeference import (
     Georeference,
     apply_georeference,
     find_georeference,
     gps_note,
 )
-from climatenerf.scene.images import picture_header
-from climatenerf.scene.known_length import FILE_NAME as MARKS
-from climatenerf.scene.scale import (
+from climatenerf.scene.alignment.known_length import FILE_NAME as MARKS
+from climatenerf.scene.alignment.scale import (
     by_depth,
     scale_warnings,
     with_capture_remedies,
     with_witness,
 )
+from climatenerf.scene.images import picture_header
+from climatenerf.scene.readers.colmap import read_colmap
 from climatenerf.scene.scene import FILE_NAME as SCENE
 from climatenerf.sfm.scene_folder import (
     KINDS,
@@ -44,7 +45,6 @@ from climatenerf.sfm.scene_folder import (
     leave,
     take_place,
 )
-from climatenerf.storage import explain, make_folder
 from climatenerf.weather.units import OptionalLength
 
 
@@ -242,7 +242,7 @@ def marks_of(options: Capture) -> Path:
 def poses_by_motion(options: Capture, new: Path):
     """The pictures, their poses by structure from motion, and those without with the reason."""
     from climatenerf.sfm.diagnose import diagnose
-    from climatenerf.sfm.intake import take_in
+    from climatenerf.sfm.photo_import import take_in
     from climatenerf.sfm.reconstruct import DATABASE
     from climatenerf.sfm.worker import reconstruct_apart
 
@@ -315,7 +315,7 @@ def as_shown(options: Capture, path: Path, camera: Camera) -> bool:
 
 def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
     """The scene with the labels, masks and depths that the user has for the photos."""
-    from climatenerf.sfm.extras import Photo, bring_along
+    from climatenerf.sfm.sidecars import Photo, bring_along
 
     known = {picture.name: picture for picture in intake.pictures}
     photos = {

@@ -10,8 +10,8 @@ import tyro
 from climatenerf.cli import progress
 from climatenerf.cli.fit import Fit, fit_with_bars, summary
 from climatenerf.cli.render import parse_size, prepare_stage, render_movie
-from climatenerf.errors import UserError
-from climatenerf.storage import read_json
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import read_json
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
 
@@ -60,8 +60,8 @@ def run(options: Demo) -> int:
         )
 
     from climatenerf.field.checkpoint import load_field
-    from climatenerf.render.camera_path import camera_path
-    from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
+    from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
+    from climatenerf.paths.camera_path import camera_path
 
     field = load_field(run_folder)
     fps = 12.0

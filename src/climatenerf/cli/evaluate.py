@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ def run(options: Evaluate) -> int:
     if not options.reference:
         raise UserError("say what to measure against: climatenerf evaluate RUN --reference -o OUT")
 
+    from climatenerf.core.storage import read_json
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.evaluation.report import check_place, table_text, write_report
     from climatenerf.evaluation.scores import Place, check_views, evaluate
     from climatenerf.field.checkpoint import load_field
     from climatenerf.scene import load_scene
-    from climatenerf.storage import read_json
     from climatenerf.training.folder import check_config
 
     field = load_field(options.run)
@@ -99,8 +99,8 @@ def run_ablation(options: Evaluate) -> int:
 
     scene = read_scene(options.run)
 
-    from climatenerf.training.ablation import TEXT_NAME, ablate, chosen_rows, markdown
-    from climatenerf.training.fit import Report
+    from climatenerf.studies.ablation import TEXT_NAME, ablate, chosen_rows, markdown
+    from climatenerf.training.trainer import Report
 
     chosen = chosen_rows(options.minutes, options.rows)
     total = len(chosen) * options.seeds

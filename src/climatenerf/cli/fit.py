@@ -8,10 +8,15 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import Scene, read_scene
-from climatenerf.scene.known_length import FILE_NAME, apply_known_lengths, measure, read_marks
-from climatenerf.scene.scale import scale_warnings, scale_words
+from climatenerf.scene.alignment.known_length import (
+    FILE_NAME,
+    apply_known_lengths,
+    measure,
+    read_marks,
+)
+from climatenerf.scene.alignment.scale import scale_warnings, scale_words
 from climatenerf.training.folder import check_folder, check_resumable
 from climatenerf.training.settings import FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
@@ -226,8 +231,8 @@ def fit_with_bars(scene, options: Fit) -> dict:
         " compiled, once on a machine"
     )
     from climatenerf.field.device import on
-    from climatenerf.training.fit import Report
     from climatenerf.training.run import fit_scene
+    from climatenerf.training.trainer import Report
 
     settings = fit_settings(options)
     with on(options.device), progress.Bar("fit", 1.0) as bar:

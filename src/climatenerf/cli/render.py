@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.scene import Scene
 from climatenerf.weather.description import (
     KeyframedWeather,
@@ -22,8 +22,8 @@ from climatenerf.weather.description import (
 from climatenerf.weather.parameters import Flood, Smog, Snow, Sun, Weather
 
 if TYPE_CHECKING:
-    from climatenerf.render.camera_path import CameraPath
-    from climatenerf.render.stage import Stage
+    from climatenerf.paths.camera_path import CameraPath
+    from climatenerf.render.session import Stage
 
 MOST_RAYS = 2**26  # in one frame: 6 GB
 PREVIEW = "preview.png"
@@ -84,7 +84,7 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
         progress.warn(f"--{name} changes nothing without {absent}")
     layers = LAYER_NAMES if "all" in options.layers else options.layers
     if "exr" in options.layer_format and layers:
-        from climatenerf.render.layers import require_exr
+        from climatenerf.output.layers import require_exr
 
         require_exr()
 
@@ -118,7 +118,7 @@ def render_run(
 ) -> int:
     """The same on the device in use, once the flags are understood."""
     from climatenerf.field.checkpoint import load_field
-    from climatenerf.render.camera_path import camera_path
+    from climatenerf.paths.camera_path import camera_path
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
 
@@ -236,7 +236,7 @@ def is_simulated(path: Path) -> bool:
 
 def prepare_stage(field, scene, weather: KeyframedWeather, path: "CameraPath", fps: float):
     """Light, waves and snowfall, with a progress bar."""
-    from climatenerf.render.stage import prepare
+    from climatenerf.render.session import prepare
 
     times = np.arange(len(path)) / fps
     with progress.Bar("prepare", 1.0) as bar:
@@ -266,10 +266,10 @@ def render_movie(
     `shown` is the training view whose appearance the field shows, as the sidecar tells; with
     `preview` out/preview.png shows the frame at work while it becomes finer.
     """
+    from climatenerf.core.storage import make_folder
+    from climatenerf.output.layers import SIMULATED, FrameRecord, save_layers, write_sidecar
+    from climatenerf.output.video import MovieWriter, write_png
     from climatenerf.render.frame import render_frame
-    from climatenerf.render.layers import SIMULATED, FrameRecord, save_layers, write_sidecar
-    from climatenerf.render.movie import MovieWriter, write_png
-    from climatenerf.storage import make_folder
 
     make_folder(out / "frames")
     before = files_of_render(out)
@@ -316,7 +316,7 @@ def render_movie(
 
 def files_of_render(out: Path) -> set[Path]:
     """Frames and layers that a folder's sidecar names; none if there is no sound one."""
-    from climatenerf.storage import read_json
+    from climatenerf.core.storage import read_json
 
     try:
         frames = read_json(out / "movie.json")["frames"]

@@ -3,9 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from climatenerf.evaluation.reference import Truth
-from climatenerf.scene import Camera
-from climatenerf.scene.classes import (
+from climatenerf.core.classes import (
     BUILDING,
     CLASS_NAMES,
     MERGED,
@@ -14,6 +12,8 @@ from climatenerf.scene.classes import (
     UNKNOWN,
     VEGETATION,
 )
+from climatenerf.evaluation.reference import Truth
+from climatenerf.scene import Camera
 
 HOLE = 1.5  # times the true distance: ground seen beyond that is missing
 FARTHEST = 50.0  # m: beyond it photos of a walk say little about distance

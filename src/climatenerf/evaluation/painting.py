@@ -10,9 +10,10 @@ from climatenerf.evaluation import baselines
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.reference import WeatherTruth
 from climatenerf.scene.srgb import to_display
-from climatenerf.weather import flood as water_physics
-from climatenerf.weather import smog, waves
+from climatenerf.weather.flood import optics as water_physics
+from climatenerf.weather.flood import waves
 from climatenerf.weather.parameters import linear_colour
+from climatenerf.weather.smog import medium as smog
 
 Picture = UInt8[np.ndarray, "h w 3"]
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import check_schema, read_json
 from climatenerf.scene import Camera, Scene, load_scene
 from climatenerf.scene.images import load_labels, read_rgb
-from climatenerf.storage import check_schema, read_json
 from climatenerf.weather.description import KeyframedWeather, read_weather
 
 FILE_NAME = "reference.json"

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 import climatenerf
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
 from climatenerf.evaluation.baselines import NAMES as BASELINES
 from climatenerf.evaluation.scores import Scores
-from climatenerf.render.contact_sheet import contact_sheet, write_jpeg
-from climatenerf.storage import make_folder, read_json, write_bytes, write_json
+from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 
 SCHEMA_VERSION = 1
 FILE_NAME, TEXT_NAME = "report.json", "report.md"

@@ -13,26 +13,26 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.samples import LEAST_TAU
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, warp_error
 from climatenerf.evaluation.metrics import psnr, ssim
 from climatenerf.evaluation.painting import painted, tune
 from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, world_rays
-from climatenerf.field.field import Field
+from climatenerf.field.hash_field import Field
 from climatenerf.ops import dispatch
-from climatenerf.render.camera_path import camera_path
+from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import see_frame
-from climatenerf.render.samples import LEAST_TAU
-from climatenerf.render.stage import Stage, prepare
-from climatenerf.render.surface import see_surface
-from climatenerf.render.view import RENDER_STEP, camera_rays
-from climatenerf.render.world import World
+from climatenerf.render.heads import see_surface
+from climatenerf.render.session import Stage, prepare
+from climatenerf.render.volume import RENDER_STEP, camera_rays
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.scene.srgb import to_display
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
+from climatenerf.weather.world import World
 
 Picture = UInt8[np.ndarray, "h w 3"]
 Tell = Callable[[str], None]

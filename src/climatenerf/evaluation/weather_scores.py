@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from climatenerf.evaluation.geometry import ground_or_roof
 from climatenerf.evaluation.reference import Truth
-from climatenerf.render.normals import plane_normals
+from climatenerf.render.depth_normals import plane_normals
 
 JOINED, JOINED_SHARE = 0.5, 0.05  # m, and of the distance: neighbours this close are one surface
 NEAR = 30.0  # m: snow is compared up to here

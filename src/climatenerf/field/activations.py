@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.field.colour_space import decode_srgb
-from climatenerf.ops import cpu_pointwise
-from climatenerf.ops.cpu_pointwise import BLACK, LARGEST_RAW, LEAST_SLOPE, SHARPNESS
-from climatenerf.ops.vectors import length
+from climatenerf.core.colour import decode_srgb
+from climatenerf.core.vectors import length
+from climatenerf.ops.cpu import activations as cpu_pointwise
+from climatenerf.ops.cpu.activations import BLACK, LARGEST_RAW, LEAST_SLOPE, SHARPNESS
 
 
 def radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:

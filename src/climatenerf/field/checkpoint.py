@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from climatenerf.errors import UserError
-from climatenerf.field.field import Field
+from climatenerf.core.device import placed
+from climatenerf.core.errors import UserError
+from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.storage import check_schema, read_safetensors, write_safetensors
+from climatenerf.field.hash_field import Field
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
-from climatenerf.ops.placing import placed
-from climatenerf.render.samples import LEAST_TAU
-from climatenerf.storage import check_schema, read_safetensors, write_safetensors
 
 SCHEMA_VERSION = 2
 FILE_NAME = "field.safetensors"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 TRITON = (3, 4)  # the first that takes our kernels; PyTorch 2.8 brings it
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.core.device import integers, uniform
 from climatenerf.ops import dispatch
-from climatenerf.ops.placing import integers, uniform
 
 OPACITY = 0.3  # of a crossed cell
 FOR_MEAN = 100_000  # cells from which the cascades' mean densities are told, about

@@ -14,8 +14,10 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
-from climatenerf.ops import cpu, cpu_network, reference
-from climatenerf.ops.vectors import unit
+from climatenerf.core.vectors import unit
+from climatenerf.ops import reference
+from climatenerf.ops.cpu import kernels as cpu
+from climatenerf.ops.cpu import network as cpu_network
 
 
 def _kernels(*tensors: Tensor) -> ModuleType | None:
@@ -26,7 +28,7 @@ def _kernels(*tensors: Tensor) -> ModuleType | None:
     if devices == {"cpu"}:
         return cpu
     if devices == {"cuda"}:
-        from climatenerf.ops import gpu  # where there is no GPU, Triton need not be installed
+        from climatenerf.ops.triton import kernels as gpu
 
         return gpu
     return None
@@ -287,7 +289,7 @@ class _EncodedNetwork(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, u, table, resolutions, shared, row, w1, b1, w2, b2):
-        from climatenerf.ops import gpu_network
+        from climatenerf.ops.triton import network as gpu_network
 
         rays = None if shared is None else (_array(shared), _array(row))
         encoding, layers = (
@@ -302,7 +304,7 @@ class _EncodedNetwork(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
-        from climatenerf.ops import gpu_network
+        from climatenerf.ops.triton import network as gpu_network
 
         u, resolutions, shared, row, *layers = ctx.saved_tensors
         u, layers = _array(u), tuple(map(_array, layers))
@@ -379,7 +381,7 @@ def voices_of(
     if kernels is cpu:
         cpu.voices_of(*given, _array(agreed))
     else:
-        from climatenerf.ops import gpu_witness
+        from climatenerf.ops.triton import visual_hull as gpu_witness
 
         gpu_witness.voices_of(*given, agreed)
     return agreed.bool()
@@ -422,7 +424,7 @@ def density_slopes(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n 3"]:
     if kernels is cpu:
         cpu.density_slopes(_array(q), _cpu_net(net), _array(w1), _array(out))
     else:
-        from climatenerf.ops import gpu_network
+        from climatenerf.ops.triton import network as gpu_network
 
         gpu_network.density_slopes(_array(q), tuple(map(_array, net)), _array(out))
     return out
@@ -566,7 +568,7 @@ def composite(
     Returns:
         Linear radiance of matter, weighted sum of ray lengths (grid units), transmittance.
     """
-    from climatenerf.ops import gpu_render
+    from climatenerf.ops.triton import fused_render as gpu_render
 
     looks, shared = colours
     out = spans.new_empty(spans.shape[0], 5)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.ops.vectors import unit
+from climatenerf.core.vectors import unit
 
 
 def contract(q: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 Parts = TypeVar("Parts")
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.perception.models import Network, load_parts
 
 DEFAULT = "depth-anything/Depth-Anything-V2-Small-hf"

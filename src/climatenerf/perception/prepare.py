@@ -19,17 +19,17 @@ from jaxtyping import Shaped
 from PIL import Image
 
 import climatenerf
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import check_schema, explain, read_json, write_bytes, write_json
+from climatenerf.perception.heuristic import shows_sky, simple_labels
+from climatenerf.perception.heuristic_ground import ground_points
 from climatenerf.perception.models import Network, check_name, licence_of
 from climatenerf.perception.monocular import DEFAULT as DEPTH_ANYTHING
 from climatenerf.perception.monocular import load_depth
 from climatenerf.perception.segmentation import load_segmentation
-from climatenerf.perception.simple import shows_sky, simple_labels
-from climatenerf.perception.simple_ground import ground_points
 from climatenerf.scene.images import load_image
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene, View
-from climatenerf.storage import check_schema, explain, read_json, write_bytes, write_json
 
 LABELS, DEPTHS = "labels", "depth_relative"
 RECORD = "made_by.json"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.perception.models import Network, load_parts
 from climatenerf.scene.label_spaces import UNKNOWN
 

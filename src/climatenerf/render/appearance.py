@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.field.field import Field
-from climatenerf.ops.placing import placed
+from climatenerf.core.device import placed
+from climatenerf.field.hash_field import Field
 
 FALL = 4  # with which power of its distance a photo's say falls; 2 and 6 do as well
 

@@ -8,17 +8,17 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from climatenerf.field.colour_space import encode_srgb
-from climatenerf.field.field import Field
-from climatenerf.ops.placing import array_of, placed
-from climatenerf.render.normals import plane_normals
+from climatenerf.core.cameras import Camera
+from climatenerf.core.colour import encode_srgb
+from climatenerf.core.device import array_of, placed
+from climatenerf.field.hash_field import Field
+from climatenerf.render.depth_normals import plane_normals
+from climatenerf.render.heads import see_surface
+from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
-from climatenerf.render.surface import see_surface
-from climatenerf.render.trace import trace
-from climatenerf.render.view import camera_rays
-from climatenerf.render.world import FieldLike, World
-from climatenerf.scene.cameras import Camera
-from climatenerf.weather.flood import pixel_roll
+from climatenerf.render.volume import camera_rays
+from climatenerf.weather.flood.optics import pixel_roll
+from climatenerf.weather.world import FieldLike, World
 
 
 def render_frame(

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.render.trace import Seen, trace
-from climatenerf.render.world import World, together
+from climatenerf.render.integrator import Seen, trace
+from climatenerf.weather.world import World, together
 
 SPACINGS = (4, 2, 1)  # rays between those that are known after each pass
 

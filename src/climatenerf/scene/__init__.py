@@ -1,4 +1,4 @@
-from climatenerf.scene.cameras import Camera
+from climatenerf.core.cameras import Camera
 from climatenerf.scene.images import load_image
 from climatenerf.scene.read import read_scene
 from climatenerf.scene.scene import Scene, View, load_scene, save_scene

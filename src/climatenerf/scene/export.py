@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.errors import UserError
-from climatenerf.scene.cameras import Camera
-from climatenerf.scene.ply import write_points
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import make_folder, write_bytes, write_json
+from climatenerf.scene.readers.ply import write_points
 from climatenerf.scene.scene import Scene, View
-from climatenerf.storage import make_folder, write_bytes, write_json
 
 
 def export_transforms(scene: Scene, folder: Path) -> Path:

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
-from climatenerf.errors import UserError
-from climatenerf.scene.cameras import Camera
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
 from climatenerf.scene.label_spaces import to_train_ids
 from climatenerf.scene.scene import Scene, View
 from climatenerf.scene.srgb import to_linear

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int16, UInt8
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 TRAIN_IDS = "cityscapes-train-ids"
 CITYSCAPES_IDS = "cityscapes-ids"

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from climatenerf.errors import UserError
-from climatenerf.scene.cameras import Camera
-from climatenerf.scene.capture import Capture, checked_camera, checked_pose
-from climatenerf.scene.colmap import model_folders, read_colmap
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.scene.alignment.scale import by_camera_height
+from climatenerf.scene.alignment.up import level
 from climatenerf.scene.images import Header, picture_header
-from climatenerf.scene.kitti360 import kitti360_root, parse_frames, read_kitti360
 from climatenerf.scene.label_spaces import checked_label_space
-from climatenerf.scene.levelling import level
-from climatenerf.scene.mega_nerf import is_mega_nerf, read_mega_nerf
-from climatenerf.scene.scale import by_camera_height
+from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
+from climatenerf.scene.readers.colmap import model_folders, read_colmap
+from climatenerf.scene.readers.kitti360 import kitti360_root, parse_frames, read_kitti360
+from climatenerf.scene.readers.mega_nerf import is_mega_nerf, read_mega_nerf
+from climatenerf.scene.readers.tanks_temples import is_tanks_temples, read_tanks_temples
+from climatenerf.scene.readers.transforms_json import read_transforms, transforms_files
 from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_split
-from climatenerf.scene.tanks_temples import is_tanks_temples, read_tanks_temples
-from climatenerf.scene.transforms_json import read_transforms, transforms_files
 
 HOLDOUT_EVERY = 8
 MINIMUM_IMAGES = 3

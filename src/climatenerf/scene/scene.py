@@ -14,11 +14,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from climatenerf.errors import UserError
-from climatenerf.scene.cameras import Camera
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import atomic_path
 from climatenerf.scene.label_spaces import TRAIN_IDS, checked_label_space
-from climatenerf.scene.ply import read_points, write_points
-from climatenerf.storage import atomic_path
+from climatenerf.scene.readers.ply import read_points, write_points
 
 SCHEMA_VERSION = 1
 FILE_NAME = "scene.json"

@@ -1,4 +1,4 @@
-"""The sRGB curve (IEC 61966-2-1) for arrays; `field/colour_space.py` has it with gradients."""
+"""The sRGB curve (IEC 61966-2-1) for arrays; `core/colour.py` has it with gradients."""
 
 import numpy as np
 from jaxtyping import Float

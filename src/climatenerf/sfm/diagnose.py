@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.sfm.intake import Intake
+from climatenerf.sfm.photo_import import Intake
 
 ENOUGH_MATCHES = 30  # verified ones that a picture needs with a posed one
 BLURRED = 0.08  # of the median sharpness; a sharp picture of plain walls has more

@@ -7,14 +7,14 @@ from pathlib import Path
 
 from PIL import Image
 
-from climatenerf.errors import UserError
-from climatenerf.scene.colmap import largest_model, read_colmap
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import explain, make_folder
+from climatenerf.scene.readers.colmap import largest_model, read_colmap
 from climatenerf.sfm.diagnose import Lost
 from climatenerf.sfm.exif import Exif, read_exif
-from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.photo_import import Intake, Picture
 from climatenerf.sfm.photos import FEWEST, photos_in
 from climatenerf.sfm.reconstruct import Model, Told
-from climatenerf.storage import explain, make_folder
 
 
 def take_posed(

@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from urllib.parse import quote
 
+from climatenerf.core.storage import write_bytes
 from climatenerf.scene.scene import Scene
-from climatenerf.storage import write_bytes
 
 _PAGE = """<!doctype html>
 <meta charset="utf-8">

@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.sfm.scene_folder import KINDS, is_scene, walk_once
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}

@@ -12,13 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from climatenerf.errors import UserError
-from climatenerf.scene.cameras import Camera
-from climatenerf.scene.colmap import read_colmap
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import make_folder, read_json, write_json
+from climatenerf.scene.readers.colmap import read_colmap
 from climatenerf.sfm.diagnose import read_only, turned_only
-from climatenerf.sfm.intake import Intake, Picture
+from climatenerf.sfm.photo_import import Intake, Picture
 from climatenerf.sfm.photos import FEWEST
-from climatenerf.storage import make_folder, read_json, write_json
 
 EXHAUSTIVE_UP_TO = 120  # photos; beyond, and for video, neighbours in time and loops are compared
 OVERLAP = 10  # neighbours in time to each side

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
-from climatenerf.scene.scale import scale_words
+from climatenerf.core.storage import atomic_path, write_bytes
+from climatenerf.scene.alignment.scale import scale_words
 from climatenerf.scene.scene import Scene
 from climatenerf.sfm.diagnose import Lost
-from climatenerf.sfm.intake import Intake
+from climatenerf.sfm.photo_import import Intake
 from climatenerf.sfm.reconstruct import Model
-from climatenerf.storage import atomic_path, write_bytes
 
 PANEL = 640  # pixels
 GROUND_REACH = 5.0  # camera heights around the path in which ground is asked for

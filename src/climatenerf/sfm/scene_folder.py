@@ -11,10 +11,10 @@ import shutil
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import explain, make_folder, read_json, write_json
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import FILE_NAME
-from climatenerf.storage import explain, make_folder, read_json, write_json
 
 WORK = "work"  # folder in the scene: may be deleted when all is well
 RECORD = ".made-by-capture.json"  # beside `scene.json`, so that it outlives the work folder

@@ -16,10 +16,10 @@ import threading
 from dataclasses import asdict
 from pathlib import Path
 
-from climatenerf.errors import UserError
-from climatenerf.sfm.intake import Intake, picture_from_json
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import explain, plain
+from climatenerf.sfm.photo_import import Intake, picture_from_json
 from climatenerf.sfm.reconstruct import Model, Told, known_result, reconstruct
-from climatenerf.storage import explain, plain
 
 NEARLY_FULL = 20_000_000  # bytes free, below which a crash is put down to the disk
 LOG = "colmap.log"

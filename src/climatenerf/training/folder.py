@@ -3,10 +3,10 @@
 import dataclasses
 from pathlib import Path
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import check_schema, read_json
 from climatenerf.field.presets import PRESETS
 from climatenerf.scene.scene import Scene
-from climatenerf.storage import check_schema, read_json
 from climatenerf.training.settings import FitSettings
 
 SCHEMA_VERSION = 1  # of config.json

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.field.colour_space import encode_srgb
+from climatenerf.core.colour import encode_srgb
 from climatenerf.ops import dispatch
 
 

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.ops.placing import placed
-from climatenerf.ops.vectors import unit
-from climatenerf.scene.cameras import Camera
+from climatenerf.core.cameras import Camera
+from climatenerf.core.device import placed
+from climatenerf.core.vectors import unit
 
 SPACING = 4  # pixels
 WIDE = 0.1  # cosine from the axis below which directions are not scaled to depth 1

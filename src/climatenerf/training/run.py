@@ -11,15 +11,22 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 import climatenerf
-from climatenerf.errors import UserError
+from climatenerf.core.cameras import Camera
+from climatenerf.core.device import array_of, placed
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import (
+    atomic_path,
+    make_folder,
+    read_safetensors,
+    write_json,
+    write_safetensors,
+)
 from climatenerf.evaluation.metrics import psnr, psnr_cc, ssim
 from climatenerf.field.checkpoint import load_field, save_field
-from climatenerf.field.extent import find_extent
-from climatenerf.field.field import Field
-from climatenerf.ops.placing import array_of, placed
+from climatenerf.field.hash_field import Field
+from climatenerf.field.normalisation import find_extent
 from climatenerf.render.appearance import nearby_appearance
-from climatenerf.render.view import render_view
-from climatenerf.scene.cameras import Camera
+from climatenerf.render.volume import render_view
 from climatenerf.scene.images import (
     downscaled_camera,
     load_image,
@@ -28,14 +35,9 @@ from climatenerf.scene.images import (
     load_relative_depth,
 )
 from climatenerf.scene.scene import Scene, load_scene, save_scene
-from climatenerf.storage import (
-    atomic_path,
-    make_folder,
-    read_safetensors,
-    write_json,
-    write_safetensors,
-)
-from climatenerf.training.fit import REFINE_AT, Fitting, Report
+from climatenerf.training.dataset import TrainingPixels
+from climatenerf.training.evidence.multiview_stereo import match_photos
+from climatenerf.training.evidence.sparse_depth import shown_points
 from climatenerf.training.folder import (
     OPTIMISER,
     SCHEMA_VERSION,
@@ -43,10 +45,8 @@ from climatenerf.training.folder import (
     check_folder,
     check_resumable,
 )
-from climatenerf.training.matching import match_photos
-from climatenerf.training.pixels import TrainingPixels
-from climatenerf.training.points import shown_points
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.trainer import REFINE_AT, Fitting, Report
 
 CHECKPOINT_EVERY = 60.0  # seconds
 PREVIEW_EVERY = 20.0

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from climatenerf.scene.classes import PERSON, VEHICLE
+from climatenerf.core.classes import PERSON, VEHICLE
+from climatenerf.training.dataset import TrainingPixels
+from climatenerf.training.evidence.sparse_depth import PointRays
 from climatenerf.training.losses import FAINT
-from climatenerf.training.pixels import TrainingPixels
-from climatenerf.training.points import PointRays
 
 CELLS = (6, 12, 24, 48)  # along each side of an image, of the mask's levels
 HIDDEN = 16

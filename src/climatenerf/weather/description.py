@@ -18,7 +18,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.weather.parameters import Weather, check, kind_of
 from climatenerf.weather.units import DURATION, format_quantity, parse_quantity
 

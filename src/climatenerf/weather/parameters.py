@@ -9,7 +9,7 @@ GPS). This module loads no torch.
 import math
 from dataclasses import dataclass, field, fields
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 from climatenerf.weather.units import (
     Angle,
     Kind,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.constructors import PrimitiveConstructorSpec
 
-from climatenerf.errors import UserError
+from climatenerf.core.errors import UserError
 
 if TYPE_CHECKING:
     import pint

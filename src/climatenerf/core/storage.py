@@ -1,0 +1,228 @@
+"""Files written so that a failure never harms what was there before, and read with clear errors.
+
+Everything is written to a temporary name in the same folder and then renamed over the old file:
+a reader sees the old file or the new one, never half of one.
+"""
+
+import contextlib
+import dataclasses
+import errno
+import json
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from climatenerf.core.errors import UserError
+
+
+def explain(error: OSError, path: Path) -> UserError:
+    """The sentence a user can act on for a failed read or write of ``path``."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return UserError(
+            f"the disk is full: could not write {path}; free some space or choose another folder"
+            " (what was already saved is unharmed)"
+        )
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return UserError(f"no permission for {path}; change that or choose another place")
+    if error.errno in (errno.ENOTDIR, errno.EEXIST):
+        return UserError(
+            f"cannot create {path}: something on the way there is a file, not a folder;"
+            " choose another place"
+        )
+    if error.errno == errno.EISDIR:
+        return UserError(f"{path} is a folder where a file was expected; choose another name")
+    reason = error.strerror or str(error)
+    return UserError(f"could not read or write {path}: {reason}; check the disk and the path")
+
+
+def make_folder(path: Path | str) -> Path:
+    """Creates a folder and its parents if they are absent, and returns its path.
+
+    Raises:
+        UserError: a file is in the way, or permission or space is lacking.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise explain(error, folder) from error
+    return folder
+
+
+@contextlib.contextmanager
+def atomic_path(path: Path | str) -> Iterator[Path]:
+    """Yields a temporary path beside ``path``; it becomes ``path`` when the block succeeds.
+
+    The temporary name keeps the suffix, because many writers choose their format by it. When the
+    block fails (also by Ctrl-C) the temporary file is removed and an old ``path`` stays as it was.
+
+    Raises:
+        UserError: the disk is full, or the place cannot be written.
+    """
+    # Through a symbolic link the file it points at is replaced, not the link.
+    final = Path(os.path.realpath(path))
+    make_folder(final.parent)
+    temporary = final.with_name(f".{secrets.token_hex(6)}.tmp{final.suffix}")
+    try:
+        yield temporary
+        # Before the rename: network disks report a full disk only here, and after a power cut an
+        # unflushed file may be empty under its final name.
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, final)
+    except OSError as error:
+        raise explain(error, final) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def write_bytes(path: Path | str, data: bytes) -> None:
+    """Writes ``data`` to ``path`` atomically.
+
+    Raises:
+        UserError: the disk is full, or the place cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Writes ``value`` as indented JSON, atomically.
+
+    Dataclasses, paths, numpy scalars and arrays (torch tensors too) are converted. Numbers that
+    are not finite become ``null``, since JSON has none.
+
+    Raises:
+        UserError: the disk is full, or the place cannot be written.
+    """
+    text = json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False)
+    write_bytes(path, (text + "\n").encode())
+
+
+def plain(value: Any) -> Any:
+    """``value`` as the dicts, lists, numbers and strings that JSON knows."""
+    if isinstance(value, bool | int | str) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    to_list = getattr(value, "tolist", None)  # numpy scalars and arrays, torch tensors
+    if to_list is not None:
+        return plain(to_list())
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")
+
+
+def read_json(path: Path | str, what: str = "file") -> dict[str, Any]:
+    """Reads a JSON object.
+
+    Args:
+        path: the file.
+        what: what it is to the user ("run", "camera path"), for the error message.
+
+    Raises:
+        UserError: absent, unreadable, not JSON, or not an object.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise UserError(f"{what}: {path} does not exist; check the path") from error
+    except OSError as error:
+        raise explain(error, Path(path)) from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{what}: {path} is not text; it is damaged or not JSON") from error
+    try:
+        value = json.loads(text)
+    except RecursionError as error:
+        raise UserError(f"{what}: {path} is nested too deeply to be sound; restore it") from error
+    except json.JSONDecodeError as error:
+        raise UserError(
+            f"{what}: {path} is not valid JSON (line {error.lineno}, column {error.colno}:"
+            f" {error.msg}); it is damaged or cut off, restore or recreate it"
+        ) from error
+    if not isinstance(value, dict):
+        raise UserError(f"{what}: {path} should hold a JSON object {{...}}; recreate it")
+    return value
+
+
+def write_safetensors(
+    path: Path | str, tensors: Mapping[str, Any], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Writes named torch tensors, or named numpy arrays, as one safetensors file, atomically.
+
+    Raises:
+        UserError: the disk is full, or the place cannot be written.
+    """
+    from safetensors import SafetensorError
+
+    ready: dict[str, Any]
+    if any(hasattr(tensor, "detach") for tensor in tensors.values()):
+        from safetensors import torch as library
+
+        ready = {name: t.detach().cpu().contiguous() for name, t in tensors.items()}
+    else:
+        import numpy as np
+        from safetensors import numpy as library
+
+        ready = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+    with atomic_path(path) as temporary:
+        # Created here first: that reports a forbidden folder by errno, and shows the permissions
+        # that an ordinary new file has (the library makes its own readable by the owner alone).
+        temporary.touch()
+        mode = temporary.stat().st_mode
+        try:
+            library.save_file(ready, temporary, dict(metadata or {}))
+            temporary.chmod(mode)
+        except SafetensorError as error:
+            if f"os error {errno.ENOSPC}" in str(error):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+            raise UserError(f"could not write {path}: {error}; check the disk") from error
+
+
+def read_safetensors(path: Path | str, what: str = "file") -> tuple[dict[str, Any], dict[str, str]]:
+    """Reads a safetensors file as numpy arrays by name, with its metadata.
+
+    Raises:
+        UserError: absent, unreadable, or damaged.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not Path(path).is_file():
+        raise UserError(f"{what}: {path} does not exist; check the path")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
+    except OSError as error:
+        raise explain(error, Path(path)) from error
+    except SafetensorError as error:
+        raise UserError(f"{what}: {path} is damaged ({error}); restore or recreate it") from error
+
+
+def check_schema(found: object, supported: int, what: str) -> None:
+    """Refuses a file whose schema version is newer than this program's.
+
+    Args:
+        found: the version read from the file.
+        supported: the newest version this program reads.
+        what: what was read, with its path ("run /data/run1").
+
+    Raises:
+        UserError: ``found`` is newer, or is no version number.
+    """
+    if not isinstance(found, int) or isinstance(found, bool) or found < 1:
+        raise UserError(f"{what} has no schema version ({found!r}); it is damaged, recreate it")
+    if found > supported:
+        raise UserError(
+            f"{what} has schema version {found}, and this climatenerf reads up to {supported};"
+            " it was written by a newer climatenerf, upgrade this one to use it"
+        )

@@ -1,0 +1,337 @@
+"""Metaball sums over a sparse lattice, and rays marched through them: Numba, CPU.
+
+The slow twin is `ops.metaballs_reference`. Inside, lengths are in lattice spacings.
+
+A lattice consists of cascades: squares in x and y around one centre, each with twice the spacing
+and twice the side of the one before, all of them over the full height. A position belongs to the
+finest cascade that contains it. Vertices are stored in bricks: a brick holds the vertices -1 to 9
+along each axis relative to its corner, all that the balls reaching into its 8 x 8 x 8 cells need.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, Int
+from numba import njit, prange
+
+from climatenerf.ops.cpu.simd_metaballs import BALL_REACH, ball_means, ball_sums
+
+LANES_DIGEST = "d22e9516b615"  # of `lanes.py` and `ball_lanes.py`; the former says why
+BRICK = 8
+"""Cells along a brick's side."""
+STORED = BRICK + 3
+"""Vertices along a brick's side that are stored."""
+REACH = BALL_REACH
+"""Support 1.5 R of the kernel in lattice spacings."""
+RADIUS = REACH / 1.5
+"""R of the kernel in lattice spacings (measured in docs/decisions.md)."""
+THRESHOLD = 0.497
+"""tau: the surface of a half-space lies where half of the sum is reached; the 0.003 make up for
+rays that see a little (0.006 spacings, the same for every lattice) into the snow."""
+SHARPNESS = 100.0
+"""a of the logistic that turns the sum into density."""
+HEIGHT_UNIT = 1 / 128
+"""Unit of `Lattice.height`, in lattice spacings."""
+MAX_SAMPLES = 24
+"""Samples on one ray at most."""
+
+LOW = 0.42
+"""Below this sum the density is less than a thousandth of that inside."""
+_SLOPE_BOUND = 0.75  # no sum rises faster than this per spacing (tests measure it)
+_GROUP = 0.5  # optical depth that is gathered into one sample
+_OPAQUE = 7.0  # optical depth at which a ray ends: exp(-7) < 1e-3
+# NaN and infinity keep their meaning: t_max may be infinite.
+_FAST = {"contract", "reassoc", "arcp", "nsz"}
+
+
+class Lattice(NamedTuple):
+    """Cascades of bricks (a named tuple because Numba takes it as it is)."""
+
+    lower: Float[np.ndarray, "k 3"]
+    """Corner of each cascade, m; vertex (0, 0, 0) lies there. One brick around is margin."""
+    spacing: Float[np.ndarray, "k"]
+    """m; doubles from one to the next."""
+    bricks: Int[np.ndarray, "k 3"]
+    """Number of bricks along x, y, z."""
+    start: Int[np.ndarray, "k"]
+    """Where a cascade's part of `index` begins."""
+    index: Int[np.ndarray, "i"]
+    """Brick at (x, y, z), row by row, z fastest; -1: empty."""
+    fill: np.ndarray
+    """[b, 11, 11, 11] uint8: filled fraction f of a vertex's surroundings, in 1/255."""
+    height: np.ndarray
+    """int16: height of the vertex over the ground under it, in HEIGHT_UNIT spacings."""
+    shade: np.ndarray
+    """uint8: brightness under the scene's light, in 1/255."""
+    band: np.ndarray
+    """[b, 2] uint8: layers of cells, from and to, outside of which a brick's sums are low."""
+    near: np.ndarray
+    """[b, 8, 8] uint8: bit m says whether sums in the cell (x, y, m) may be more than low."""
+    burial: Float[np.ndarray, "k"]
+    """Depth under the ground below which there is no matter, m."""
+
+
+def where_matter_is(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`Lattice.band` and `Lattice.near` from `Lattice.fill`.
+
+    A cell's sum is a mean over the vertices one below to two above it along each axis: where they
+    all are low, so is the sum.
+    """
+    cells = fill >= LOW * 255
+    for axis in (1, 2, 3):
+        cells = np.lib.stride_tricks.sliding_window_view(cells, 4, axis).any(-1)
+    near = np.packbits(cells, axis=-1, bitorder="little")[..., 0]
+    layers = np.pad(cells.max((1, 2), initial=False), ((0, 0), (0, 1)))
+    first = layers.argmax(1)
+    last = np.where(layers.any(1), BRICK + 1 - layers[:, ::-1].argmax(1), 0)
+    return np.stack([first, last], 1).astype(np.uint8), near
+
+
+@njit(cache=True, fastmath=_FAST, inline="always")
+def _find(lattice, x, y, z):
+    """Finest cascade around a position and the brick there (-1: none)."""
+    for k in range(lattice.spacing.shape[0]):
+        h = lattice.spacing[k]
+        i = math.floor((x - lattice.lower[k, 0]) / (h * BRICK))
+        j = math.floor((y - lattice.lower[k, 1]) / (h * BRICK))
+        # The outermost bricks only lend vertices to those inside.
+        if i < 1 or j < 1 or i >= lattice.bricks[k, 0] - 1 or j >= lattice.bricks[k, 1] - 1:
+            continue
+        m = math.floor((z - lattice.lower[k, 2]) / (h * BRICK))
+        if m < 0 or m >= lattice.bricks[k, 2]:
+            return k, -1, i, j, m
+        at = (i * lattice.bricks[k, 1] + j) * lattice.bricks[k, 2] + m
+        return k, lattice.index[lattice.start[k] + at], i, j, m
+    return -1, -1, 0, 0, 0
+
+
+@njit(cache=True, fastmath=_FAST, inline="always")
+def _sum(lattice, brick, px, py, pz):
+    """Normalised sum and its gradient per spacing; p relative to the brick's corner, spacings."""
+    i, j, m = int(px), int(py), int(pz)
+    i, j, m = min(max(i, 0), BRICK - 1), min(max(j, 0), BRICK - 1), min(max(m, 0), BRICK - 1)
+    ux, uy, uz = np.float32(px - i), np.float32(py - j), np.float32(pz - m)
+    bottom, top, bx, by, bz, tx, ty, tz = ball_sums(lattice.fill, brick, i, j, m, ux, uy, uz)
+    s = top / bottom
+    scale = np.float32(-6.0 / 255.0) / bottom
+    return (
+        s * np.float32(1 / 255.0),
+        (tx - s * bx) * scale,
+        (ty - s * by) * scale,
+        (tz - s * bz) * scale,
+    )
+
+
+@njit(cache=True, fastmath=_FAST)
+def _means(lattice, brick, px, py, pz):
+    """Kernel-weighted mean height over the ground (spacings, of the vertices) and brightness.
+
+    The height is that of the position itself: the mean ground is subtracted from it.
+    """
+    i, j, m = int(px), int(py), int(pz)
+    i, j, m = min(max(i, 0), BRICK - 1), min(max(j, 0), BRICK - 1), min(max(m, 0), BRICK - 1)
+    ux, uy, uz = np.float32(px - i), np.float32(py - j), np.float32(pz - m)
+    total, over, dz, shade = ball_means(
+        lattice.fill, lattice.height, lattice.shade, brick, i, j, m, ux, uy, uz
+    )
+    height = over * np.float32(HEIGHT_UNIT) + dz
+    if total <= np.float32(0):  # nothing within reach: 0 / 0 would give NaN
+        return np.float32(0), np.float32(1)
+    return height / total, shade / (total * np.float32(255))
+
+
+@njit(cache=True, fastmath=_FAST, inline="always")
+def _extinction(s, h):
+    """Density O = sigma0 s sigmoid(a (s - tau)), 1/m.
+
+    A half-space's sum rises by about 1/2 per spacing, and sigma0 = a / spacing makes a ray that
+    enters it head-on lose half of its light exactly at s = tau, whatever the spacing.
+    """
+    return SHARPNESS / h * s / (1 + math.exp(-SHARPNESS * (s - THRESHOLD)))
+
+
+@njit(cache=True, parallel=True, fastmath=_FAST)
+def evaluate(
+    points: Float32[np.ndarray, "n 3"], lattice: Lattice
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Metaball sum and what is averaged on the lattice, at points.
+
+    Args:
+        points: positions, m.
+        lattice: the cascades.
+
+    Returns:
+        float32 arrays: the normalised sum s [n]; its gradient [n, 3], 1/m; and [n, 3]: height over
+        the ground under the snow, m, brightness, and density O, 1/m, 0 below the ground.
+    """
+    n = points.shape[0]
+    sums = np.zeros(n, np.float32)
+    gradients = np.zeros((n, 3), np.float32)
+    rest = np.zeros((n, 3), np.float32)
+    for r in prange(n):
+        x, y, z = np.float64(points[r, 0]), np.float64(points[r, 1]), np.float64(points[r, 2])
+        rest[r, 1] = 1
+        k, brick, i, j, m = _find(lattice, x, y, z)
+        if brick < 0:
+            continue
+        h = lattice.spacing[k]
+        px = (x - lattice.lower[k, 0]) / h - i * BRICK
+        py = (y - lattice.lower[k, 1]) / h - j * BRICK
+        pz = (z - lattice.lower[k, 2]) / h - m * BRICK
+        s, gx, gy, gz = _sum(lattice, brick, px, py, pz)
+        sums[r] = s
+        gradients[r, 0], gradients[r, 1], gradients[r, 2] = gx / h, gy / h, gz / h
+        height, shade = _means(lattice, brick, px, py, pz)
+        rest[r, 0], rest[r, 1] = height * h, shade
+        if height * h > -lattice.burial[k]:
+            rest[r, 2] = _extinction(s, h)
+    return sums, gradients, rest
+
+
+@njit(cache=True, fastmath=_FAST)
+def _to_band(px, py, pz, d, low, high):
+    """Way (spacings) to a brick's band of layers, or out of the brick if that comes first."""
+    way = np.inf
+    for p, c in ((px, d[0]), (py, d[1]), (pz, d[2])):
+        if c != 0:
+            way = min(way, ((BRICK if c > 0 else 0) - p) / c)
+    if d[2] != 0:
+        level = (low if pz < low else high) - pz
+        if level * d[2] > 0:
+            way = min(way, level / d[2])
+    return max(way, 0.0)
+
+
+@njit(cache=True, fastmath=_FAST)
+def _to_face(ux, uy, uz, d):
+    """Way (spacings) out of a cell from a place in it."""
+    way = np.inf
+    for p, c in ((ux, d[0]), (uy, d[1]), (uz, d[2])):
+        if c != 0:
+            way = min(way, ((1 if c > 0 else 0) - p) / c)
+    return max(way, 0.0)
+
+
+@njit(cache=True, fastmath=_FAST)
+def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
+    """Samples of one ray into the given rows; returns their number."""
+    n = 0
+    depth = 0.0  # optical depth so far
+    group, moment, first, last = 0.0, 0.0, 0.0, 0.0
+    k, brick, h, per = -1, -1, 0.0, 0.0
+    cx, cy, cz = 0.0, 0.0, 0.0  # the brick's corner
+    while t < end and depth < _OPAQUE:
+        x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+        px, py, pz = (x - cx) * per, (y - cy) * per, (z - cz) * per
+        # Most steps stay in their brick; only of the finest is it sure that no finer one is there.
+        inside = min(px, py, pz) >= 0 and max(px, py, pz) < BRICK
+        if not (k == 0 and brick >= 0 and inside):
+            k, brick, i, j, m = _find(lattice, x, y, z)
+            if k < 0:
+                break  # the ray was cut to the outermost cascade before
+            h = lattice.spacing[k]
+            side, per = h * BRICK, 1 / h
+            cx = lattice.lower[k, 0] + i * side
+            cy = lattice.lower[k, 1] + j * side
+            cz = lattice.lower[k, 2] + m * side
+            px, py, pz = (x - cx) * per, (y - cy) * per, (z - cz) * per
+        if brick < 0:
+            step = np.inf
+            for axis, face in ((0, cx), (1, cy), (2, cz)):
+                if d[axis] != 0:
+                    far = face + (h * BRICK if d[axis] > 0 else 0.0)
+                    step = min(step, (far - o[axis]) / d[axis] - t)
+            t += max(step, 0.0) + 1e-3 * h
+            sigma, step = 0.0, 0.0
+        else:
+            # Rounding may bring the last cell's far face to 8.
+            i, j, m = min(int(px), BRICK - 1), min(int(py), BRICK - 1), min(int(pz), BRICK - 1)
+            if pz < lattice.band[brick, 0] or pz > lattice.band[brick, 1]:
+                t += _to_band(px, py, pz, d, lattice.band[brick, 0], lattice.band[brick, 1]) * h
+                t += 1e-3 * h
+                s, sigma, step = 0.0, 0.0, 0.0
+            elif not lattice.near[brick, i, j] >> m & 1:
+                t += _to_face(px - i, py - j, pz - m, d) * h + 1e-3 * h
+                s, sigma, step = 0.0, 0.0, 0.0
+            else:
+                s, gx, gy, gz = _sum(lattice, brick, px, py, pz)
+                sigma, step = 0.0, max((LOW - s) / _SLOPE_BOUND, 0.05) * h
+            if s >= LOW:
+                slope = gx * d[0] + gy * d[1] + gz * d[2]
+                step = min(max(0.025 / max(abs(slope), 1e-6), 0.01), 0.15) * h
+                step = min(step, end - t)
+                height, _ = _means(lattice, brick, px, py, pz)
+                if height * h > -lattice.burial[k]:
+                    sigma = _extinction(s + slope * step / h / 2, h)
+            t += step
+        if sigma > 0:
+            if group == 0:
+                first = t - step
+            last = t
+            group += sigma * step
+            moment += sigma * step * (t - step / 2)
+            depth += sigma * step
+        if group > 0 and (sigma == 0 or group > _GROUP or depth >= _OPAQUE or t >= end):
+            if group > 1e-4 and n < MAX_SAMPLES:
+                out_t[n] = moment / group
+                out_dt[n] = last - first
+                out_sigma[n] = group / (last - first)
+                n += 1
+            group, moment = 0.0, 0.0
+    return n
+
+
+@njit(cache=True, parallel=True)
+def march(
+    rays_o: Float32[np.ndarray, "n 3"],
+    rays_d: Float32[np.ndarray, "n 3"],
+    t_min: Float32[np.ndarray, "n"],
+    t_max: Float32[np.ndarray, "n"],
+    lattice: Lattice,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """March rays through the snow, front to back, until they are opaque.
+
+    Steps are as long as the sum's steepest possible rise allows, so no surface is jumped over;
+    within a surface they follow its slope.
+
+    Args:
+        rays_o: origins, m.
+        rays_d: unit directions.
+        t_min: where each ray begins, m.
+        t_max: where it ends, m; infinite is allowed.
+        lattice: the cascades.
+
+    Returns:
+        offsets [n + 1] and, packed, the samples' middle t, extent dt (m) and extinction (1/m).
+    """
+    n = rays_o.shape[0]
+    t = np.empty((n, MAX_SAMPLES), np.float32)
+    dt = np.empty((n, MAX_SAMPLES), np.float32)
+    sigma = np.empty((n, MAX_SAMPLES), np.float32)
+    offsets = np.zeros(n + 1, np.int64)
+    outer = lattice.spacing.shape[0] - 1
+    for r in prange(n):
+        begin, end = np.float64(t_min[r]), np.float64(t_max[r])
+        o, d = rays_o[r].astype(np.float64), rays_d[r].astype(np.float64)
+        for axis in range(3):
+            side = lattice.spacing[outer] * BRICK
+            low = lattice.lower[outer, axis] + side
+            high = low + (lattice.bricks[outer, axis] - 2) * side
+            if d[axis] == 0:
+                if o[axis] < low or o[axis] > high:
+                    end = -1.0
+                continue
+            first, second = (low - o[axis]) / d[axis], (high - o[axis]) / d[axis]
+            begin = max(begin, min(first, second) + 1e-4 * lattice.spacing[0])
+            end = min(end, max(first, second))
+        offsets[r + 1] = _march_ray(lattice, o, d, begin, end, t[r], dt[r], sigma[r])
+    for r in range(n):
+        offsets[r + 1] += offsets[r]
+    packed = np.empty((3, offsets[n]), np.float32)
+    for r in prange(n):
+        for q in range(offsets[r + 1] - offsets[r]):
+            packed[0, offsets[r] + q] = t[r, q]
+            packed[1, offsets[r] + q] = dt[r, q]
+            packed[2, offsets[r] + q] = sigma[r, q]
+    return offsets, packed[0], packed[1], packed[2]

@@ -1,0 +1,144 @@
+"""Whole rays on a GPU, a block at a time: march, encode, both networks, composite, in one launch.
+
+The twin is the composition of the operations (`render.view.composited`). Nothing is stored
+for the samples, so memory does not grow with them. In Triton, with the search of `gpu_march.py`.
+"""
+
+# Triton's functions have no types that pyright could know.
+# pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+
+import math
+
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from climatenerf.ops.triton.encoding import (
+    FAST,
+    density_layers,
+    density_of,
+    features_at,
+    first_layer,
+    hidden_of,
+    over,
+    sizes_of,
+    unit_cube,
+)
+from climatenerf.ops.triton.marching import (
+    RAYS,
+    WARPS,
+    begin,
+    cells_of,
+    middle_of,
+    search,
+    weight_of,
+)
+
+SHARPNESS = tl.constexpr(8.0)  # of the softplus; see `field.activations`
+BRIGHT = tl.constexpr(2.4 / 1.055)  # slope beyond white; see `field.colour_space.decode_srgb`
+
+
+@triton.jit
+def radiance(raw):
+    """Network output to linear radiance: softplus, then the display curve undone."""
+    x = raw + 0.5
+    # Far up it is the identity, and exp would overflow; far down exp alone, and 1 would swallow it.
+    e = tl.exp(tl.minimum(x * SHARPNESS, 20.0))
+    soft = tl.where(e < 1e-3, e * (1.0 - 0.5 * e), tl.log(1.0 + e)) / SHARPNESS
+    x = tl.where(x * SHARPNESS <= 20.0, soft, x)
+    curve = tl.exp2(2.4 * tl.log2((tl.maximum(x, 0.04045) + 0.055) / 1.055))
+    bright = 1.0 + (x - 1.0) * BRIGHT
+    return tl.where(x <= 0.04045, x / 12.92, tl.where(x > 1.0, bright, curve))
+
+
+@triton.jit(do_not_specialize=["n"])
+def _composite(
+    rays,
+    spans,
+    cells,
+    steps,
+    limits,
+    density,
+    colour,
+    shared,
+    out,
+    n,
+    SIZES: tl.constexpr,
+    SIZES_C: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    r, some, o, d, t, end = begin(rays, spans, cells[2][0], steps, n, BLOCK)
+    layers = density_layers(density[1], SIZES)
+    w1, b1, w2, b2 = colour[1]
+    layer = first_layer(w1, b1, SIZES_C)
+    HIDDEN: tl.constexpr = SIZES_C[3]
+    unit, c = tl.arange(0, SIZES_C[2]), tl.arange(0, 16)
+    known = (unit < HIDDEN)[:, None] & (c < 3)[None, :]
+    second_layer = tl.load(w2 + unit[:, None] * 3 + c[None, :], mask=known, other=0.0)
+    bias = tl.load(b2 + c, mask=c < 3, other=0.0)
+    known = some[:, None] & (unit < HIDDEN)[None, :]
+    own_shared = tl.load(shared + r[:, None] * HIDDEN + unit[None, :], mask=known, other=0.0)
+    tau, far = tl.zeros_like(t), tl.zeros_like(t)
+    rgb = tl.zeros([BLOCK, 16], tl.float32)
+    live = some & (t < end)
+    while tl.max(live.to(tl.int32), 0) > 0:
+        t, found = search(o, d, t, end, live, cells, steps)
+        here = found > 0
+        if tl.max(found, 0) > 0:
+            dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
+            own = density_of(qx, qy, qz, here, density[0], layers, SIZES) * dt
+            own = tl.where(here & (own > steps[2]), own, 0.0)
+            weight = weight_of(tau, own)
+            tau += own
+            far += weight * tm
+            heavy = weight > limits[1]
+            if tl.max(heavy.to(tl.int32), 0) > 0:
+                ux, uy, uz, _distance = unit_cube(qx, qy, qz)
+                first, second = features_at(ux, uy, uz, heavy, colour[0], SIZES_C)
+                h = tl.maximum(hidden_of(first, second, layer, FAST) + own_shared, 0.0)
+                y = tl.dot(h, second_layer, input_precision=FAST) + bias[None, :]
+                rgb += tl.where(heavy, weight, 0.0)[:, None] * radiance(y)
+            t = tl.where(here, t + dt, t)
+        live = live & (t < end) & (tau < limits[0])
+    tl.store(out + 5 * r[:, None] + c[None, :], rgb, mask=some[:, None] & (c < 3)[None, :])
+    tl.store(out + 5 * r + 3, far, mask=some)
+    tl.store(out + 5 * r + 4, tl.exp(-tau), mask=some)
+
+
+def composite(
+    rays: tuple[Tensor, Tensor],
+    spans: Tensor,
+    cells: tuple[Tensor, Tensor],
+    steps: tuple[float, float, float],
+    limits: tuple[float, float],
+    net: tuple[Tensor, ...],
+    colours: tuple[Tensor, ...],
+    shared: Tensor,
+    out: Tensor,
+) -> None:
+    """What rays see of matter: radiance, weighted sum of lengths, transmittance.
+
+    Args: as `gpu.march`, but rays = (origins, directions); limits = (transmittance at which a ray
+    ends, weight from which a sample has a colour); colours = (table, resolutions, w1, b1, w2, b2)
+    of the appearance, to whose hidden layer shared [n,H] is added; out [n,5].
+    """
+    nets = []
+    for table, resolutions, *layers in (net, colours):
+        nets.append(((table, resolutions, table.shape[1]), tuple(layers)))
+    n, stop = spans.shape[0], -math.log(limits[0])
+    over(_composite, n, RAYS)(
+        rays,
+        spans,
+        cells_of(cells),
+        steps,
+        (stop, limits[1]),
+        *nets,
+        shared,
+        out,
+        n,
+        SIZES=sizes_of(net[0], net[2]),
+        SIZES_C=sizes_of(colours[0], colours[2]),
+        BLOCK=RAYS,
+        num_warps=WARPS,
+    )

@@ -1,0 +1,1 @@
+"""Files made of frames: layers, movies, contact sheets."""

@@ -1,0 +1,95 @@
+"""One picture of many frames: a row for each movie, a column for each moment."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import write_bytes
+
+GAP = 4
+"""Pixels between the pictures."""
+
+
+def contact_sheet(
+    rows: Sequence[tuple[str, Sequence[UInt8[np.ndarray, "h w 3"]]]],
+    columns: int | None = None,
+    cell_width: int = 320,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Lays rows of frames out as one labelled picture.
+
+    Args:
+        rows: label and frames of each row; all frames of one shape.
+        columns: at most so many frames of each row, evenly spread over it; None takes all.
+        cell_width: width of each frame in the sheet, pixels; frames are never enlarged.
+
+    Returns:
+        The sheet, 8-bit RGB.
+    """
+    if not rows or any(len(frames) == 0 for _, frames in rows):
+        raise ValueError("a contact sheet needs at least one frame in every row")
+    count = min(columns or 10**9, max(len(frames) for _, frames in rows))
+    height, width = rows[0][1][0].shape[:2]
+    cell = (min(cell_width, width), max(1, round(height * min(cell_width, width) / width)))
+    sheet = Image.new(
+        "RGB",
+        (count * (cell[0] + GAP) + GAP, len(rows) * (cell[1] + GAP) + GAP),
+        (255, 255, 255),
+    )
+    font = ImageFont.load_default(size=max(10, cell[1] // 14))
+    for r, (label, frames) in enumerate(rows):
+        chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round())
+        for c, index in enumerate(chosen.astype(int)):
+            picture = Image.fromarray(np.ascontiguousarray(frames[index]))
+            place = (GAP + c * (cell[0] + GAP), GAP + r * (cell[1] + GAP))
+            sheet.paste(picture.resize(cell, Image.Resampling.LANCZOS), place)
+            if c == 0:
+                _label(ImageDraw.Draw(sheet), place, label, font)
+    return np.asarray(sheet)
+
+
+def write_jpeg(
+    path: Path | str, picture: UInt8[np.ndarray, "h w 3"], max_bytes: int | None = None
+) -> int:
+    """Writes a JPEG, marked as simulated, as good as the size bound allows.
+
+    Quality is lowered from 90 to 60 first, then the picture is made smaller.
+
+    Args:
+        path: the file.
+        picture: 8-bit RGB.
+        max_bytes: upper bound of the file, or None.
+
+    Returns:
+        Bytes written.
+
+    Raises:
+        UserError: the bound cannot be met, or the place cannot be written.
+    """
+    image = Image.fromarray(np.ascontiguousarray(picture))
+    while min(image.size) >= 16:
+        for quality in (90, 82, 74, 66, 60):
+            buffer = io.BytesIO()
+            image.save(buffer, "JPEG", quality=quality, optimize=True, comment=b"simulated")
+            if max_bytes is None or buffer.tell() <= max_bytes:
+                write_bytes(path, buffer.getvalue())
+                return buffer.tell()
+        image = image.resize(
+            (round(image.width * 0.8), round(image.height * 0.8)), Image.Resampling.LANCZOS
+        )
+    raise UserError(f"{path} does not fit into {max_bytes} bytes; allow more")
+
+
+def _label(
+    draw: ImageDraw.ImageDraw,
+    place: tuple[int, int],
+    text: str,
+    font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
+) -> None:
+    left, top, right, bottom = draw.textbbox((place[0] + 6, place[1] + 4), text, font=font)
+    draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=(0, 0, 0))
+    draw.text((place[0] + 6, place[1] + 4), text, font=font, fill=(255, 255, 255))

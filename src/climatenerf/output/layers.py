@@ -1,0 +1,268 @@
+"""Measured layers of a frame (depth, normals, water depth, ...) as files, and the JSON sidecar.
+
+Layers are float32 arrays of the frame's size. NPZ and EXR hold them as they are; PNG holds them
+rounded to the step in `LAYERS`. No surface is +inf in the depth of NPZ and EXR, and 0 in PNG.
+"""
+
+import importlib.metadata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+import climatenerf
+from climatenerf.core.classes import CLASS_NAMES
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import atomic_path, write_json
+from climatenerf.output.video import write_png
+from climatenerf.scene import Camera, Scene
+
+SIDECAR_SCHEMA = 1
+SIMULATED = (
+    "simulated: weather was computed into a model fitted to photographs; this is no photograph and"
+    " no forecast"
+)
+LayerFormat = Literal["npz", "png", "exr"]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """How a layer is stored.
+
+    Attributes:
+        unit: Unit of the float values, as the sidecar names it.
+        meaning: One line for the sidecar.
+        png_step: Value of one grey level of the PNG; None for normals, which are (n + 1) / 2.
+        png_bits: 8 or 16.
+    """
+
+    unit: str
+    meaning: str
+    png_step: float | None
+    png_bits: Literal[8, 16]
+
+
+CLASSES = ", ".join(f"{number} {name}" for number, name in enumerate(CLASS_NAMES))
+LAYERS: dict[str, Layer] = {
+    "depth": Layer("m", "distance along the ray; no surface: +inf (PNG 0)", 1e-3, 16),
+    "normal": Layer("1", "surface normal in world axes; no surface: 0 0 0 (PNG 128)", None, 8),
+    "label": Layer("1", f"class of the dry scene: {CLASSES}", 1.0, 8),
+    "water_depth": Layer("m", "water above the ground where water is seen, else 0", 1e-3, 16),
+    "transmittance": Layer("1", "share of the surface's light that passes the air", 1 / 65535, 16),
+    "snow_thickness": Layer("m", "snow upon the surface that is seen, else 0", 1e-4, 16),
+    "mask_water": Layer("1", "share of the pixel that shows water", 1 / 255, 8),
+    "mask_snow": Layer("1", "share of the pixel that shows snow", 1 / 255, 8),
+    "mask_smog": Layer("1", "share of the pixel's light that smog added", 1 / 255, 8),
+}
+
+
+def save_layers(
+    folder: Path | str,
+    stem: str,
+    layers: Mapping[str, Float[np.ndarray, "h w *c"]],
+    formats: Sequence[LayerFormat] = ("npz",),
+) -> dict[str, list[str]]:
+    """Writes one frame's layers as ``folder/NAME/STEM.FORMAT``.
+
+    Args:
+        folder: where the layers go.
+        stem: the frame's file name without suffix, e.g. ``0007``.
+        layers: names of `LAYERS` with (h, w) values, (h, w, 3) for ``normal``.
+        formats: any of npz (one array, named as the layer), png (rounded, see `LAYERS`), exr.
+
+    Returns:
+        For each layer the paths written, relative to ``folder``.
+
+    Raises:
+        UserError: a file cannot be written, or EXR is asked for without the OpenEXR package.
+        ValueError: a layer has an unknown name or a wrong shape.
+    """
+    written: dict[str, list[str]] = {}
+    for name, values in layers.items():
+        array = np.asarray(values, dtype=np.float32)
+        if name not in LAYERS or array.shape[2:] != ((3,) if name == "normal" else ()):
+            raise ValueError(f"no layer {name!r} of shape {array.shape}; see LAYERS")
+        for kind in formats:
+            path = Path(folder) / name / f"{stem}.{kind}"
+            if kind == "npz":
+                arrays: dict[str, Any] = {name: array}
+                with atomic_path(path) as temporary:
+                    np.savez_compressed(temporary, **arrays)
+            elif kind == "png":
+                write_png(path, png_values(name, array), f"{name}; {SIMULATED}")
+            else:
+                _write_exr(path, name, array)
+            written.setdefault(name, []).append(f"{name}/{path.name}")
+    return written
+
+
+def png_values(name: str, array: Float[np.ndarray, "h w *c"]) -> np.ndarray:
+    """A layer as PNG grey levels, 8 or 16 bits.
+
+    Values beyond the range saturate (65.535 m for depth in 16-bit millimetres), except that what
+    is not finite is 0. A positive depth too small for a grey level is 1, as 0 means no surface.
+    """
+    layer = LAYERS[name]
+    top = 2**layer.png_bits - 1
+    finite = np.where(np.isfinite(array), array, 0.0).astype(np.float64)
+    levels = (finite + 1) / 2 * top if layer.png_step is None else finite / layer.png_step
+    if name == "depth":
+        levels = np.where(finite > 0, np.maximum(levels, 1.0), 0.0)
+    return np.clip(np.rint(levels), 0, top).astype(np.uint8 if layer.png_bits == 8 else np.uint16)
+
+
+def require_exr() -> None:
+    """Raises UserError if EXR cannot be written; to be called before hours of rendering."""
+    try:
+        import OpenEXR  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise UserError(
+            "EXR layers need the OpenEXR package; run `pip install climatenerf[exr]`, or choose npz"
+        ) from error
+
+
+def _write_exr(path: Path, name: str, array: np.ndarray) -> None:
+    require_exr()
+    import OpenEXR  # pyright: ignore[reportMissingImports]
+
+    # Viewers show X, Y, Z as a picture; one value a pixel is Y (luminance) or Z (depth) by custom.
+    single = "Z" if name == "depth" else "Y"
+    channels = {single: array} if array.ndim == 2 else dict(zip("XYZ", _planes(array), strict=True))
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "comments": f"{name} [{LAYERS[name].unit}]: {LAYERS[name].meaning}; {SIMULATED}",
+    }
+    with atomic_path(path) as temporary:
+        try:
+            OpenEXR.File(header, channels).write(str(temporary))
+        except RuntimeError as error:
+            raise UserError(f"could not write {path}: {error}; check the disk") from error
+
+
+def _planes(array: np.ndarray) -> list[np.ndarray]:
+    return [np.ascontiguousarray(array[..., i]) for i in range(array.shape[-1])]
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """What the sidecar says about one frame.
+
+    Attributes:
+        file: The picture, relative to the sidecar.
+        time: Time in the movie, s.
+        camera: Intrinsics, pixels.
+        c2w: Camera-to-world pose, world metres, OpenCV axes.
+        layers: Layer files by name, as `save_layers` returns them.
+        weather: Parameters at this frame's time, where they change over time.
+        measured: Numbers measured on this frame, e.g. the share of water.
+    """
+
+    file: str
+    time: float
+    camera: Camera
+    c2w: Float[np.ndarray, "4 4"]
+    layers: Mapping[str, list[str]]
+    weather: Mapping[str, Any] | None = None
+    measured: Mapping[str, float] | None = None
+
+
+def write_sidecar(
+    path: Path | str,
+    scene: Scene,
+    records: Sequence[FrameRecord],
+    weather: Mapping[str, Any],
+    seed: int,
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Writes the JSON that lies beside a movie: everything needed to use the frames as data.
+
+    Args:
+        path: the JSON file.
+        scene: the capture, for the frame of reference, the scale and its error.
+        records: one for each frame.
+        weather: all weather parameters with their units.
+        seed: of every random number used.
+        about: further entries (movie file, camera path and its notes, fps, run folder).
+
+    Raises:
+        UserError: the disk is full, or the place cannot be written.
+    """
+    used = {name for record in records for name in record.layers}
+    write_json(
+        path,
+        {
+            "schema_version": SIDECAR_SCHEMA,
+            "simulated": True,
+            "note": SIMULATED,
+            "weather": weather,
+            "seed": seed,
+            **(about or {}),
+            "versions": versions(),
+            "units": {
+                "length": "m",
+                "angle": "deg",
+                "colour": "8-bit sRGB",
+                "pixels": "centre of the top-left pixel at (0.5, 0.5)",
+                "world": "right-handed, z up",
+                "camera": "camera-to-world, +x right, +y down, +z forward",
+            },
+            "scale": {
+                "source": scene.scale_source,
+                "relative_error": scene.scale_error,
+                "metres_per_input_unit": scene.scale,
+                "assumed": "assumed" in scene.scale_source,
+            },
+            "ground_z": scene.ground_z,
+            "lowest_ground_z": scene.lowest_ground_z,
+            "world_from_input": scene.world_from_input,
+            "layers": {
+                name: {
+                    "unit": LAYERS[name].unit,
+                    "meaning": LAYERS[name].meaning,
+                    "png": "(n + 1) / 2 * 255"
+                    if LAYERS[name].png_step is None
+                    else {"bits": LAYERS[name].png_bits, "value_of_one": LAYERS[name].png_step},
+                }
+                for name in sorted(used)
+            },
+            "frames": [_frame_entry(record, scene) for record in records],
+        },
+    )
+
+
+def c2w_in_input_frame(c2w: Float[np.ndarray, "4 4"], scene: Scene) -> Float[np.ndarray, "4 4"]:
+    """A world pose in the capture's own frame: its units for the position, a pure rotation."""
+    back = np.linalg.inv(scene.world_from_input) @ c2w
+    back[:3, :3] *= scene.scale
+    return back
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of what computes the pictures, without importing it; None where absent."""
+    found: dict[str, str | None] = {"climatenerf": climatenerf.__version__}
+    for package in ("torch", "numpy", "numba"):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = None
+    return found
+
+
+def _frame_entry(record: FrameRecord, scene: Scene) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "file": record.file,
+        "time": record.time,
+        "camera": record.camera,
+        "c2w_world": record.c2w,
+        "c2w_input": c2w_in_input_frame(record.c2w, scene),
+        "layers": record.layers,
+    }
+    if record.weather is not None:
+        entry["weather"] = record.weather
+    if record.measured is not None:
+        entry["measured"] = record.measured
+    return entry

@@ -1,0 +1,1 @@
+"""The world frame of a capture: up, scale, ground datum, georeference."""

@@ -1,0 +1,210 @@
+"""`transforms.json` of nerfstudio, instant-ngp and the Blender scenes.
+
+Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward); columns 1 and 2 are
+negated on reading. The file's own frame is the input frame: nerfstudio's `applied_transform` is
+part of it and is not undone, instant-ngp's `scale` and `offset` belong to its viewer and are not
+applied.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.scene.images import picture_header
+from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
+from climatenerf.scene.readers.ply import read_points
+from climatenerf.scene.scene import View
+
+SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+_PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+
+
+def transforms_files(root: Path) -> list[Path]:
+    """The file or files below `root` that describe the capture; `root` may be the file itself."""
+    if root.is_file():
+        siblings = [root.parent / n for n in SPLIT_FILES]
+        return [s for s in siblings if s.is_file()] if root.name in SPLIT_FILES else [root]
+    if (root / "transforms.json").is_file():
+        return [root / "transforms.json"]
+    return [root / n for n in SPLIT_FILES if (root / n).is_file()]
+
+
+def read_transforms(root: Path) -> Capture:
+    """Read `transforms.json`, or the three `transforms_{train,val,test}.json` of Blender scenes.
+
+    The capture's own split is kept: `{train,val,test}_filenames`, or the three files. Of the
+    latter, pictures for testing are held out (validation ones only where no test file exists).
+
+    Raises:
+        UserError: A file is damaged or describes a camera or pose that cannot be used.
+    """
+    files = transforms_files(root)
+    if not files:
+        raise UserError(f"{root} holds no transforms.json.")
+    base = files[0].parent
+    by_name = {f.name: f for f in files}
+    if SPLIT_FILES[0] in by_name and SPLIT_FILES[2] in by_name:
+        by_name.pop(SPLIT_FILES[1], None)
+    cameras: dict[Camera, int] = {}
+    views: list[View] = []
+    points, own_split, unlisted = None, False, 0
+    for name, path in by_name.items():
+        data = _load(path)
+        train, heldout = _own_split(data)
+        own_split |= bool(train or heldout) or name in SPLIT_FILES
+        for frame in data["frames"]:
+            view = _view(frame, data, base, path, cameras)
+            key = _plain(frame["file_path"])
+            out = key in heldout or name in SPLIT_FILES[1:]
+            if not train or key in train or out:
+                views.append(replace(view, split="heldout" if out else "train"))
+            else:
+                unlisted += 1
+        cloud = data.get("ply_file_path")
+        if isinstance(cloud, str) and (base / cloud).is_file():
+            points = read_points(base / cloud)
+    if unlisted and not views:
+        raise UserError(
+            f"The lists of {files[0].name} (train_filenames, ...) name none of its frames; correct"
+            " them, or remove them to have every 8th picture held out."
+        )
+    return Capture(
+        root=base,
+        source="transforms",
+        cameras=tuple(cameras),
+        views=tuple(views),
+        points=points if points is not None and len(points) else None,
+        own_split=own_split,
+        warnings=(
+            (f"{unlisted} pictures are in none of the lists of {files[0].name} and are left out.",)
+            if unlisted
+            else ()
+        ),
+    )
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} is not readable JSON ({error}); export it again.") from None
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise UserError(f"{path} has no list of frames; export it again.")
+    for i, frame in enumerate(frames):
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise UserError(f"Frame {i} of {path} names no file_path; export it again.")
+    return data
+
+
+def _plain(file_path: str) -> str:
+    return file_path.replace("\\", "/").removeprefix("./")
+
+
+def _own_split(data: dict[str, Any]) -> tuple[set[str], set[str]]:
+    names = {k: data.get(f"{k}_filenames") for k in ("train", "val", "test")}
+    names = {k: v if isinstance(v, list) else [] for k, v in names.items()}
+    plain = {k: {_plain(str(n)) for n in v} for k, v in names.items()}
+    return plain["train"], (plain["val"] | plain["test"])
+
+
+def _view(
+    frame: dict[str, Any],
+    data: dict[str, Any],
+    base: Path,
+    where: Path,
+    cameras: dict[Camera, int],
+) -> View:
+    plain = _plain(frame["file_path"])
+    path = base / plain
+    if not path.is_file() and path.suffix.lower() not in (s.lower() for s in _IMAGE_SUFFIXES):
+        found = [p for s in _IMAGE_SUFFIXES if (p := Path(f"{path}{s}")).is_file()]
+        path = found[0] if found else Path(f"{path}.png")
+    name = plain.removeprefix("images/")
+    name = name if Path(name).suffix == path.suffix else name + path.suffix
+    pose = checked_pose(frame.get("transform_matrix"), name, str(where))
+    pose[:3, 1:3] *= -1
+    mask = frame.get("mask_path")
+    camera = _camera(frame, data, path, str(where))
+    return View(
+        name=name,
+        path=path,
+        camera=cameras.setdefault(camera, len(cameras)),
+        c2w=pose,
+        mask_path=base / _plain(mask) if isinstance(mask, str) else None,
+    )
+
+
+def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str) -> Camera:
+    def number(key: str, default: float | None = None) -> float | None:
+        value = frame.get(key, data.get(key, default))
+        try:
+            return None if value is None else float(value)
+        except (TypeError, ValueError):
+            raise UserError(f"{key} in {where} is not a number; correct the file.") from None
+
+    model = str(frame.get("camera_model", data.get("camera_model", "OPENCV")))
+    fisheye = model == "OPENCV_FISHEYE" or bool(frame.get("is_fisheye", data.get("is_fisheye")))
+    if model not in (*_PLAIN_MODELS, "OPENCV_FISHEYE"):
+        raise UserError(
+            f"The camera model {model} in {where} is not supported; undistort the pictures "
+            "(nerfstudio or colmap image_undistorter) and give the result."
+        )
+    width, height = number("w"), number("h")
+    if width is None or height is None:
+        # A picture that is missing gets a placeholder; it is left out later anyway.
+        header = picture_header(path) if path.is_file() else None
+        width, height = (header.width, header.height) if header else (1.0, 1.0)
+    fx, fy = number("fl_x"), number("fl_y")
+    if fx is None:
+        angle = number("camera_angle_x")
+        if angle is None and fy is None:
+            raise UserError(
+                f"{where} has neither fl_x nor camera_angle_x, so the focal length is unknown; "
+                "add one of them."
+            )
+        if angle is None:
+            fx = fy
+        else:
+            _check_angle(angle, where)
+            fx = 0.5 * width / math.tan(0.5 * angle)
+    if fy is None:
+        angle = number("camera_angle_y")
+        if angle is None or number("fl_x") is not None:
+            fy = fx
+        else:
+            _check_angle(angle, where)
+            fy = 0.5 * height / math.tan(0.5 * angle)
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
+    if not fisheye and number("k4", 0.0):
+        raise UserError(
+            f"{where} has k4 without a fisheye camera_model, which OpenCV's perspective model "
+            "lacks; undistort the pictures or name OPENCV_FISHEYE."
+        )
+    assert fx is not None and fy is not None
+    camera = Camera(
+        width=int(width) if math.isfinite(width) else 0,
+        height=int(height) if math.isfinite(height) else 0,
+        fx=fx,
+        fy=fy,
+        cx=number("cx", width / 2) or 0.0,
+        cy=number("cy", height / 2) or 0.0,
+        fisheye=fisheye,
+        **{n: number(n, 0.0) or 0.0 for n in names},
+    )
+    return checked_camera(camera, where)
+
+
+def _check_angle(angle: float, where: str) -> None:
+    if not 0 < angle < math.pi:
+        raise UserError(
+            f"The camera angle {angle:g} in {where} is not between 0 and pi radians, so the focal "
+            "length would be 0; correct the file."
+        )

@@ -1,0 +1,1 @@
+"""Evidence for geometry, computed once before a fit."""

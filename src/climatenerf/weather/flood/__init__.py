@@ -1,0 +1,1 @@
+"""Flood water: a level surface with waves, a body and a bed."""

@@ -1,0 +1,1 @@
+"""Smog, fog and haze: a medium that absorbs and glows."""

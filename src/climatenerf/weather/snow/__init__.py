@@ -1,0 +1,1 @@
+"""Fallen snow: metaballs on upward surfaces."""

@@ -1,0 +1,197 @@
+"""Fallen snow: metaballs on upward surfaces, as matter that the renderer can march through.
+
+ClimateNeRF, sections "Snow Simulation" and "Bake Editing": balls of density on a lattice, weighted
+by where the field shows surfaces that face the falling snow, summed with a compact kernel; the
+surface lies where the sum crosses a threshold. Instead of a trained network there is an explicit
+sparse grid (`snow_lattice`), filled by rays along the fall direction (`snow_bake`).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from climatenerf.core.device import array_of, placed
+from climatenerf.core.samples import Samples
+from climatenerf.ops.cpu import metaballs
+from climatenerf.ops.cpu.metaballs import THRESHOLD, Lattice
+from climatenerf.weather.parameters import Snow
+from climatenerf.weather.snow.deposition import Light, SnowField, find_deposits
+from climatenerf.weather.snow.lattice import Deposits, SnowGrid, choose_grid, grow
+
+
+@dataclass(frozen=True)
+class BakedSnow:
+    """Snow lying on a scene."""
+
+    lattice: Lattice
+    deposits: Deposits
+    snow: Snow
+    light: Light
+    floor_z: float | None = None
+    """There is no snow below this height (a water level), m."""
+
+    def with_depth(self, depth: float) -> "BakedSnow":
+        """The same places under another depth of snow, m; takes no look at the field."""
+        snow = replace(self.snow, depth=depth)
+        return replace(self, lattice=grow(self.deposits, depth), snow=snow)
+
+    def above(self, floor_z: float | None) -> "BakedSnow":
+        """The same snow, gone below a height (m)."""
+        return replace(self, floor_z=floor_z)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the lattice, bytes."""
+        return sum(part.nbytes for part in self.lattice)
+
+    def march(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        t_max: Float[Tensor, "n"],
+    ) -> Samples:
+        """Samples of the snow along rays, until they are opaque.
+
+        Args:
+            rays_o: origins, m.
+            rays_d: unit directions.
+            t_min: where each ray begins, m.
+            t_max: where it ends, m; may be infinite.
+
+        Returns:
+            Samples with extinction in 1/m; a handful a ray.
+        """
+        if self.floor_z is not None:
+            t_min, t_max = _cut(rays_o, rays_d, t_min, t_max, self.floor_z)
+        offsets, t, dt, sigma = metaballs.march(
+            _array(rays_o), _array(rays_d), _array(t_min), _array(t_max), self.lattice
+        )
+        return Samples(
+            placed(offsets),
+            placed(t),
+            placed(dt),
+            placed(sigma),
+        )
+
+    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Extinction O of the snow at points (m), 1/m."""
+        density = placed(metaballs.evaluate(_array(x), self.lattice)[2][:, 2])
+        return density if self.floor_z is None else density * (x[:, 2] >= self.floor_z)
+
+    def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Outward unit normal, from the analytic gradient of the sum; up where there is none."""
+        gradient = placed(metaballs.evaluate(_array(x), self.lattice)[1])
+        return _normal(gradient)
+
+    def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Linear radiance of the snow at points (m), the same in all directions.
+
+        White diffuse snow in the open under the scene's own light, darkened a little over dark
+        ground and more in the sun's shadow, with wrap lighting (n.l + gamma)/(1 + gamma).
+        """
+        _, gradient, rest = metaballs.evaluate(_array(x), self.lattice)
+        sun = self.light.sun_direction
+        towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
+        facing = _normal(placed(gradient)) @ torch.tensor(towards, dtype=torch.float32)
+        # Negative only for a wrap below 1, on the side that faces away.
+        wrap = ((facing + self.snow.wrap) / (1 + self.snow.wrap)).clamp(min=0)
+        shade = placed(rest[:, 1])
+        white = torch.tensor(self.light.irradiance_over_pi, dtype=torch.float32)
+        return (shade * wrap)[:, None] * white
+
+    def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
+        return placed(metaballs.evaluate(_array(x), self.lattice)[2][:, 0]).clamp(min=0)
+
+    def depth_over(self, ground: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Thickness of the snow over points of the ground (m), m; 0 where it is bare."""
+        # From well above the ground the balls can carry, down to just below it.
+        reach = 1.5 * (self.snow.depth or 0.0) + 2 * float(self.lattice.spacing[0])
+        origin = ground + torch.tensor([0.0, 0.0, reach])
+        down = torch.tensor([0.0, 0.0, -1.0]).expand_as(origin)
+        zero = torch.zeros(len(ground))
+        samples = self.march(origin, down, zero, zero + reach)
+        ray = samples.ray_index()
+        depth = (samples.sigma * samples.dt).double()
+        before = torch.cat([depth.new_zeros(1), depth.cumsum(0)])
+        through = before[:-1] - before[samples.offsets[:-1]][ray]
+        weight = torch.exp(-through) * -torch.expm1(-depth)
+        total = torch.zeros(len(ground), dtype=torch.float64).index_add_(0, ray, weight)
+        moment = torch.zeros_like(total).index_add_(0, ray, weight * samples.t)
+        height = reach - moment / total.clamp(min=1e-9)  # no snow: 0 / 0
+        return torch.where(total > 0.5, height, 0.0).float()
+
+    def covered(self, ground: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether points of the ground (m) lie under snow."""
+        sums = placed(metaballs.evaluate(_array(ground), self.lattice)[0])
+        return (sums > THRESHOLD) & (self.density(ground) > 0)
+
+
+def bake_snow(
+    field: SnowField,
+    snow: Snow,
+    cameras: Float[np.ndarray, "m 3"],
+    irradiance_over_pi: Float[np.ndarray, "3"],
+    sun_direction: Float[np.ndarray, "3"] | None = None,
+    seed: int = 0,
+    grid: SnowGrid | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> BakedSnow | None:
+    """Let snow fall on a scene. World frame: metres, z up.
+
+    Args:
+        field: the fitted field (unstylised), without geometry that cannot be trusted.
+        snow: depth, fall direction, slope, colour.
+        cameras: camera positions of the path, m; the snow is finest around them.
+        irradiance_over_pi: linear radiance that a white horizontal surface in the open would have.
+        sun_direction: unit vector towards the sun; None: diffuse light only.
+        seed: of the fall direction's spread.
+        grid: where snow is simulated and how finely; None: chosen from bounds and cameras.
+        progress: called with the share that is done, 0 to 1.
+
+    Returns:
+        The snow; None where the depth asks for none.
+    """
+    if snow.depth is None or snow.depth <= 0:
+        return None
+    cameras = np.asarray(cameras, np.float64).reshape(-1, 3)
+    light = Light(np.asarray(irradiance_over_pi, np.float64), sun_direction)
+    if grid is None:
+        lower, upper = (array_of(b).astype(np.float64) for b in field.bounds)
+        grid = choose_grid(lower, upper, cameras)
+    with torch.no_grad():
+        deposits = find_deposits(field, snow, grid, light, cameras, seed, progress)
+    return BakedSnow(grow(deposits, snow.depth), deposits, snow, light)
+
+
+def _array(x: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(array_of(x), np.float32)
+
+
+def _normal(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    length = gradient.norm(dim=-1, keepdim=True)
+    up = torch.tensor([0.0, 0.0, 1.0])
+    return torch.where(length > 1e-6, -gradient / length.clamp(min=1e-6), up)
+
+
+def _cut(
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    t_min: Float[Tensor, "n"],
+    t_max: Float[Tensor, "n"],
+    floor_z: float,
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """The part of each ray that lies above a height."""
+    slope = rays_d[:, 2]
+    over = rays_o[:, 2] - floor_z
+    level = slope.abs() < 1e-9  # a level ray crosses nowhere: division by 0
+    crossing = -over / torch.where(level, torch.ones_like(slope), slope)
+    t_max = torch.where(~level & (slope < 0), torch.minimum(t_max, crossing), t_max)
+    t_min = torch.where(~level & (slope > 0), torch.maximum(t_min, crossing), t_min)
+    t_max = torch.where(level & (over < 0), t_min, t_max)
+    return t_min, t_max

@@ -1,0 +1,133 @@
+import errno
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from climatenerf.core import storage
+from climatenerf.core.errors import UserError
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_json_round_trip_of_everything_we_store(tmp_path):
+    @dataclass(frozen=True)
+    class Level:
+        metres: float
+
+    storage.write_json(
+        tmp_path / "deep" / "a.json",
+        {"x": np.float32(0.5), "m": np.eye(2), "p": Path("b"), "l": Level(1.0), "inf": np.inf},
+    )
+    assert storage.read_json(tmp_path / "deep" / "a.json") == {
+        "x": 0.5,
+        "m": [[1.0, 0.0], [0.0, 1.0]],
+        "p": "b",
+        "l": {"metres": 1.0},
+        "inf": None,
+    }
+    assert names(tmp_path / "deep") == ["a.json"]
+
+
+def test_failure_or_interrupt_leaves_old_file_and_no_rubbish(tmp_path):
+    path = tmp_path / "a.json"
+    storage.write_json(path, {"old": 1})
+    with pytest.raises(KeyboardInterrupt), storage.atomic_path(path) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".json"
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    with pytest.raises(TypeError):
+        storage.write_json(path, {"bad": object()})
+    assert json.loads(path.read_text()) == {"old": 1}
+    assert names(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_disk_full_is_one_clear_sentence(tmp_path, monkeypatch, code):
+    path = tmp_path / "a.bin"
+    storage.write_bytes(path, b"old")
+
+    def full(self, data):
+        self.touch()
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(UserError, match="disk is full"):
+        storage.write_bytes(path, b"new")
+    assert path.read_bytes() == b"old" and names(tmp_path) == ["a.bin"]
+
+
+def test_disk_full_inside_safetensors(tmp_path, monkeypatch):
+    import safetensors.numpy
+    from safetensors import SafetensorError
+
+    def full(*_):
+        raise SafetensorError("I/O error: No space left on device (os error 28)")
+
+    monkeypatch.setattr(safetensors.numpy, "save_file", full)
+    with pytest.raises(UserError, match="disk is full"):
+        storage.write_safetensors(tmp_path / "f.safetensors", {"a": np.zeros(3)})
+    assert names(tmp_path) == []
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="is a file, not a folder"):
+        storage.write_bytes(tmp_path / "file" / "a.bin", b"")
+    with pytest.raises(UserError, match="is a file, not a folder"):
+        storage.make_folder(tmp_path / "file")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(UserError, match="folder"):
+        storage.write_bytes(tmp_path / "folder", b"")
+    assert "no permission" in str(storage.explain(PermissionError(errno.EACCES, "x"), tmp_path))
+
+
+def test_safetensors_round_trip(tmp_path):
+    import torch
+
+    path = tmp_path / "f.safetensors"
+    storage.write_safetensors(path, {"a": torch.arange(6.0).reshape(2, 3).T}, {"schema": "1"})
+    arrays, metadata = storage.read_safetensors(path)
+    assert np.array_equal(arrays["a"], np.arange(6.0).reshape(2, 3).T) and metadata["schema"] == "1"
+    storage.write_safetensors(path, {"b": np.ones((2, 2), np.float32)})
+    assert storage.read_safetensors(path)[0].keys() == {"b"}
+    path.write_bytes(path.read_bytes()[:20])
+    with pytest.raises(UserError, match="damaged"):
+        storage.read_safetensors(path, "run")
+    with pytest.raises(UserError, match="does not exist"):
+        storage.read_safetensors(tmp_path / "none.safetensors", "run")
+
+
+@pytest.mark.parametrize(
+    "content, words",
+    [(b'{"a": 1', "line 1, column"), (b"[1]", "object"), (b"\xff\xfe\x00", "not text")],
+)
+def test_read_json_says_what_is_wrong(tmp_path, content, words):
+    path = tmp_path / "a.json"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        storage.read_json(path, "run")
+    assert str(path) in str(caught.value) and str(caught.value).startswith("run")
+    with pytest.raises(UserError, match="does not exist"):
+        storage.read_json(tmp_path / "b.json")
+
+
+def test_schema():
+    storage.check_schema(1, 2, "run x")
+    with pytest.raises(UserError, match="version 3.*up to 2.*upgrade"):
+        storage.check_schema(3, 2, "run x")
+    for bad in (None, "1", True, 0):
+        with pytest.raises(UserError, match="no schema"):
+            storage.check_schema(bad, 2, "run x")
+
+
+def test_new_files_have_ordinary_permissions(tmp_path):
+    storage.write_bytes(tmp_path / "a", b"")
+    (tmp_path / "b").write_bytes(b"")
+    storage.write_safetensors(tmp_path / "c", {"a": np.zeros(2)})
+    assert len({(tmp_path / name).stat().st_mode for name in "abc"}) == 1

@@ -1,0 +1,437 @@
+"""The path-traced truth itself: snow, water and layers of the street against closed forms."""
+
+import hashlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from tools.reference_street import publish, render, smog, snowfall, water  # noqa: E402
+from tools.reference_street.geometry import box, quad  # noqa: E402
+from tools.reference_street.layout import (  # noqa: E402
+    build_scene,
+    camera_poses,
+    ground_datum,
+    look,
+    measuring_poses,
+    passers_by,
+)
+from tools.reference_street.mirror import mirrored_view  # noqa: E402
+from tools.reference_street.objects import bench, fence, table  # noqa: E402
+from tools.reference_street.sky import SUN_AZIMUTH, SUN_ELEVATION, direction  # noqa: E402
+from tools.reference_street.terrain import DIP_AT, DIP_DEPTH, ground_height  # noqa: E402
+from tools.reference_street.textures import make  # noqa: E402
+from tools.reference_street.truth import TRAIN_IDS, layers, pixel_rays, sun_directions  # noqa: E402
+
+
+@pytest.fixture
+def yard(monkeypatch):
+    """A level yard of 6 m with a table, a roof of 42 degrees and one of 65."""
+    monkeypatch.setattr(snowfall, "RINGS", ((3.0, 3.0, 0.05),))
+    ground = quad((-3, -3, 0), (6, 0, 0), (0, 6, 0))
+    top = box((-2.0, -2.0, 0.7), (-1.0, -1.0, 0.75))
+
+    def roof(x, degrees):
+        run = 1.2 * np.cos(np.deg2rad(degrees))
+        rise = 1.2 * np.sin(np.deg2rad(degrees))
+        return quad((x, 0, 2.0), (run, 0, rise), (0, 2.0, 0))
+
+    return [ground, top, roof(-1.5, 42.0), roof(0.8, 65.0)]
+
+
+def mean_depth(cover, x0, x1, y0, y1):
+    rows, columns = cover.depth.shape
+    x = cover.x0 + cover.cell * np.arange(columns)
+    y = cover.y0 + cover.cell * np.arange(rows)
+    return cover.depth[(y > y0) & (y < y1)][:, (x > x0) & (x < x1)].mean()
+
+
+def test_snow_lies_where_it_can_and_none_is_lost(yard):
+    cover, _ = snowfall.snow_cover(yard, 0.15, 0)
+    assert mean_depth(cover, 1.8, 2.8, -2.5, -1.0) == pytest.approx(0.15, rel=0.04)
+    assert mean_depth(cover, -1.8, -1.2, -1.8, -1.2) == pytest.approx(0.15, rel=0.08), (
+        "on the table"
+    )
+    # EN 1991-1-3: roofs of 42 degrees keep (60 - 42) / 30 of it, those of 65 nothing.
+    assert mean_depth(cover, -1.3, -0.8, 0.5, 1.5) == pytest.approx(0.15 * 0.6, rel=0.12)
+    assert mean_depth(cover, 0.9, 1.2, 0.5, 1.5) < 0.002
+    # What slid off lies at the foot of the roofs.
+    assert mean_depth(cover, -1.9, -1.55, 0.3, 1.7) > 0.2
+    assert cover.depth.mean() == pytest.approx(0.15, rel=0.01)
+
+
+def test_nothing_lies_under_the_table(yard):
+    cover, _ = snowfall.snow_cover(yard, 0.15, 0)
+    mesh = snowfall.cover_mesh(cover, (0.0, 0.0))
+    corners = mesh.vertices[mesh.faces].mean(1)
+    under = (np.abs(corners[:, :2] + 1.5) < 0.4).all(1)
+    assert under.any() and corners[under, 2].min() > 0.75
+    tops = corners[(np.abs(corners[:, 0] - 2.3) < 0.4) & (np.abs(corners[:, 1] + 2) < 0.4)]
+    assert np.median(tops[:, 2]) == pytest.approx(0.15, rel=0.05)
+
+
+def test_snow_falls_through_a_crown_and_piles_up_nowhere(yard):
+    """Loose leaves over open ground: what they do not hold lies evenly below them."""
+    rng = np.random.default_rng(0)
+    leaves = []
+    for x, y in rng.uniform((-2.5, -2.8), (2.5, -0.2), (900, 2)):
+        steep = np.deg2rad(rng.uniform(0, 90))
+        side, down = (0.12, 0, 0), (0, 0.12 * np.cos(steep), -0.12 * np.sin(steep))
+        leaves.append(quad((x, y, rng.uniform(2.0, 3.0)), side, down).tagged("l", "", "vegetation"))
+    below, held = snowfall.snow_cover([yard[0], *leaves], 0.15, 0)
+    under = mean_depth(below, -2.0, 2.0, -2.5, -0.5)
+    assert 0.04 < under < 0.13, "less than in the open, but not bare"
+    assert below.depth.max() < 0.25, "no towers in the gaps"
+    assert held.depth.max() > 0.05
+    assert below.depth.mean() + held.depth.mean() == pytest.approx(0.15, rel=0.02)
+
+
+def test_the_same_seed_lets_the_same_snow_fall(yard):
+    first, second = (snowfall.snow_cover(yard, 0.05, 0)[0].depth for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_waves_of_the_mesh_are_the_programs_own(tmp_path):
+    from climatenerf.weather.flood.waves import at_time, heights, make_waves, slopes
+    from climatenerf.weather.parameters import Flood
+
+    water.wavy(5.0, 1.0, tmp_path)
+    raw = (tmp_path / "water.ply").read_bytes()
+    start = raw.index(b"end_header\n") + len(b"end_header\n")
+    (x0, x1), (y0, y1) = water.NEAR
+    columns, rows = round((x1 - x0) / water.STEP) + 1, round((y1 - y0) / water.STEP) + 1
+    table = np.frombuffer(raw, "<f4", rows * columns * 6, start).reshape(rows, columns, 6)
+    z, normal = table[..., 2].astype(float) - 5.0, table[..., 3:].astype(float)
+    inner = (slice(80, -80), slice(80, -80))  # beyond the calm border
+    slope_y, slope_x = np.gradient(z, water.STEP)
+    analytic = -normal[..., :2] / normal[..., 2:]
+    wanted = np.stack([slope_x, slope_y], -1)
+    error = np.sqrt(((analytic - wanted)[inner] ** 2).mean())
+    assert error < 0.25 * np.sqrt((analytic[inner] ** 2).mean()), "differences blur short waves"
+    waves = make_waves(
+        Flood(level=0.0, wind_speed=water.WIND, wave_scale=water.WAVE_SCALE), water.SEED
+    )
+    x, y = np.meshgrid(x0 + water.STEP * np.arange(80, 300), y0 + water.STEP * np.arange(80, 300))
+    places = torch.from_numpy(np.stack([x.ravel(), y.ravel()], -1)).float()
+    own = analytic[80:300, 80:300].reshape(-1, 2)
+    for time, same in ((1.0, True), (1.5, False)):
+        found = slopes(at_time(waves, time), places, torch.zeros(len(places)))[0].numpy()
+        share = ((found - own) ** 2).mean() / (own**2).mean()
+        assert (share < 0.01) == same, (time, share)
+    spread = np.sqrt(sum(float(heights(waves, i, 1.0).var()) for i in range(len(waves.tiles))))
+    assert z[inner].std() == pytest.approx(spread, rel=0.25)
+    assert abs(z[0]).max() < 1e-5 and abs(z[:, -1]).max() < 1e-5, "calm at the border"
+
+
+def test_tables_repeat_and_are_met_at_their_points():
+    values = np.random.default_rng(0).normal(size=(8, 8))
+    x, y = np.meshgrid(np.arange(8) * 0.25, np.arange(8) * 0.25)
+    np.testing.assert_allclose(water.periodic(values, 2.0, x, y), values)
+    np.testing.assert_allclose(water.periodic(values, 2.0, x - 4.0, y + 2.0), values)
+    middle = water.periodic(values, 2.0, np.array([0.125]), np.array([0.0]))
+    assert middle[0] == pytest.approx((values[0, 0] + values[0, 1]) / 2)
+
+
+def test_sun_rays_fill_its_core():
+    rays, sun = sun_directions(), direction(SUN_AZIMUTH, SUN_ELEVATION)
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1)
+    angles = np.degrees(np.arccos(rays @ sun))
+    assert angles.max() < 12.5 and angles.min() < 5
+    assert np.degrees(np.arccos(rays.mean(0) @ sun / np.linalg.norm(rays.mean(0)))) < 2
+
+
+def test_test_views_stand_free_and_dry():
+    solid = np.concatenate(
+        [m.vertices for m in build_scene() if m.label not in ("road", "terrain")]
+    )
+    near = solid[np.abs(solid[:, :2]).max(1) < 18]
+    taken = np.stack([pose[:3, 3] for _, pose in camera_poses()])
+    for name, pose in measuring_poses():
+        assert np.linalg.norm(near - pose[:3, 3], axis=-1).min() > 0.3, name
+        assert pose[2, 3] > ground_datum()[0] + 0.6 + 0.3, "above the high flood"
+        away = np.linalg.norm(taken - pose[:3, 3], axis=-1).min()
+        assert 0.05 < away < 3.0, "between the photos, and none of them"
+
+
+def test_new_things_are_where_they_are_said_to_be():
+    top = table()[0].vertices
+    assert ground_height(-6.35, 2.45) + 0.74 < top[:, 2].max() < ground_height(-6.35, 2.45) + 0.76
+    pickets = fence()[0].vertices
+    assert pickets[:, 0].min() > 5.4 and pickets[:, 0].max() < 5.7
+    assert bench()[0].vertices[:, 2].max() < 3
+    ring = [ground_height(DIP_AT[0] + 2.5 * np.cos(a), DIP_AT[1]) for a in (0, np.pi)]
+    assert np.mean(ring) - ground_height(*DIP_AT) > 0.6 * DIP_DEPTH
+
+
+def test_people_pass_in_some_pictures_and_never_stand_still():
+    seen = [passers_by(i) for i in range(64)]
+    assert 15 < sum(bool(s) for s in seen) < 40
+    walkers = [s[0].vertices.mean(0) for s in seen[2:16]]
+    steps = np.linalg.norm(np.diff(walkers, axis=0)[:, :2], axis=1)
+    assert steps.min() > 0.5
+    for someone in seen:
+        for mesh in someone:
+            assert mesh.label == "person"
+        if someone:
+            low = min(mesh.vertices[:, 2].min() for mesh in someone)
+            x, y = someone[0].vertices[:, :2].mean(0)
+            assert abs(low - ground_height(x, y)) < 0.16  # one foot may be off the kerb
+
+
+REFERENCE = ROOT / "reference" / "street"
+
+
+def test_the_set_on_disk_is_whole():
+    for folder in (
+        REFERENCE,
+        publish.beside(REFERENCE, "busy"),
+        publish.beside(REFERENCE, "turned"),
+    ):
+        lines = (folder / "SHA256SUMS").read_text().splitlines()
+        assert len(lines) >= 3
+        for line in lines:
+            wanted, name = line.split("  ")
+            assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == wanted, name
+        there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+        assert there == {line.split("  ")[1] for line in lines} | {"SHA256SUMS"}
+    total = sum(p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file())
+    assert total < 30e6
+
+
+def test_the_set_reads_as_a_capture_and_as_the_truth():
+    from climatenerf.evaluation.reference import read_reference
+    from climatenerf.scene import read_scene
+
+    for variant in ("", "-busy", "-turned"):
+        folder = REFERENCE.with_name(REFERENCE.name + variant)
+        scene = read_scene(folder)
+        assert len(scene.of_split("train")) == 64 and len(scene.of_split("heldout")) == 6
+        reference = read_reference(folder)
+        assert len(reference.truths) == 6 and len(reference.weathers) == 9
+    kinds = {kind.name: kind for kind in reference.weathers}
+    truth = reference.truths[0]
+    assert kinds["flood-low"].weather.at(0).flood.level == 0.25
+    assert kinds["flood-waves"].time == publish.WAVE_TIME
+    deep = kinds["snow-deep"].layers(truth.name)
+    lies = deep["thickness"] > 0.005
+    road = lies & (truth.label == TRAIN_IDS["road"]) & (truth.depth < 20)
+    assert np.median(deep["thickness"][road]) == pytest.approx(0.15, rel=0.1)
+    # Snow is only ever nearer than what it lies on.
+    assert (deep["depth"] < truth.depth + 1e-3)[~truth.sky].all()
+    clean = render.encode(truth.clean).astype(float)
+    smoggy = kinds["smog-far"].picture(truth.name).astype(float)
+    dim = kinds["smog-near"].picture(truth.name).astype(float)
+    assert np.abs(dim - clean).mean() > 2 * np.abs(smoggy - clean).mean()
+
+
+def test_the_turned_variant_can_be_levelled_and_measured():
+    from climatenerf.scene import read_scene
+    from climatenerf.scene.alignment.known_length import apply_known_lengths, measure
+
+    scene = read_scene(publish.beside(REFERENCE, "turned"))
+    turn = np.eye(4)
+    turn[:3, :3] = publish.SHRUNK * publish._rotation(*publish.TURN)
+    turn[:3, 3] = publish.SHIFT
+    up = (scene.world_from_input @ turn)[:3, 2]
+    assert np.degrees(np.arccos(up[2] / np.linalg.norm(up))) < 0.5
+    # A wall whose length is known, marked in the pictures that see both its ends.
+    ends = {"from": np.array([-10.5, -6.5, 1.0, 1.0]), "to": np.array([-10.5, 1.5, 1.0, 1.0])}
+    marks = {"from": {}, "to": {}}
+    rng = np.random.default_rng(0)
+    for view in scene.of_split("train"):
+        camera = scene.cameras[view.camera]
+        local = {k: np.linalg.inv(view.c2w) @ (turn @ p) for k, p in ends.items()}
+        if min(p[2] for p in local.values()) < 0.5:
+            continue
+        pixels = {k: camera.project(p[:3]) for k, p in local.items()}
+        if all(
+            (q > 0).all() and (q < (camera.width, camera.height)).all() for q in pixels.values()
+        ):
+            for end, pixel in pixels.items():
+                marks[end][view.name] = tuple(pixel + rng.normal(0, 0.5, 2))
+    assert len(marks["from"]) >= 3
+    measured = measure(scene, {"WALL": marks}, "WALL", 8.0)
+    scaled = apply_known_lengths(scene, [measured])
+    assert np.cbrt(np.linalg.det((scaled.world_from_input @ turn)[:3, :3])) == pytest.approx(
+        1.0, abs=0.01
+    )
+    # The datum: cameras stand as high above it as above the true ground.
+    heights = {Path(v.name).name: scaled.c2w_world(v)[2, 3] - scaled.ground_z for v in scaled.views}
+    true = {name: pose[2, 3] - ground_datum()[0] for name, pose in camera_poses()}
+    assert len(true) == 64
+    assert max(abs(heights[name] - true[name]) for name in true) < 0.05
+
+
+# From here on with the path tracer.
+
+
+@pytest.mark.slow
+def test_layers_agree_with_the_ground_and_with_each_other(tmp_path):
+    pytest.importorskip("mitsuba")
+    from tools.reference_street.render import load
+
+    meshes = build_scene()
+    scene = load(meshes, tmp_path, named=True)
+    name, pose = measuring_poses()[5]
+    truth = layers(scene, meshes, pose, 96, 54)
+    focal = 48 / np.tan(np.deg2rad(34.0))
+    x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
+    local = np.stack([(x - 48) / focal, (y - 27) / focal, np.ones_like(x)], -1)
+    rays = (local / np.linalg.norm(local, axis=-1, keepdims=True)) @ pose[:3, :3].T
+    road = truth["label"] == TRAIN_IDS["road"]
+    assert road.mean() > 0.2
+    points = pose[:3, 3] + truth["depth"][road, None] * rays[road]
+    assert np.abs(points[:, 2] - ground_height(points[:, 0], points[:, 1])).max() < 0.03
+    # Normals are those of the planes through neighbouring points.
+    whole = pose[:3, 3] + np.where(road, truth["depth"], 0)[..., None] * rays
+    across, down = whole[1:-1, 2:] - whole[1:-1, :-2], whole[2:, 1:-1] - whole[:-2, 1:-1]
+    plane = np.cross(down, across)
+    plane /= np.maximum(np.linalg.norm(plane, axis=-1, keepdims=True), 1e-9)
+    flat = road[1:-1, 1:-1] & road[1:-1, 2:] & road[1:-1, :-2] & road[2:, 1:-1] & road[:-2, 1:-1]
+    cosine = np.abs((plane * truth["normal"][1:-1, 1:-1]).sum(-1))[flat]
+    assert np.median(np.degrees(np.arccos(np.clip(cosine, 0, 1)))) < 1.0
+    sky = truth["label"] == TRAIN_IDS["sky"]
+    assert (np.isinf(truth["depth"]) == sky).all() and (truth["normal"][sky] == 0).all()
+    assert ((truth["sun"] >= 0) & (truth["sun"] <= 1)).all() and truth["sun"][road].mean() > 0.3
+
+
+def fresnel(cosine, n=1.333):
+    """Unpolarised reflectance of a smooth surface, from the equations in every textbook."""
+    inside = np.sqrt(1 - (1 - cosine**2) / n**2)
+    s = ((cosine - n * inside) / (cosine + n * inside)) ** 2
+    p = ((inside - n * cosine) / (inside + n * cosine)) ** 2
+    return 0.5 * (s + p), inside
+
+
+@pytest.mark.parametrize("degrees", [10.0, 45.0, 75.0])
+def test_traced_water_obeys_fresnel_and_beer(degrees):
+    """A black bed shows the mirrored sky alone; a shining bed what Beer and Lambert leave of it."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    depth, height = 0.8, 1.0
+    theta = np.deg2rad(degrees)
+    flat = mi.ScalarTransform4f()
+    target = [height * np.tan(theta), 0, 0]
+    sensor = {
+        "type": "perspective", "fov": 0.2, "near_clip": 0.01,
+        "to_world": flat.look_at(origin=[0, 0, height], target=target, up=[0, 1, 0]),
+        "film": {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}},
+        "sampler": {"type": "independent", "sample_count": 4096},
+    }  # fmt: skip
+    bed_place = flat.translate([0, 0, -depth]).scale([250, 250, 1])
+    reflected, inside = fresnel(np.cos(theta))
+
+    def seen(bed, sky):
+        scene = {
+            "type": "scene", "integrator": {"type": "volpath", "max_depth": 12, "rr_depth": 8},
+            "sensor": sensor, "water": water.still(0.0),
+            "bed": {"type": "rectangle", "to_world": bed_place, **bed},
+        }  # fmt: skip
+        if sky:
+            scene["sky"] = {"type": "constant", "radiance": 1.0}
+        return float(np.array(mi.render(mi.load_dict(scene), seed=1))[..., :3].mean())
+
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    assert seen({"bsdf": black}, sky=True) == pytest.approx(reflected, abs=0.003)
+    shining = {"bsdf": black, "emitter": {"type": "area", "radiance": 1.0}}
+    left = (1 - reflected) * np.exp(-water.ABSORPTION * depth / inside) / water.IOR**2
+    assert seen(shining, sky=False) == pytest.approx(left, abs=0.004)
+
+
+def test_smog_without_fall_off_is_exponential_and_haze_is_summed_right():
+    depth, rise = np.array([[10.0, 200.0, np.inf]]), np.array([[0.0, 0.1, 0.5]])
+    even = smog.transmittance("smog-mid", depth, 1.7, rise, 0.1)
+    np.testing.assert_allclose(even, 0.05 ** (depth / 120.0))
+    hazy = smog.transmittance("haze", depth, 1.7, rise, 0.1)
+    sigma, falloff = -np.log(0.05) / 60.0, 5.0
+    level = np.exp(-sigma * 10.0 * np.exp(-1.6 / falloff))
+    up = np.exp(-sigma * np.exp(-1.6 / falloff) * falloff / 0.5)
+    assert hazy[0, 0] == pytest.approx(level, rel=1e-4)
+    assert hazy[0, 2] == pytest.approx(up, rel=2e-3)
+    # Down from 1.7 m to the base at 0.1 m and on through what is even there.
+    low = smog.transmittance("haze", np.array([[20.0]]), 1.7, np.array([[-0.2]]), 0.1)
+    above = falloff * (1 - np.exp(-1.6 / falloff)) / 0.2
+    assert low[0, 0] == pytest.approx(np.exp(-sigma * (above + 12.0)), rel=1e-3)
+    white = smog.smoggy(np.zeros((1, 1, 3)), np.zeros((1, 1)))
+    assert np.abs(render.encode(white)[0, 0] / 255 - smog.COLOUR).max() < 0.003
+
+
+@pytest.mark.slow
+def test_true_smog_agrees_with_an_absorbing_medium_in_the_path_tracer(tmp_path):
+    """The street's surfaces shine with their own colours, in air that only absorbs."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    sigma, samples, width, height = -np.log(0.05) / 40.0, 400, 96, 54
+    air = mi.load_dict({"type": "homogeneous", "sigma_t": sigma, "albedo": 0.0})
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    content = {"type": "scene", "integrator": {"type": "volpath", "max_depth": 2}}
+    meshes = build_scene()
+    textures = {}
+    for mesh in meshes:
+        if mesh.texture not in textures:
+            bitmap = mi.Bitmap(make(mesh.texture))
+            textures[mesh.texture] = mi.load_dict({"type": "bitmap", "bitmap": bitmap})
+        path = tmp_path / f"{mesh.name}.ply"
+        render.write_ply(mesh, path)
+        content[mesh.name.replace(".", "_")] = {
+            "type": "ply", "filename": str(path), "bsdf": {"type": "twosided", "own": black},
+            "emitter": {"type": "area", "radiance": textures[mesh.texture]},
+        }  # fmt: skip
+    clear = mi.load_dict(content)
+    place = mi.ScalarTransform4f().scale([500, 500, 300])
+    box = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": air}
+    smoky = mi.load_dict(content | {"air": box})
+    pose = measuring_poses()[0][1]
+    dry = render.render_view(clear, pose, width, height, samples, 0)[..., :3]
+    seen = render.render_view(smoky, pose, width, height, samples, 1, air=air)[..., :3]
+    fine = layers(render.load(meshes, tmp_path, named=True), meshes, pose, width, height)
+    passed = smog.transmittance("smog-near", fine["depth"], 0.0, np.zeros((height, width)), 0.0)
+    # One ray's depth stands for a pixel only where its surroundings are about as far.
+    depth = np.pad(fine["depth"], 1, mode="edge")
+    around = np.stack([depth[i : i + height, j : j + width] for i in range(3) for j in range(3)])
+    flat = np.isfinite(around).all(0) & (around.max(0) < 1.2 * around.min(0)) & (dry.sum(-1) > 0.05)
+    assert flat.mean() > 0.25
+    wanted = (dry * passed[..., None])[flat]
+    noise = dry[flat] * np.sqrt(passed * (1 - passed) / samples)[flat][:, None]
+    apart = seen[flat] - wanted
+    assert abs(apart.mean()) < 0.01 * wanted.mean()
+    assert np.sqrt((apart**2).mean()) < 2.0 * np.sqrt((noise**2).mean())
+
+
+def test_the_mirror_shows_what_a_mirrored_camera_sees():
+    """A ball beside the axis under a sky that is dark below: Mitsuba's own camera, mirrored."""
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("scalar_rgb")
+    sky = np.zeros((32, 64, 3), np.float32)
+    sky[:16] = [0.4, 0.6, 0.9]
+    red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.2, 0.1]}}
+    turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 3},
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky), "to_world": turn},
+        "ball": {"type": "sphere", "center": [0.6, 4.0, 0.9], "radius": 0.5, "bsdf": red},
+    })  # fmt: skip
+    pose, level = look(np.array([0.0, 0.0, 1.6]), 3.0, -30.0), 0.2
+    seen = mirrored_view(scene, pose, level, (64, 36), 64, 0)
+    flip = np.diag([1.0, 1.0, -1.0, 1.0])
+    flip[2, 3] = 2 * level
+    wanted = render.render_view(scene, flip @ pose, 64, 36, 256, 1)[..., :3]
+    dry = render.render_view(scene, pose, 64, 36, 256, 1)[..., :3]
+    rays = pixel_rays(pose, 64, 36)
+    t = (level - pose[2, 3]) / np.minimum(rays[..., 2], -1e-9)
+    assert (rays[..., 2] < 0).all()
+    ball = dry[..., 0] > 1.2 * dry[..., 2]  # seen directly, before the mirror
+    grown = np.pad(ball, 1)
+    beside = ~(grown[1:-1, 1:-1] | grown[:-2, 1:-1] | grown[2:, 1:-1] | grown[1:-1, :-2])
+    beside &= ~grown[1:-1, 2:]
+    assert 0.02 < ball.mean() < 0.5 and np.isfinite(t).all()
+    apart = np.abs(seen - wanted).max(-1)[beside]
+    assert np.median(apart) < 0.02 and (apart < 0.12).mean() > 0.97
+    red_there = (wanted[..., 0] > 1.2 * wanted[..., 2]) & beside
+    assert red_there.mean() > 0.02, "the mirrored ball is in the picture"
+    assert np.abs(seen - wanted).max(-1)[red_there].mean() < 0.05

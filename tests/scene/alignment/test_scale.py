@@ -1,0 +1,101 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.scene_builders import look_at
+
+from climatenerf.scene import Camera, Scene, View, read_scene, save_scene
+from climatenerf.scene.alignment.scale import (
+    by_camera_height,
+    by_depth,
+    rescaled,
+    scale_warnings,
+    scale_words,
+    with_witness,
+)
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Nine cameras 1.6 m above a plane of points, heading turned away from the axes."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.uniform(-12, 12, (4000, 2)), np.zeros((4000, 1))], axis=1)
+    views = []
+    for i in range(9):
+        path = tmp_path / f"{i}.png"
+        from PIL import Image
+
+        Image.new("RGB", (64, 48)).save(path)
+        pose = look_at((i - 4.0, -6.0, 1.6), (i - 4.0, 0.0, 0.0))
+        local = (points - pose[:3, 3]) @ pose[:3, :3]
+        x, y = CAMERA.project(np.where(local[:, 2:] > 0.1, local, [0, 0, 1.0])).T
+        inside = (local[:, 2] > 0.1) & (x > 0) & (y > 0) & (x < 64) & (y < 48)
+        views.append(View(path.name, path, 0, pose, seen=np.flatnonzero(inside)))
+    return Scene(
+        tmp_path, "test", (CAMERA,), tuple(views), points, scale_source="gps", scale_error=0.02,
+        lowest_ground_z=-1.0, scale_report={"camera-height-assumed": {"times": 1.2, "error": 0.3}},
+    )  # fmt: skip
+
+
+def test_all_evidence_is_told_in_the_metres_that_are_used(scene):
+    out = rescaled(scene, 2.0, "known-length", 0.01)
+    assert out.scale == pytest.approx(2) and out.lowest_ground_z == -2
+    assert out.scale_report == {
+        "camera-height-assumed": {"times": 0.6, "error": 0.3},
+        "gps": {"times": 0.5, "error": 0.02},
+    }
+    back = rescaled(out, 0.5, "gps", 0.02)
+    assert back.scale == pytest.approx(1) and "gps" not in back.scale_report
+    assert back.scale_report["known-length"]["times"] == pytest.approx(2)
+    words = scale_words(out)
+    assert "known-length (+-1%)" in words and "gps says 0.50 times that (+-2%)" in words
+
+
+def test_only_what_errors_do_not_explain_is_warned_of(scene):
+    assert scale_warnings(scene) == []
+    told = scale_warnings(with_witness(scene, "depth files", 1.3, 0.02))
+    assert len(told) == 1 and told[0].startswith("depth files makes the scene 1.30 times")
+
+
+def test_camera_height_keeps_the_heading_of_a_scene_that_is_level(scene, tmp_path):
+    turn = np.eye(4)
+    turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
+    turned = replace(scene, world_from_input=turn, georeference={"latitude": 47.0})
+    out = by_camera_height(turned, 3.2)
+    assert out is not None and out.scale == pytest.approx(2, rel=0.01)
+    assert out.scale_source == "camera-height"
+    assert out.scale_report["gps"]["times"] == pytest.approx(0.5, rel=0.01)
+    np.testing.assert_allclose(out.world_from_input[:3, :3] / out.scale, turn[:3, :3], atol=1e-9)
+    assert by_camera_height(replace(scene, points=None), 3.2) is None
+    # The same through the reader, of a scene folder.
+    save_scene(turned, tmp_path)
+    again = read_scene(tmp_path, camera_height=3.2)
+    assert again.georeference == {"latitude": 47.0}
+    np.testing.assert_allclose(again.world_from_input, out.world_from_input, atol=1e-4)
+    assert again.scale_report.keys() == out.scale_report.keys()
+
+
+def depths(scene, folder, of):
+    """Depth files whose value is `of(z)` at each point that a view shows."""
+    views = []
+    for view in scene.views:
+        local = (scene.points[view.seen] - view.c2w[:3, 3]) @ view.c2w[:3, :3]
+        x, y = CAMERA.project(local).T.astype(int)
+        depth = np.zeros((48, 64), np.float32)
+        depth[y, x] = of(local[:, 2])
+        np.save(folder / f"{view.name}.npy", depth)
+        views.append(replace(view, depth_path=folder / f"{view.name}.npy"))
+    return replace(scene, views=tuple(views))
+
+
+def test_depth_files_that_measure_say_how_large_the_scene_is(scene, tmp_path):
+    said = by_depth(depths(scene, tmp_path, lambda z: 1.3 * z))
+    # Points that share a pixel are at slightly different depths.
+    assert said is not None and said[0] == pytest.approx(1.3, rel=0.01) and said[1] < 0.03
+
+
+def test_relative_depths_say_nothing_of_size(scene, tmp_path):
+    assert by_depth(depths(scene, tmp_path, lambda z: 8 / z)) is None
+    assert by_depth(scene) is None

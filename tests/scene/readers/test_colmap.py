@@ -1,0 +1,223 @@
+import shutil
+import struct
+
+import numpy as np
+import pytest
+from support.scene_builders import PINHOLE, names_of, ring, write_colmap, write_images
+
+from climatenerf.core.errors import UserError
+from climatenerf.scene import read_scene
+from climatenerf.scene.readers.colmap import camera_from_params, read_colmap
+
+POINTS = [(0.5, 1.5, -2.5), (1.0, 2.0, 3.0)]
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize("sub", ["sparse/0", "sparse", "sparse/3", "colmap/sparse/0"])
+def test_poses_intrinsics_and_points(tmp_path, binary, sub):
+    poses = ring(5)
+    write_colmap(tmp_path / sub, poses, names_of(5), points=POINTS, binary=binary)
+    write_images(tmp_path / "images", names_of(5))
+    capture = read_colmap(tmp_path)
+    for pose, view in zip(poses, capture.views, strict=True):
+        np.testing.assert_allclose(view.c2w, pose, atol=1e-9)
+        assert view.path.is_file()
+    camera = capture.cameras[capture.views[0].camera]
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (32, 24, 30.0, 31.0)
+    assert capture.points is not None
+    np.testing.assert_allclose(capture.points, POINTS)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_pictures_know_the_points_that_they_show(tmp_path, binary):
+    """Their features name point 3, and one feature none; ids are not rows."""
+    points = [(float(i), 0.0, 0.0) for i in range(6)]
+    model = tmp_path / "sparse/0"
+    write_colmap(model, ring(4), names_of(4), points=points, binary=binary)
+    write_images(tmp_path / "images", names_of(4))
+    views = read_colmap(tmp_path).views
+    assert [list(v.seen) for v in views] == ([[3]] * 4 if binary else [[3], [], [3], []])
+    write_colmap(model, ring(4), names_of(4), points=points[:3], binary=binary)
+    assert not any(len(v.seen) for v in read_colmap(tmp_path).views), "point 3 is not there"
+    if not binary:
+        lines = (model / "points3D.txt").read_text().splitlines()
+        (model / "points3D.txt").write_text("\n".join([f"3 7 8 9 {lines[1][2:]}", *lines[2:]]))
+        capture = read_colmap(tmp_path)
+        assert [list(capture.points[v.seen]) for v in capture.views[:1]][0][0].tolist() == [7, 8, 9]
+
+
+def test_centre_is_minus_rt_t_and_w_comes_first(tmp_path):
+    # 90 degrees about z: q = (cos 45, 0, 0, sin 45); R x = y. Centre = -R^T t.
+    write_images(tmp_path / "images", names_of(3))
+    model = tmp_path / "sparse" / "0"
+    write_colmap(model, ring(3), names_of(3), binary=False)
+    half = repr(float(np.sqrt(0.5)))
+    lines = [f"{i} {half} 0 0 {half} 1 2 3 1 {n}\n" for i, n in enumerate(names_of(3))]
+    (model / "images.txt").write_text("\n".join(lines) + "\n")
+    pose = read_colmap(tmp_path).views[0].c2w
+    np.testing.assert_allclose(pose[:3, :3], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(pose[:3, 3], [-2, 1, -3], atol=1e-12)
+
+
+def test_binary_is_preferred(tmp_path):
+    write_images(tmp_path / "images", names_of(4))
+    write_colmap(tmp_path / "sparse/0", ring(4), names_of(4), binary=True)
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), binary=False)
+    assert len(read_colmap(tmp_path).views) == 4
+
+
+def test_largest_submodel_wins(tmp_path):
+    write_images(tmp_path / "images", names_of(10))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
+    write_colmap(tmp_path / "sparse/1", ring(7), names_of(10)[3:])
+    write_colmap(tmp_path / "sparse/10", ring(4), names_of(4))
+    capture = read_colmap(tmp_path)
+    assert len(capture.views) == 7
+    assert "0: 3, 1: 7, 10: 4" in capture.warnings[0]
+
+
+def test_model_folder_itself_finds_the_pictures(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
+    scene = read_scene(tmp_path / "sparse/0")
+    assert scene.root == tmp_path and len(scene.views) == 3
+
+
+def test_scaled_pictures_scale_the_intrinsics(tmp_path):
+    write_images(tmp_path / "images_2", names_of(3), size=(16, 12))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
+    scene = read_scene(tmp_path)
+    camera = scene.cameras[0]
+    assert (camera.width, camera.fx, camera.cy) == (16, 15.0, 6.0)
+    assert any("intrinsics are scaled" in w for w in scene.warnings)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "expected"),
+    [
+        ("SIMPLE_PINHOLE", [9, 4, 3], {"fx": 9, "fy": 9, "cx": 4, "cy": 3}),
+        ("SIMPLE_RADIAL", [9, 4, 3, 0.1], {"fy": 9, "k1": 0.1, "fisheye": False}),
+        ("RADIAL", [9, 4, 3, 0.1, 0.2], {"k1": 0.1, "k2": 0.2}),
+        ("OPENCV", [9, 8, 4, 3, 0.1, 0.2, 0.3, 0.4], {"fy": 8, "k2": 0.2, "p1": 0.3, "p2": 0.4}),
+        ("OPENCV_FISHEYE", [9, 8, 4, 3, 0.1, 0.2, 0.3, 0.4], {"k4": 0.4, "fisheye": True, "p1": 0}),
+        ("FULL_OPENCV", [9, 8, 4, 3, 0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], {"k3": 0.5, "p2": 0.4}),
+    ],
+)
+def test_models(model, params, expected):
+    camera = camera_from_params(model, 8, 6, params, "here")
+    assert {k: getattr(camera, k) for k in expected} == expected
+
+
+@pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "EUCM", "FULL_OPENCV"])
+def test_unsupported_model_is_named(model):
+    params = [1.0] * {"FOV": 5, "EUCM": 6}.get(model, 12)
+    with pytest.raises(UserError, match=f"{model}.*undistort"):
+        camera_from_params(model, 8, 6, params, "here")
+
+
+def test_unknown_model_id_in_binary(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    eucm = (1, "EUCM", 32, 24, (30.0, 30.0, 16.0, 12.0, 0.5, 1.0))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(eucm,))
+    with pytest.raises(UserError, match=r"id 16 .*undistort"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("keep", [0, 3, 0.5, 0.95])
+def test_truncated_binary_names_the_file(tmp_path, file, keep):
+    write_images(tmp_path / "images", names_of(4))
+    write_colmap(tmp_path / "sparse/0", ring(4), names_of(4), points=POINTS)
+    path = tmp_path / "sparse/0" / file
+    data = path.read_bytes()
+    path.write_bytes(data[: keep if isinstance(keep, int) else int(keep * len(data))])
+    with pytest.raises(UserError, match=file):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_garbled_binary_names_the_file(tmp_path, file):
+    write_images(tmp_path / "images", names_of(4))
+    write_colmap(tmp_path / "sparse/0", ring(4), names_of(4), points=POINTS)
+    path = tmp_path / "sparse/0" / file
+    path.write_bytes(np.random.default_rng(3).bytes(len(path.read_bytes())))
+    with pytest.raises(UserError, match=file):
+        read_scene(tmp_path)
+
+
+def test_every_truncation_is_a_user_error(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "whole", ring(3), names_of(3), points=POINTS)
+    for file in ("cameras.bin", "images.bin"):
+        data = (tmp_path / "whole" / file).read_bytes()
+        for length in range(0, len(data), 11):
+            shutil.copytree(tmp_path / "whole", tmp_path / "sparse", dirs_exist_ok=True)
+            (tmp_path / "sparse" / file).write_bytes(data[:length])
+            with pytest.raises(UserError):
+                read_colmap(tmp_path)
+
+
+def test_garbled_text(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "sparse", ring(3), names_of(3), binary=False)
+    (tmp_path / "sparse/images.txt").write_text("1 0.5 what 0 0\n\n")
+    with pytest.raises(UserError, match=r"images\.txt"):
+        read_scene(tmp_path)
+
+
+def test_empty_model(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "sparse/0", [], [])
+    with pytest.raises(UserError, match="no posed picture"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("focal", [0.0, -5.0, float("nan")])
+def test_bad_focal_length(tmp_path, focal):
+    write_images(tmp_path / "images", names_of(3))
+    camera = (1, "PINHOLE", 32, 24, (focal, 30.0, 16.0, 12.0))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(camera,))
+    with pytest.raises(UserError, match="focal length|not finite"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_non_finite_pose(tmp_path, bad):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
+    path = tmp_path / "sparse/0/images.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, 8 + 4 + 5 * 8, bad)
+    path.write_bytes(bytes(data))
+    with pytest.raises(UserError, match=r"000\.png .* not finite"):
+        read_scene(tmp_path)
+
+
+def test_zero_quaternion(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
+    path = tmp_path / "sparse/0/images.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<4d", data, 8 + 4, 0, 0, 0, 0)
+    path.write_bytes(bytes(data))
+    with pytest.raises(UserError, match="zero quaternion"):
+        read_scene(tmp_path)
+
+
+def test_picture_with_unlisted_camera(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    write_colmap(tmp_path / "sparse", ring(3), names_of(3), binary=False)
+    text = (tmp_path / "sparse/cameras.txt").read_text().replace("1 PINHOLE", "7 PINHOLE")
+    (tmp_path / "sparse/cameras.txt").write_text(text)
+    with pytest.raises(UserError, match="camera 1, which"):
+        read_scene(tmp_path)
+
+
+def test_two_cameras(tmp_path):
+    write_images(tmp_path / "images", names_of(3))
+    other = (5, "SIMPLE_PINHOLE", 32, 24, (44.0, 16.0, 12.0))
+    write_colmap(tmp_path / "sparse", ring(3), names_of(3), (PINHOLE, other), binary=False)
+    text = (tmp_path / "sparse/images.txt").read_text().replace("1 001.png", "5 001.png")
+    (tmp_path / "sparse/images.txt").write_text(text)
+    scene = read_scene(tmp_path)
+    assert [scene.cameras[v.camera].fx for v in scene.views] == [30.0, 44.0, 30.0]

@@ -1,0 +1,92 @@
+"""mip-NeRF 360: COLMAP poses of `images/`, with the same pictures reduced in `images_2/4/8`."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.scene_builders import names_of, ring, seen_at, write_colmap, write_images
+
+from climatenerf.scene import load_image, read_scene
+from climatenerf.scene.images import load_labels
+
+FULL = (519, 337)
+QUARTER = (130, 84)  # rounded: 129.75 and 84.25; int() would make it 129
+F, CX, CY = 400.0, 260.0, 170.0
+EDGE = 260, 200  # first column and row of the labels' lower right part, full size
+POINT = np.array([0.9, -0.4, 1.9])
+MODELS = {
+    "SIMPLE_RADIAL": ((F, CX, CY, 0.05), (0.05, 0, 0, 0)),
+    "OPENCV": ((F, F, CX, CY, 0.05, -0.02, 0.003, -0.004), (0.05, -0.02, 0.003, -0.004)),
+}
+
+
+def make(root, folders, model="SIMPLE_RADIAL"):
+    write_colmap(root / "sparse/0", ring(9), names_of(9), ((1, model, *FULL, MODELS[model][0]),))
+    for folder, size in folders.items():
+        write_images(root / folder, names_of(9), size)
+
+
+def by_hand(pose, k):
+    """(x, y) in the full picture, by the formulas of OpenCV's lens model."""
+    x, y, z = (np.linalg.inv(pose) @ np.append(POINT, 1.0))[:3]
+    x, y = x / z, y / z
+    r2 = x * x + y * y
+    radial = 1 + k[0] * r2 + k[1] * r2 * r2
+    u = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x)
+    v = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y
+    return np.array([F * u + CX, F * v + CY])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_reduced_pictures_alone(tmp_path, model):
+    make(tmp_path, {"images_4": QUARTER}, model)
+    scene = read_scene(tmp_path)
+    assert [(c.width, c.height) for c in scene.cameras] == [QUARTER]
+    for pose, view in zip(ring(9), scene.views, strict=True):
+        wanted = by_hand(pose, MODELS[model][1]) * np.array(QUARTER) / FULL
+        np.testing.assert_allclose(seen_at(scene, view, POINT), wanted, atol=1e-6)
+        assert view.path.parent.name == "images_4"
+
+
+def test_the_full_pictures_are_preferred(tmp_path):
+    make(tmp_path, {"images_4": QUARTER, "images_8": (65, 42), "images": FULL})
+    scene = read_scene(tmp_path)
+    assert {v.path.parent.name for v in scene.views} == {"images"}
+    assert [(c.width, c.height) for c in scene.cameras] == [FULL] and not any(
+        "another size" in w for w in scene.warnings
+    )
+
+
+def test_the_sizes_of_the_garden_agree(tmp_path):
+    write_colmap(
+        tmp_path / "sparse/0",
+        ring(3),
+        names_of(3),
+        ((1, "PINHOLE", 5187, 3361, (4e3, 4e3, 2e3, 1e3)),),
+    )
+    write_images(tmp_path / "images_4", names_of(3), (1297, 840))
+    camera = read_scene(tmp_path).cameras[0]
+    assert (camera.width, camera.height) == (1297, 840)
+    assert camera.cx == pytest.approx(2e3 * 1297 / 5187) and camera.fy == pytest.approx(
+        4e3 * 840 / 3361
+    )
+
+
+def test_labels_of_full_size_are_not_sheared(tmp_path):
+    """Read in rows of int(519 / 4) instead of 130 numbers, they would slant by a pixel a row."""
+    make(tmp_path, {"images_4": QUARTER})
+    labels = np.full(FULL[::-1], 10, dtype=np.uint8)
+    labels[EDGE[1] :, EDGE[0] :] = 2
+    (tmp_path / "labels").mkdir()
+    Image.fromarray(labels).save(tmp_path / "labels/000.png")
+    picture = np.where(labels == 2, 250, 5).astype(np.uint8)
+    small = Image.fromarray(picture).resize(QUARTER, Image.Resampling.BOX)
+    small.convert("RGB").save(tmp_path / "images_4/000.png")
+    scene = read_scene(tmp_path)
+    found = load_labels(scene.views[0], scene)
+    assert found is not None and found.shape == QUARTER[::-1]
+    wanted = np.full(QUARTER[::-1], 10)
+    wanted[50:, 65:] = 2  # 200 * 84 / 337 = 49.9, 260 * 130 / 519 = 65.1
+    np.testing.assert_array_equal(found, wanted)
+    # The photo's own edge is there too.
+    bright = load_image(scene.views[0], scene)[..., 0] > 127
+    np.testing.assert_array_equal(bright, wanted == 2)

@@ -1,0 +1,1 @@
+"""Scenes, fields and photos that several tests share."""

@@ -1,0 +1,67 @@
+"""Fits of the toy scene, with labels and points if wanted."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from climatenerf.field.normalisation import find_extent
+from climatenerf.render.frame import render_frame
+from climatenerf.scene import load_image
+from climatenerf.training.dataset import TrainingPixels
+from climatenerf.training.evidence.sparse_depth import find_point_rays
+from climatenerf.training.run import load_pixels
+from climatenerf.training.settings import FitSettings
+from climatenerf.training.trainer import Fitting
+from climatenerf.weather.world import World
+from support.toy_scene import CAMERA, FIELD
+
+
+def begin(scene, **settings):
+    views = scene.of_split("train")
+    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**15, **settings}
+    extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
+    return Fitting(load_pixels(scene, 1), len(views), extent, FitSettings(**chosen))
+
+
+def labelled(scene):
+    """The scene with points on its ground, and what its pixels show: terrain, building or sky."""
+    labels, ends = [], []
+    for view in scene.of_split("train"):
+        _, layers = render_frame(World(FIELD), CAMERA, scene.c2w_world(view))
+        d = CAMERA.directions() @ scene.c2w_world(view)[:3, :3].T
+        x = scene.c2w_world(view)[:3, 3] + layers["depth"][..., None] * d
+        ground = np.isfinite(layers["depth"]) & (x[..., 2] < 0.02)
+        labels.append(np.where(ground, 9, np.where(np.isfinite(layers["depth"]), 2, 10)))
+        ends.append(x[ground & (layers["depth"] < 6)][::40])
+    views = scene.of_split("train")
+    seen = np.cumsum([0] + [len(each) for each in ends])
+    known = {
+        view.name: replace(view, seen=np.arange(a, b))
+        for view, a, b in zip(views, seen, seen[1:], strict=False)
+    }
+    shown = tuple(known.get(view.name, view) for view in scene.views)
+    return replace(scene, points=np.concatenate(ends), views=shown), labels
+
+
+def labelled_pixels(scene, labels):
+    """The photos as they are now, with labels."""
+    views = scene.of_split("train")
+    return TrainingPixels(
+        [CAMERA],
+        [0] * len(views),
+        np.stack([scene.c2w_world(view) for view in views]),
+        [load_image(view, scene) for view in views],
+        [each.astype(np.uint8) for each in labels],
+    )
+
+
+def with_labels(scene, relabel, **settings):
+    """A fit of the labelled scene, with its labels changed, that is past a quarter."""
+    known, labels = labelled(scene)
+    views = known.of_split("train")
+    extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
+    chosen = FitSettings(preset="tiny", minutes=None, steps=1000, **settings)
+    pixels = labelled_pixels(known, [relabel(each) for each in labels])
+    fitting = Fitting(pixels, len(views), extent, chosen, find_point_rays(known))
+    fitting.reached = 0.5
+    return fitting

@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.training.dataset import in_units
+from climatenerf.training.evidence.monocular_depth import RelativeDepth
+
+
+def rays(n=4000, images=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.randint(images, (n,), generator=generator)
+    return image, 0.1 + torch.rand(n, generator=generator)
+
+
+SCALE, SHIFT = torch.tensor([2.0, 0.5, 30.0]), torch.tensor([-1.0, 4.0, 0.1])
+
+
+def test_scale_and_shift_of_each_image_are_found():
+    image, inverse = rays()
+    relative = RelativeDepth(3)
+    loss = relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)
+    scale, shift, spread = relative.affine()
+    assert torch.allclose(scale, SCALE, rtol=1e-3) and torch.allclose(shift, SHIFT, atol=1e-2)
+    assert (spread > 0).all() and loss < 1e-6
+
+
+def test_the_loss_does_not_depend_on_the_networks_units():
+    image, inverse = rays()
+    bent = inverse + 0.1 * torch.sin(20 * inverse)
+    first = RelativeDepth(3).loss(inverse, bent, image, inverse > 0)
+    second = RelativeDepth(3).loss(inverse, SCALE[image] * bent + SHIFT[image], image, inverse > 0)
+    assert first == pytest.approx(float(second), rel=1e-3) and first > 1e-3
+
+
+def test_gradients_move_a_wrong_depth_towards_the_right_one():
+    image, inverse = rays()
+    given = inverse.clone()
+    given[0] += 0.3  # nearer than it should be
+    given.requires_grad_()
+    RelativeDepth(3).loss(
+        given, SCALE[image] * inverse + SHIFT[image], image, inverse > 0
+    ).backward()
+    assert given.grad is not None and torch.isfinite(given.grad).all()
+    assert given.grad[0] > 0 and given.grad[0] > 10 * given.grad[1:].abs().median()
+
+
+def test_what_is_not_known_or_inside_out_says_nothing():
+    image, inverse = rays()
+    relative = RelativeDepth(3)
+    bent = inverse + 0.1 * torch.sin(20 * inverse)
+    assert relative.loss(inverse, -bent, image, inverse > 0) == 0  # far would be near
+    assert RelativeDepth(3).loss(inverse, bent, image, inverse > 0) > 0
+    none = torch.zeros(len(image), dtype=torch.bool)
+    assert relative.loss(inverse, inverse, image, none) == 0
+    few = torch.arange(len(image)) < 10
+    assert RelativeDepth(3).loss(inverse, inverse, image, few) == 0
+    flat = RelativeDepth(3).loss(inverse, torch.ones_like(inverse), image, inverse > 0)
+    assert flat == 0 and torch.isfinite(flat)
+
+
+def test_sums_from_earlier_steps_help_when_a_step_has_few_rays():
+    image, inverse = rays(60)
+    relative = RelativeDepth(3)
+    for seed in range(5):
+        image, inverse = rays(60, seed=seed)
+        relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)
+    assert (relative.affine()[2] > 0).all()
+
+
+def test_relative_depth_of_any_unit_fits_into_half_floats():
+    disparity = np.array([[1.0, 2.0], [60_000.0, np.nan]]) * 100
+    kept = in_units(disparity).astype(np.float16)
+    assert kept[1, 0] == 1 and kept[0, 1] == pytest.approx(2 * kept[0, 0], rel=1e-2)
+    assert np.isnan(kept[1, 1])
+    assert (in_units(np.zeros((2, 2))) == 0).all()
+    assert in_units(np.array([[np.inf, 0.5]])).tolist() == [[np.inf, 1.0]]

@@ -1,0 +1,125 @@
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.core.cameras import Camera
+from climatenerf.core.classes import MERGED, SKY
+from climatenerf.core.colour import decode_srgb
+from climatenerf.training.dataset import TrainingPixels
+from climatenerf.training.evidence import sky_prior as sky_fill
+from climatenerf.training.evidence.sky_prior import (
+    COLUMNS,
+    LOWEST,
+    ROWS,
+    SkyFill,
+    direction,
+    fill_sky,
+    spread,
+)
+
+SKY_ID = 10
+
+
+def upward(turn):
+    """A camera whose axis rises by 30 degrees, towards azimuth `turn`."""
+    flat = np.array([np.cos(turn), np.sin(turn), 0.0])
+    forward = np.cos(np.pi / 6) * flat + np.array([0, 0, np.sin(np.pi / 6)])
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    c2w = np.eye(4)
+    c2w[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    return c2w
+
+
+def pixels(colours, label=SKY_ID):
+    camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0)
+    images = [np.full((30, 40, 3), colour, np.uint8) for colour in colours]
+    c2w = np.stack([upward(2 * np.pi * i / len(colours)) for i in range(len(colours))])
+    labels = [np.full((30, 40), label, np.uint8) for _ in colours]
+    return TrainingPixels([camera], [0] * len(colours), c2w, images, labels)
+
+
+def test_directions_are_unit_and_cover_the_sky_evenly():
+    at = torch.rand(20000, 2, generator=torch.Generator().manual_seed(0))
+    d = direction(at[:, 0] * ROWS, at[:, 1] * COLUMNS)
+    assert torch.allclose(d.norm(dim=-1), torch.ones(len(d)), atol=1e-5)
+    assert d[:, 2].min() >= LOWEST - 1e-6
+    # Archimedes: heights of even directions are even.
+    assert d[:, 2].mean() == pytest.approx((1 + LOWEST) / 2, abs=0.01)
+    assert d[:, :2].mean(0).abs().max() < 0.02
+
+
+def test_what_is_seen_stays_and_gaps_lie_between():
+    fill = fill_sky(pixels([60, 200]), torch.Generator().manual_seed(0))
+    dark, bright = (float(decode_srgb(torch.tensor(v / 255))) for v in (60, 200))
+    seen = fill.colour[~fill.unseen]
+    assert 0.02 < (~fill.unseen).float().mean() < 0.6
+    assert torch.isin(seen.mul(1e4).round(), torch.tensor([dark, bright]).mul(1e4).round()).all()
+    gaps = fill.colour[fill.unseen]
+    assert gaps.min() >= dark - 1e-5 and gaps.max() <= bright + 1e-5
+    assert gaps.std() > 0.01  # nearer to the dark side it is darker
+    zenith = fill.colour[-1]
+    assert zenith.std() < 0.25 * (bright - dark)
+
+
+def test_drawn_directions_are_unseen_ones_with_their_colours():
+    colour = torch.rand(ROWS, COLUMNS, 3)
+    unseen = torch.zeros(ROWS, COLUMNS, dtype=torch.bool)
+    unseen[3:6, 10:20] = True
+    d, drawn, which = SkyFill(colour, unseen).draw(20000, torch.Generator().manual_seed(0))
+    d, drawn = d[which], drawn[which]
+    assert 0.5 < len(d) / (20000 * unseen.float().mean()) < 1.5
+    row = ((d[:, 2] - LOWEST) / (1 - LOWEST) * ROWS).long()
+    assert ((row >= 3) & (row < 6)).all()
+    assert (drawn[:, None] - colour[3:6, 10:20].reshape(-1, 3)).abs().sum(-1).min(1)[0].max() == 0
+
+
+def test_where_no_label_tells_sky_all_that_is_above_the_horizon_stands_for_it():
+    assert MERGED[0] != MERGED[SKY_ID]
+    fill = fill_sky(pixels([100, 100], label=0), torch.Generator())
+    grey = float(decode_srgb(torch.tensor(100 / 255)))
+    assert fill.colour.numpy() == pytest.approx(grey, abs=1e-5)
+    assert 0.3 < fill.unseen.float().mean() < 0.98
+
+
+def test_where_labels_tell_sky_a_house_above_the_horizon_is_none():
+    dark_sky_beside_a_bright_house = [60, 200]
+    labelled = pixels(dark_sky_beside_a_bright_house)
+    own = (labelled.pixel_start[:-1], labelled.pixel_start[1:])
+    labelled.label[own[0][1] : own[1][1]] = MERGED[2]
+    fill = fill_sky(labelled, torch.Generator().manual_seed(0))
+    dark = float(decode_srgb(torch.tensor(60 / 255)))
+    assert fill.colour.numpy() == pytest.approx(dark, abs=1e-5)
+
+
+@pytest.mark.parametrize(("shown", "bright"), [(100, False), (230, True)])
+def test_photos_that_look_down_give_an_even_grey_sky_that_would_light_them(shown, bright):
+    """Lambertian ground of albedo .2 shows a fifth of the sky's radiance; white is the most."""
+    low = pixels([(shown, shown // 2, shown // 4)] * 2, label=0)
+    low.c2w[:, 2] *= -1  # up is down: the cameras' axes sink by 30 degrees
+    low.c2w[:, :3, 3] = 0
+    batch = low.draw(1000, torch.Generator().manual_seed(0))
+    assert batch.rays_d[:, 2].max() < LOWEST
+    fill = fill_sky(low, torch.Generator())
+    r, g, b = (float(decode_srgb(torch.tensor(v / 255))) for v in (shown, shown // 2, shown // 4))
+    radiance = (0.2126 * r + 0.7152 * g + 0.0722 * b) / 0.2
+    assert fill.unseen.all() and (radiance > 1) == bright
+    assert torch.allclose(fill.colour, torch.full((ROWS, COLUMNS, 3), min(radiance, 1.0)))
+
+
+def test_where_hardly_a_pixel_is_labelled_sky_what_is_above_stands_for_it(monkeypatch):
+    """A lamp that a network takes for sky, in a room whose walls are grey."""
+    monkeypatch.setattr(sky_fill, "LOOKS", 600)  # a quarter of the pixels
+    room = pixels([100, 100], label=0)
+    room.label[:2] = SKY
+    assert room.knows_sky
+    fill = fill_sky(room, torch.Generator().manual_seed(0))
+    wall = float(decode_srgb(torch.tensor(100 / 255)))
+    assert fill.colour.numpy() == pytest.approx(wall, abs=1e-5) and not fill.unseen.all()
+
+
+def test_spreading_keeps_an_even_sky_even():
+    seen = torch.zeros(ROWS, COLUMNS, dtype=torch.bool)
+    seen[4, 7] = True
+    known = torch.full((ROWS, COLUMNS, 3), 0.3) * seen[..., None]
+    assert torch.allclose(spread(known, seen), torch.full((ROWS, COLUMNS, 3), 0.3), atol=1e-5)

@@ -1,0 +1,81 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from support.toy_scene import CAMERA, make_scene
+
+from climatenerf.training.evidence.sparse_depth import find_point_rays, shown_points
+from climatenerf.training.run import load_pixels
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """The toy with three points, of which its views show none, one, two and three in turn."""
+    points = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 0.2], [-1.0, 0.5, 0.3]])
+    scene = make_scene(tmp_path)
+    views = tuple(replace(v, seen=np.arange(i % 4)) for i, v in enumerate(scene.views))
+    return replace(scene, points=points, views=views)
+
+
+def test_rays_end_on_their_points_and_held_out_views_give_none(scene):
+    found = find_point_rays(scene)
+    assert found is not None
+    training = scene.of_split("train")
+    assert found.depth.shape[0] == sum(len(v.seen) for v in training)
+    assert len(training) < len(scene.views)
+    ends = found.rays_o + found.depth[:, None] * found.rays_d
+    expected = np.concatenate([scene.points_world()[v.seen] for v in training])
+    np.testing.assert_allclose(ends, expected, atol=1e-5)
+    assert torch.allclose(found.rays_d.norm(dim=-1), torch.ones(len(ends)))
+    # They are rays of the photos: the points project into the pictures along them.
+    view = next(v for v in training if len(v.seen))
+    local = (expected[0] - scene.c2w_world(view)[:3, 3]) @ scene.c2w_world(view)[:3, :3]
+    pixel = CAMERA.project(local)
+    direction = scene.c2w_world(view)[:3, :3] @ CAMERA.directions(pixel)
+    np.testing.assert_allclose(found.rays_d[0], direction, atol=1e-5)
+
+
+def test_drawn_rays_stay_whole(scene):
+    found = find_point_rays(scene)
+    drawn = found.draw(50, torch.Generator().manual_seed(0))
+    ends = drawn.rays_o + drawn.depth[:, None] * drawn.rays_d
+    distance = (ends[:, None] - torch.tensor(scene.points_world()[None], dtype=torch.float32)).norm(
+        dim=-1
+    )
+    assert distance.min(dim=1).values.max() < 1e-5
+
+
+def test_without_knowledge_of_who_sees_what_there_are_none(scene):
+    unknown = tuple(replace(v, seen=None) for v in scene.views)
+    assert find_point_rays(replace(scene, views=unknown)) is None
+    assert find_point_rays(replace(scene, points=None)) is None
+    nothing = tuple(replace(v, seen=np.empty(0, int)) for v in scene.views)
+    assert find_point_rays(replace(scene, views=nothing)) is None
+
+
+def test_what_a_mask_hides_is_no_measured_depth(scene, tmp_path):
+    """A mirror's points lie behind it: where it is masked they tell nothing of the wall."""
+    every = find_point_rays(scene)
+    views = scene.of_split("train")
+    view = next(v for v in views if len(v.seen) == 3)
+    c2w, points = scene.c2w_world(view), scene.points_world()[view.seen]
+    column = CAMERA.project((points - c2w[:3, 3]) @ c2w[:3, :3])[:, 0]
+    border = int(np.sort(column)[1])  # between the leftmost and the others
+    mask = np.full((CAMERA.height, CAMERA.width), 255, np.uint8)
+    mask[:, : border - 1] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    masked = tuple(
+        replace(v, mask_path=tmp_path / "mask.png") if v.name == view.name else v
+        for v in scene.views
+    )
+    masked = replace(scene, views=masked)
+    found = shown_points(masked, load_pixels(masked, 1))
+    image = [v.name for v in views].index(view.name)
+    assert (every.image == image).sum() == 3 and (found.image == image).sum() == 2
+    assert (found.image != image).sum() == (every.image != image).sum()
+    left = points[np.argmin(column)]
+    ends = found.ends[found.image == image].numpy()
+    assert np.linalg.norm(ends - left, axis=-1).min() > 0.1
+    assert shown_points(scene, load_pixels(scene, 1)).depth.shape == every.depth.shape

@@ -1,0 +1,300 @@
+"""Waves: the spectrum's integrals, the animated field's statistics, and the filtered lookups."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.weather.flood import spectrum, waves
+from climatenerf.weather.parameters import Flood
+
+STREET = Flood(level=0.0)
+SEA = Flood(level=0.0, wind_speed=10.0, fetch=1e5, depth=200.0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    """Thousands of small FFTs: handing each to several threads costs more than it saves."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def single_tile(flood: Flood, seed: int, peaks: float = 16, n: int = 64):
+    """A tile of so many peak waves, and the band it carries."""
+    length = peaks * 2 * math.pi / spectrum.peak_wavenumber(flood)
+    band = [0.0, 0.9 * math.pi * n / length]
+    generator = torch.Generator().manual_seed(seed)
+    return waves.make_tile(flood, length, band, 370.0, generator, n), band
+
+
+def as_waves(tile: waves.WaveTile, scale: float = 1.0) -> waves.Waves:
+    return waves.Waves((tile,), scale=scale)
+
+
+# --- spectrum ---------------------------------------------------------------------------------
+
+
+def test_dispersion():
+    k = np.array([0.01, 1.0])
+    assert spectrum.dispersion(k, 1e4) == pytest.approx(np.sqrt(9.81 * k), rel=1e-4)  # deep
+    shallow = spectrum.dispersion(np.array([0.01]), 0.5)
+    assert shallow == pytest.approx(0.01 * math.sqrt(9.81 * 0.5), rel=1e-4)
+    # Capillary-gravity waves are slowest at 1.7 cm, at 23 cm/s.
+    fine = np.geomspace(50, 2000, 2000)
+    speed = spectrum.dispersion(fine, 10.0) / fine
+    assert speed.min() == pytest.approx(0.232, rel=0.01)
+    assert 2 * math.pi / fine[speed.argmin()] == pytest.approx(0.0172, rel=0.02)
+
+
+def test_group_velocity_is_the_derivative():
+    k = np.geomspace(0.05, 1000, 50)
+    for depth in (0.05, 1.0, 100.0):
+        step = 1e-5 * k
+        slope = spectrum.dispersion(k + step, depth) - spectrum.dispersion(k - step, depth)
+        assert spectrum.group_velocity(k, depth) == pytest.approx(slope / (2 * step), rel=1e-6)
+
+
+def test_tma_known_values():
+    wind, fetch = 10.0, 1e5
+    peak = spectrum.peak_frequency(wind, fetch)
+    assert peak == pytest.approx(22 * (9.81**2 / 1e6) ** (1 / 3))
+    alpha = 0.076 * (100 / (1e5 * 9.81)) ** 0.22
+    at_peak = alpha * 9.81**2 * peak**-5 * math.exp(-1.25) * 3.3
+    deep = spectrum.tma(np.array([peak, 0.0]), wind, fetch, 1e4)
+    assert deep == pytest.approx([at_peak, 0])
+    # Depth factor: (omega sqrt(d/g))^2/2 in the shallows, 1 in deep water.
+    depth = 0.25 * 9.81 / peak**2
+    shallow = spectrum.tma(np.array([peak]), wind, fetch, depth)
+    assert shallow == pytest.approx([at_peak * 0.25 / 2])
+
+
+def test_spreading_is_normalised_and_points_downwind():
+    angle = (np.arange(4000) + 0.5) / 4000 * 2 * math.pi - math.pi
+    for ratio in (0.3, 0.8, 1.0, 1.5, 3.0, 30.0):
+        share = spectrum.spreading(np.full_like(angle, ratio), angle)
+        assert share.mean() * 2 * math.pi == pytest.approx(1, abs=1e-4)
+        assert abs(angle[share.argmax()]) < 0.01
+
+
+@pytest.mark.parametrize(("wind", "tolerance"), [(5.0, 0.15), (10.0, 0.35)])
+def test_open_sea_is_near_cox_and_munk(wind, tolerance):
+    """Developed sea, cut at 370 rad/m where capillary waves begin; short of storms."""
+    sea = replace(SEA, wind_speed=wind)
+    k = spectrum.log_axis(sea)
+    energy = spectrum.wavenumber_spectrum(k, sea, spectrum.MAX_CUTOFF)
+    slope = np.trapezoid(k**3 * energy, np.log(k))
+    assert slope == pytest.approx(spectrum.cox_munk(wind), rel=tolerance)
+    # What the tiles lack is handed on as unresolved variance.
+    drawn = waves.make_waves(sea, 0, 64)
+    total = drawn.mean_square_slope + 2 * drawn.unresolved
+    assert total == pytest.approx(spectrum.cox_munk(wind))
+
+
+def test_significant_height_of_the_open_sea():
+    """10 m/s over 100 km: 2.1 m (the height that JONSWAP's fetch law, 0.0016 F^0.5, gives)."""
+    drawn = waves.make_waves(SEA, 0, 64)
+    law = 0.0016 * math.sqrt(9.81 * 1e5 / 100) * 100 / 9.81
+    assert drawn.significant_height == pytest.approx(law, rel=0.35)
+    assert drawn.significant_height == pytest.approx(2.14, abs=0.02)
+
+
+@pytest.mark.parametrize("wind", [0.5, 2.0, 6.0])
+def test_short_fetch_holds_no_more_slope_than_cox_and_munk(wind):
+    flood = Flood(level=0.0, wind_speed=wind)
+    sea = waves.make_waves(flood, 0, n=64)
+    total = sea.mean_square_slope + 2 * sea.unresolved
+    assert total == pytest.approx(spectrum.cox_munk(wind), rel=0.01)
+    assert sea.unresolved < 0.02 * total
+
+
+def test_default_is_a_gentle_ripple():
+    sea = waves.make_waves(STREET, 0)
+    assert 0.004 < sea.significant_height < 0.02  # metres
+    assert 0.05 < math.sqrt(sea.mean_square_slope / 2) < 0.1
+
+
+# --- field ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("flood", [STREET, SEA, Flood(wind_speed=5.0, fetch=300.0, depth=0.2)])
+def test_variance_of_height_and_slope_is_the_spectrums(flood):
+    height, slope = [], []
+    for seed in range(64):
+        tile, band = single_tile(flood, seed)
+        height.append(waves.heights(as_waves(tile), 0, 0.7).var(unbiased=False).item())
+        maps = waves.at_time(as_waves(tile), 0.7).pyramids[0][: 64 * 64]
+        slope.append((maps.abs() ** 2).mean().item())
+    k = spectrum.log_axis(flood)
+    k = k[k < band[1]]
+    energy = k * spectrum.wavenumber_spectrum(k, flood, 370.0)
+    assert np.mean(height) == pytest.approx(np.trapezoid(energy, np.log(k)), rel=0.03)
+    assert np.mean(slope) == pytest.approx(np.trapezoid(k**2 * energy, np.log(k)), rel=0.03)
+
+
+def test_surface_is_real_at_all_times():
+    tile, _ = single_tile(STREET, 3)
+    for time in (0.0, 0.3, 1000.0):
+        field = torch.fft.ifft2(waves.amplitudes(tile, time), norm="forward")
+        assert field.imag.abs().max() < 1e-5 * field.real.abs().max()
+
+
+def test_slopes_are_the_gradient_of_the_height():
+    tile, _ = single_tile(STREET, 0, peaks=4, n=128)
+    smooth = waves.WaveTile(
+        tile.length,
+        tile.k,
+        tile.omega,
+        torch.where(tile.k.norm(dim=-1) < 10 * tile.k[0, 1, 0], tile.forward, 0),
+        torch.where(tile.k.norm(dim=-1) < 10 * tile.k[0, 1, 0], tile.backward, 0),
+        tile.total,
+        tile.kept,
+        tile.shared,
+    )
+    h = waves.heights(as_waves(smooth), 0, 0.4)
+    maps = waves.at_time(as_waves(smooth), 0.4).pyramids[0][: 128 * 128].reshape(128, 128)
+    step = 2 * tile.length / 128
+    along_x = (h.roll(-1, 1) - h.roll(1, 1)) / step
+    along_y = (h.roll(-1, 0) - h.roll(1, 0)) / step
+    assert (maps.real - along_x).abs().max() < 0.05 * maps.real.abs().max()
+    assert (maps.imag - along_y).abs().max() < 0.05 * maps.imag.abs().max()
+
+
+@pytest.mark.parametrize("index", [(0, 16), (5, 20), (-9, 14)])
+def test_time_series_lies_on_the_dispersion_curve(index):
+    tile, _ = single_tile(STREET, 1)
+    period, steps = 10.0, 256
+    series = [
+        torch.fft.fft2(waves.heights(as_waves(tile), 0, period * i / steps))[index].item()
+        for i in range(steps)
+    ]
+    power = np.abs(np.fft.fft(np.array(series) * np.hanning(steps))) ** 2
+    seen = abs(np.fft.fftfreq(steps, period / steps)[power.argmax()]) * 2 * math.pi
+    k = 2 * math.pi / tile.length * math.hypot(*index)
+    expected = spectrum.dispersion(np.array([k]), STREET.depth)[0]
+    assert seen == pytest.approx(expected, abs=2 * math.pi / period)
+
+
+@pytest.mark.parametrize(("degrees", "downwind"), [(0, (0, -1)), (90, (-1, 0)), (180, (0, 1))])
+def test_waves_run_with_the_wind(degrees, downwind):
+    """Wind from +y drives waves to -y: the height's best match a moment later is downwind."""
+    tile, _ = single_tile(Flood(wind_direction=math.radians(degrees)), 0)
+    before, after = (waves.heights(as_waves(tile), 0, t) for t in (0.0, 0.06))
+    match = torch.fft.ifft2(torch.fft.fft2(before).conj() * torch.fft.fft2(after)).real
+    row, column = divmod(int(match.argmax()), 64)
+    moved = np.array([(column + 32) % 64 - 32, (row + 32) % 64 - 32])
+    assert moved @ downwind > 0.8 * np.linalg.norm(moved) > 0
+
+
+def test_seed_and_time():
+    x = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 10
+    narrow = torch.full((500,), 0.01)
+
+    def seen(seed, time):
+        return waves.slopes(waves.at_time(waves.make_waves(STREET, seed, 64), time), x, narrow)[0]
+
+    assert torch.equal(seen(5, 1.0), seen(5, 1.0))
+    apart = (seen(5, 1.0) - seen(6, 1.0)).pow(2).mean()
+    close = (seen(5, 1.0) - seen(5, 1.001)).pow(2).mean()
+    assert close < 1e-2 * apart
+    assert (seen(5, 1.0) - seen(5, 1.5)).pow(2).mean() > 0.1 * apart
+
+
+def test_no_wind_is_perfectly_flat():
+    sea = waves.make_waves(Flood(wind_speed=0.0), 0)
+    slope, removed = waves.slopes(waves.at_time(sea, 3.0), torch.rand(9, 2), torch.full((9,), 0.1))
+    assert not slope.any() and not removed.any()
+    assert sea.significant_height == 0
+
+
+def test_scale_stretches_waves_at_unchanged_slope():
+    small = waves.make_waves(STREET, 0, 64)
+    large = waves.make_waves(Flood(wave_scale=3.0), 0, 64)
+    assert large.significant_height == pytest.approx(3 * small.significant_height)
+    x = torch.rand(200, 2)
+    a, va = waves.slopes(waves.at_time(small, 1.0), x, torch.full((200,), 0.02))
+    b, vb = waves.slopes(waves.at_time(large, math.sqrt(3)), 3 * x, torch.full((200,), 0.06))
+    torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(va, vb, atol=1e-7, rtol=1e-3)
+
+
+# --- lookups ----------------------------------------------------------------------------------
+
+
+def test_tile_repeats_and_lookup_hits_its_texels():
+    tile, _ = single_tile(STREET, 2)
+    frame = waves.at_time(as_waves(tile), 0.2)
+    maps = torch.view_as_real(frame.pyramids[0][: 64 * 64].reshape(64, 64))
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    x = torch.stack([columns, rows], dim=-1).reshape(-1, 2) * tile.length / 64
+    zero = torch.zeros(len(x))
+    torch.testing.assert_close(
+        waves.slopes(frame, x, zero)[0], maps.reshape(-1, 2), atol=1e-4, rtol=0
+    )
+    shifted = x + 0.3 + torch.tensor([2.0, -3.0]) * tile.length
+    torch.testing.assert_close(
+        waves.slopes(frame, x + 0.3, zero)[0],
+        waves.slopes(frame, shifted, zero)[0],
+        atol=1e-3,
+        rtol=0,
+    )
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_levels_against_a_direct_blur(level):
+    """Each level is the slope map blurred by a Gaussian of half its texel, texel by texel."""
+    tile, _ = single_tile(STREET, 2)
+    pyramid = waves.at_time(as_waves(tile), 0.2).pyramids[0]
+    size = 64 >> level
+    start = sum((64 >> i) ** 2 for i in range(level))
+    seen = pyramid[start : start + size**2].reshape(size, size)
+    step = torch.arange(64)
+    distance = torch.minimum(step, 64 - step).float() / (1 << level)
+    kernel = torch.exp(-(distance**2) / (2 * 0.5**2))
+    kernel = kernel / kernel.sum()
+    circulant = torch.stack([kernel.roll(i) for i in range(64)]).to(torch.complex64)
+    blurred = circulant @ pyramid[: 64 * 64].reshape(64, 64) @ circulant
+    expected = blurred[:: 1 << level, :: 1 << level]
+    # Cropping in frequency removes what the Gaussian leaves beyond the level's Nyquist index.
+    assert (seen - expected).abs().pow(2).mean() < 0.02 * pyramid[: 64 * 64].abs().pow(2).mean()
+
+
+@pytest.mark.parametrize("flood", [STREET, Flood(wind_speed=6.0, fetch=300.0)])
+def test_filtering_conserves_slope_variance(flood):
+    x = torch.rand(6000, 2, generator=torch.Generator().manual_seed(0)) * 200
+    sums = {width: 0.0 for width in (0.0, 0.013, 0.07, 0.3, 100.0)}
+    total, last = 0.0, -1.0
+    for seed in range(4):
+        sea = waves.make_waves(flood, seed, 128)
+        frame = waves.at_time(sea, 0.5)
+        total += sea.unresolved + sum(t.total for t in sea.tiles)
+        for width in sums:
+            slope, removed = waves.slopes(frame, x, torch.full((len(x),), width))
+            assert (removed >= 0).all()
+            sums[width] += slope.pow(2).mean().item() + removed.mean().item()
+            last = removed.mean().item()
+    assert list(sums.values()) == pytest.approx([total] * len(sums), rel=0.04)
+    assert last == pytest.approx(total / 4, rel=0.2)  # a pixel of 100 m sees no wave at all
+
+
+def test_removed_variance_grows_with_the_footprint():
+    frame = waves.at_time(waves.make_waves(STREET, 0, 64), 0.0)
+    width = torch.logspace(-4, 3, 200)
+    _, removed = waves.slopes(frame, torch.rand(200, 2), width)
+    assert (removed.diff() >= -1e-7).all()
+
+
+@pytest.mark.parametrize("wind", [1e-4, 0.01, 0.1, 40.0])
+@pytest.mark.parametrize("fetch", [1.0, 1e6])
+@pytest.mark.parametrize("depth", [0.01, 1000.0])
+def test_finite_over_the_whole_range(wind, fetch, depth):
+    flood = Flood(wind_speed=wind, fetch=fetch, depth=depth, wave_scale=0.1)
+    sea = waves.make_waves(flood, 0, 32)
+    x = torch.tensor([[0.0, 0.0], [1e5, -1e5], [-1e-9, -0.0]])
+    for width in (0.0, 1e-6, 1.0, 1e8):
+        slope, removed = waves.slopes(waves.at_time(sea, 1e4), x, torch.full((3,), width))
+        assert torch.isfinite(slope).all() and torch.isfinite(removed).all()
+        assert (removed >= 0).all()

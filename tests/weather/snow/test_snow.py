@@ -1,0 +1,309 @@
+"""Snow on scenes in closed form: every check of its physics that needs no reference scene."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+import torch
+from support.analytic_fields import AnalyticField, Box, HalfSpace, ground, table
+
+from climatenerf.weather.parameters import Snow
+from climatenerf.weather.snow.deposition import fall_directions
+from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
+from climatenerf.weather.snow.layer import bake_snow
+
+CAMERAS = np.array([[0.0, 0.0, 1.6]])
+WHITE = np.ones(3)
+GRID = SnowGrid((0.013, 0.027), (-1.0, 3.0), 0.05, 32)
+
+
+def bake(solids, depth=0.1, grid=GRID, light=WHITE, sun=None, seed=0, **snow):
+    field = AnalyticField(solids, box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
+    return bake_snow(field, Snow(depth=depth, **snow), CAMERAS, light, sun, seed, grid)
+
+
+def on_plane(plane: HalfSpace, n: int, half: float = 1.3, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    xy = (2 * torch.rand(n, 2, generator=generator) - 1) * half
+    normal = torch.tensor(plane.normal)
+    z = (plane.offset - xy @ normal[:2]) / normal[2]
+    return torch.cat([xy, z[:, None]], -1)
+
+
+def first_point(snow, rays_o, rays_d):
+    """Where rays meet the snow: mean over the rendering weights; and their opacity."""
+    zero = torch.zeros(len(rays_o))
+    samples = snow.march(rays_o, rays_d, zero, zero + torch.inf)
+    points, opacities = [], []
+    for r in range(len(rays_o)):
+        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
+        depth = torch.cat([zero[:1], (samples.sigma[part] * samples.dt[part]).cumsum(0)])
+        weight = torch.exp(-depth[:-1]) - torch.exp(-depth[1:])
+        opacities.append(float(weight.sum()))
+        t = (weight * samples.t[part]).sum() / max(opacities[-1], 1e-9)
+        points.append(rays_o[r] + t * rays_d[r])
+    return torch.stack(points), torch.tensor(opacities)
+
+
+@pytest.mark.parametrize("case", range(24))
+def test_thickness_over_planes(case):
+    """Random offsets, tilts up to 5 degrees, headings and spacings; nothing was calibrated."""
+    rng = np.random.default_rng(case)
+    depth = (0.02, 0.03, 0.05, 0.1, 0.2, 0.4)[case % 6]
+    plane = ground(
+        math.radians(rng.uniform(0, 5)), rng.uniform(0, 2 * math.pi), rng.uniform(-0.2, 0.2)
+    )
+    spacing = rng.uniform(0.03, 0.06)
+    grid = SnowGrid(tuple(rng.uniform(-0.1, 0.1, 2)), (-1.0, 2.0), spacing, 48)
+    snow = bake([plane], depth, grid, seed=case)
+    feet = on_plane(plane, 60, 0.6, seed=case)
+    assert snow.covered(feet).all()
+    assert snow.depth_over(feet).numpy() == pytest.approx(np.full(60, depth), rel=0.1)
+    # Seen from the side, too.
+    aside = torch.tensor(rng.normal(0, 1.0, (60, 3)), dtype=torch.float32)
+    aside[:, 2] = 2.0
+    direction = -aside / aside.norm(dim=1, keepdim=True)
+    points, opacity = first_point(snow, feet - 1.2 * direction, direction)
+    height = plane.distance(points) / plane.normal[2]
+    assert opacity.min() > 0.998
+    assert height.numpy() == pytest.approx(np.full(60, depth), rel=0.1)
+    assert height.mean() == pytest.approx(depth, rel=0.06)
+    assert snow.thickness(points).numpy() == pytest.approx(height.numpy(), abs=0.002)
+    normal = snow.normal(points)
+    # Quantised fractions and the lattice tilt the normal by a few degrees at most.
+    assert (normal @ torch.tensor(plane.normal)).min() > math.cos(math.radians(6))
+
+
+def test_coverage_follows_the_slope():
+    for slope in (20.0, 30.0, 35.0, 37.0, 39.0, 45.0, 60.0):
+        plane = ground(math.radians(slope), 0.7)
+        snow = bake([plane], 0.1)
+        logistic = 1 / (
+            1 + math.exp(-50 * (math.cos(math.radians(slope)) - math.cos(math.radians(37))))
+        )
+        middle = np.abs(snow.deposits.position[:, :2]).max(1) < 0.8
+        if logistic > 0.01:
+            assert snow.deposits.weight[middle].mean() == pytest.approx(logistic, abs=0.02)
+        else:
+            assert snow.deposits.weight[middle].sum() == 0 or snow.deposits.weight.max() < 0.02
+        share = float(snow.covered(on_plane(plane, 400, 0.6)).float().mean())
+        if slope < 36:
+            assert share == 1
+        if slope > 38:
+            assert share == 0
+
+
+def test_bare_under_a_roof_and_covered_in_the_open():
+    roof = [
+        Box((-0.8, -1.5, 2.0), (0.8, 0.7, 2.1)),
+        Box((-0.8, -1.5, -1.0), (-0.7, -1.4, 2.0)),
+    ]
+    snow = bake([ground(), *roof])
+    feet = on_plane(ground(), 6000, 1.4)
+    covered = snow.covered(feet)
+    x, y = feet[:, 0], feet[:, 1]
+    under = (x.abs() < 0.7) & (y < 0.6)
+    outside = (x.abs() > 0.9) | (y > 0.8)
+    assert covered[under].float().mean() < 0.02
+    assert covered[outside].float().mean() > 0.95
+    top = torch.stack([x, y, torch.full_like(x, 2.1)], -1)[(x.abs() < 0.75) & (y < 0.65)]
+    assert snow.covered(top).float().mean() > 0.95
+    assert snow.depth_over(top).mean() == pytest.approx(0.1, rel=0.1)
+
+
+def test_no_snow_hangs_below_a_thin_table():
+    for depth in (0.02, 0.1, 0.3):
+        snow = bake([ground(), *table()], depth)
+        xy = 2.2 * torch.rand(4000, 2, generator=torch.Generator().manual_seed(1)) - 1.1
+        for z in (0.69, 0.66, 0.6, 0.5):
+            below = torch.cat([xy, torch.full((4000, 1), z)], -1)
+            assert snow.density(below).max() == 0
+        on_top = torch.cat([xy, torch.full((4000, 1), 0.75)], -1)[(xy.abs() < 0.5).all(1)]
+        assert snow.depth_over(on_top).numpy() == pytest.approx(depth, rel=0.1)
+
+
+def test_swept_depth_is_monotone():
+    rocks = [Box((x, x / 2, -1), (x + 0.3, x / 2 + 0.4, x / 4 + 0.3)) for x in (-1.0, -0.4, 0.3)]
+    slope = HalfSpace((-math.sin(0.6), 0.0, math.cos(0.6)), -0.4)
+    field = [ground(0.05, 1.0), slope, *rocks]
+    snow = bake(field, 0.4)
+    feet = on_plane(ground(0.05, 1.0), 500, 1.4)
+    thickness = []
+    for depth in (1e-6, 0.001, 0.003, 0.006, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4):
+        thickness.append(snow.with_depth(depth).depth_over(feet))
+    steps = torch.stack(thickness).diff(dim=0)
+    assert thickness[0].max() == 0
+    assert steps.min() > -1e-3  # of the march; the lattice itself is monotone
+    assert (thickness[-1] > 0.3).float().mean() > 0.7
+    assert torch.equal(snow.depth_over(feet), thickness[-1])
+
+
+def test_the_limit_of_no_snow():
+    assert bake([ground()], None) is None
+    assert bake([ground()], 0.0) is None
+    snow = bake([ground()], 1e-4)
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(200, 3)
+    feet = on_plane(ground(), 200)
+    _, opacity = first_point(snow, feet - 2 * down, down)
+    assert opacity.max() < 1e-4
+
+
+def test_empty_scene_and_extremes_stay_finite():
+    nothing = bake([], 0.1)
+    assert nothing is not None
+    assert nothing.depth_over(on_plane(ground(), 5)).tolist() == [0.0] * 5
+    for extreme in (
+        {"fall_tilt": math.radians(80), "wind_direction": 1.0},
+        {"slope": 0.0, "slope_sharpness": 1000.0},
+        {"slope": math.pi / 2, "albedo_offset": 0.0, "wrap": 0.0},
+    ):
+        snow = bake([ground(), *table()], 2.0, sun=np.array([0.0, 0.8, 0.6]), **extreme)
+        assert np.isfinite(snow.deposits.position).all()
+        points = torch.rand(3000, 3) * torch.tensor([2.4, 2.4, 3.5]) - torch.tensor([1.2, 1.2, 0.5])
+        for value in (snow.density(points), snow.colour(points), snow.normal(points)):
+            assert torch.isfinite(value).all()
+        assert (snow.colour(points) >= 0).all()
+
+
+def test_same_seed_same_snow_on_any_number_of_threads():
+    threads = numba.get_num_threads()
+    scene = [ground(0.04, 2.0), *table()]
+    first = bake(scene, seed=3)
+    rays_o = torch.tensor([[0.1, 0.2, 2.0]]).repeat(300, 1)
+    rays_d = torch.nn.functional.normalize(torch.randn(300, 3) * 0.3 + torch.tensor([0, 0, -1.0]))
+    zero = torch.zeros(300)
+    expected = first.march(rays_o, rays_d, zero, zero + 9)
+    try:
+        numba.set_num_threads(1)
+        second = bake(scene, seed=3)
+        again = second.march(rays_o, rays_d, zero, zero + 9)
+    finally:
+        numba.set_num_threads(threads)
+    for one, other in zip(first.lattice, second.lattice, strict=True):
+        assert np.array_equal(one, other)
+    assert torch.equal(expected.t, again.t)
+    assert torch.equal(expected.sigma, again.sigma)
+    assert not np.array_equal(first.deposits.weight, bake(scene, seed=4).deposits.weight)
+
+
+def test_brightness():
+    white = HalfSpace(colour=(1.0, 1.0, 1.0))
+    feet = on_plane(white, 50)
+    top = feet + torch.tensor([0.0, 0.0, 0.1])
+    # Snow on white ground is white under the light that the scene has, and no brighter.
+    light = np.array([0.02, 0.03, 0.05])
+    dim = bake([white], light=light / 10)
+    expected = np.broadcast_to(light / 10, (50, 3))
+    assert dim.colour(top).numpy() == pytest.approx(expected, rel=0.02)
+    assert bake([white], light=light).colour(top).numpy() == pytest.approx(
+        np.broadcast_to(light, (50, 3)), rel=0.02
+    )
+    # Over dark ground: (0 + c0) / (1 + c0).
+    dark = bake([HalfSpace(colour=(0.0, 0.0, 0.0))]).colour(top)
+    assert dark.numpy() == pytest.approx(0.8, rel=0.02)
+
+
+def test_shadow_towards_the_sun():
+    wall = Box((0.5, -8.0, -1.0), (0.7, 8.0, 1.0))
+    sun = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
+    snow = bake([HalfSpace(colour=(1.0, 1.0, 1.0)), wall], sun=sun)
+    wrap = (math.sqrt(0.5) + 8) / 9
+    shadowed = snow.colour(torch.tensor([[0.1, 0.0, 0.1], [-0.2, 0.3, 0.1]]))
+    lit = snow.colour(torch.tensor([[-0.9, 0.0, 0.1], [1.2, 0.3, 0.1]]))
+    assert shadowed.numpy() == pytest.approx(0.3 * wrap, rel=0.02)
+    assert lit.numpy() == pytest.approx(wrap, rel=0.02)
+
+
+def test_wind_leaves_the_lee_bare():
+    wall = Box((-0.1, -8.0, -1.0), (0.1, 8.0, 0.8))
+    # From +x (90 degrees clockwise from +y), 45 degrees from the vertical.
+    snow = bake([ground(), wall], fall_tilt=math.radians(45), wind_direction=math.radians(90))
+    y = torch.linspace(-1, 1, 50)
+
+    def line(x):
+        return torch.stack([torch.full_like(y, x), y, torch.zeros_like(y)], -1)
+
+    assert not snow.covered(line(-0.5)).any()
+    assert snow.covered(line(0.5)).all()
+    assert snow.covered(line(-1.3)).all()
+    assert snow.depth_over(line(0.6)).mean() == pytest.approx(0.1, rel=0.1)
+
+
+def test_fall_directions():
+    directions = fall_directions(Snow(depth=0.1), 0)
+    assert np.linalg.norm(directions, axis=1) == pytest.approx(1)
+    assert directions.mean(0)[:2] == pytest.approx([0, 0], abs=1e-12)
+    assert np.arccos(-directions[:, 2]) == pytest.approx(0.05 / math.sqrt(2), rel=0.01)
+    windy = fall_directions(Snow(depth=0.1, fall_tilt=0.3, wind_direction=math.pi / 2), 1)
+    assert windy.mean(0) == pytest.approx([-math.sin(0.3), 0, -math.cos(0.3)], abs=2e-3)
+    assert not np.allclose(fall_directions(Snow(depth=0.1), 5), directions)
+
+
+def test_nothing_below_the_water():
+    snow = bake([ground(), Box((-0.5, -0.5, -1.0), (0.5, 0.5, 0.6))]).above(0.3)
+    feet = on_plane(ground(), 300)
+    depth = snow.depth_over(feet)
+    inside = (feet[:, :2].abs() < 0.5).all(1)
+    assert (depth[~inside] == 0).all()
+    assert not snow.covered(feet).any()
+    top = torch.tensor([[0.0, 0.1, 0.6]])
+    assert snow.depth_over(top).item() == pytest.approx(0.1, rel=0.1)
+    # From under the water upwards, and level rays on both sides.
+    o = torch.tensor([[1.0, 1.0, 0.2], [2.0, 0.0, 0.65], [2.0, 0.0, 0.05]])
+    d = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    samples = snow.march(o, d, torch.zeros(3), torch.full((3,), 9.0))
+    counts = samples.offsets.diff()
+    assert counts[0] == 0
+    assert counts[1] > 0
+    assert counts[2] == 0
+
+
+def test_cascades_meet_without_a_step():
+    grid = SnowGrid((0.0, 0.0), (-1.0, 2.0), 0.05, 16, 3)  # 0.8, 1.6 and 3.2 m
+    snow = bake([ground(0.03, 0.4)], 0.1, grid)
+    plane = ground(0.03, 0.4)
+    feet = on_plane(plane, 3000, 3.1)
+    assert snow.covered(feet).all()
+    assert snow.depth_over(feet).numpy() == pytest.approx(0.1, rel=0.1)
+    # A slanting ray through all three lands where it should.
+    direction = torch.tensor([[0.95, 0.1, -0.3]])
+    direction /= direction.norm()
+    points, opacity = first_point(snow, torch.tensor([[-2.9, 0.1, 0.6]]), direction)
+    assert opacity > 0.99
+    assert plane.distance(points).item() == pytest.approx(0.1, abs=0.01)
+
+
+def test_fuzzy_ground():
+    """A fitted surface is not sharp: depth counts from where half of the light is gone."""
+    field = AnalyticField([ground()], extinction=40.0, box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
+    snow = bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=GRID)
+    assert snow is not None
+    own = on_plane(ground(0, 0, -math.log(2) / 40), 300)
+    assert snow.depth_over(own).numpy() == pytest.approx(0.1, rel=0.1)
+
+
+def test_grid_choice():
+    lower, upper = np.array([-190.0, -190.0, -190.0]), np.array([190.0, 190.0, 190.0])
+    street = np.stack([np.linspace(-8, 8, 20), np.zeros(20), np.full(20, 1.6)], 1)
+    grid = choose_grid(lower, upper, street)
+    assert 0.04 <= grid.spacing <= 0.06
+    assert grid.half_side(0) > 12
+    assert grid.half_side(grid.cascades - 1) >= 190
+    assert grid.z_range[0] > -30
+    assert grid.z_range[1] < 50
+    long = choose_grid(lower * 5, upper * 5, street * 40)
+    assert long.cascades <= 5
+    small = choose_grid(np.full(3, -2.0), np.full(3, 2.0), CAMERAS)
+    assert small.cascades == 1
+    assert small.half_side(0) >= 2.0
+    with pytest.raises(ValueError, match="multiple of 16"):
+        SnowGrid((0.0, 0.0), (0.0, 1.0), 0.05, 40)
+
+
+def test_progress_reaches_the_end():
+    seen: list[float] = []
+    field = AnalyticField([ground()], box=((-2.0, -2.0, -1.0), (2.0, 2.0, 3.0)))
+    bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=GRID, progress=seen.append)
+    assert seen[-1] == pytest.approx(1)
+    assert all(np.diff(seen) > 0)

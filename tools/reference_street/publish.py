@@ -1,0 +1,240 @@
+"""The reference set on disk: views, classes, truth, weather, its two variants, checksums.
+
+See docs/reference-scene.md for what lies where.
+"""
+
+import hashlib
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from tools.reference_street import smog, water
+from tools.reference_street.layout import (
+    build_scene,
+    camera_poses,
+    ground_datum,
+    measuring_poses,
+    passers_by,
+)
+from tools.reference_street.render import EXPOSURE, encode, load
+from tools.reference_street.snowfall import snow_meshes
+from tools.reference_street.truth import layers, pixel_rays, snow_layers
+from tools.reference_street.write import (
+    mean_of,
+    save_jpeg,
+    save_png,
+    truths,
+    write_pictures,
+    write_scene,
+)
+
+SNOW = {"snow-thin": 0.03, "snow-deep": 0.15}  # m
+LEVELS = {"flood-low": 0.25, "flood-high": 0.6, "flood-waves": 0.6}  # m above the ground datum
+MOST = 3.0  # times the depth in the open: thicker snow is what hangs over an edge
+WAVE_TIME = 1.0  # s
+EXPOSURE_SPREAD = 0.12  # of the busy variant's pictures, as the logarithm's deviation
+TURN = ((0.5, -0.7, 0.4), 40.0)  # axis and degrees of the turned variant
+SHRUNK, SHIFT = 0.37, (12.0, -5.0, 3.0)  # its units a metre, and where its origin lies
+
+
+def write_reference(store: Path, out: Path, width: int, height: int) -> None:
+    """Write `out`, `out`-busy and `out`-turned."""
+    walk, tests = camera_poses(), measuring_poses()
+    poses = walk + tests
+    write_pictures(store / "clean", out / "images", poses)
+    known = truths(store, poses, width, height)
+    for name, truth in known.items():
+        save_png(truth["label"], out / "labels" / f"{Path(name).stem}.png")
+    heldout = {name for name, _ in tests}
+    write_scene(out, poses, heldout, known, width, height)
+    datum = ground_datum()[0]
+    for name, pose in tests:
+        truth, clean = known[name], EXPOSURE * mean_of(store / "clean", name)
+        _save_arrays(
+            out / "truth" / f"{Path(name).stem}.npz",
+            depth=truth["depth"],
+            normal=truth["normal"].astype(np.float16),
+            sun=truth["sun"].astype(np.float16),
+            clean=clean.astype(np.float16),
+        )
+        rise = pixel_rays(pose, width, height)[..., 2]
+        for kind in smog.VISIBILITY:
+            passed = smog.transmittance(kind, truth["depth"], pose[2, 3], rise, datum)
+            picture = encode(smog.smoggy(clean, passed))
+            save_png(picture, out / "weather" / kind / f"{Path(name).stem}.png")
+            path = out / "weather" / kind / f"{Path(name).stem}.npz"
+            _save_arrays(path, transmittance=passed.astype(np.float16))
+        for group, folder in (
+            *((kind, out / "weather" / kind) for kind in (*LEVELS, *SNOW)),
+            ("mirror", out / "mirror"),
+        ):
+            linear = EXPOSURE * mean_of(store / group, name)
+            save_png(encode(linear), folder / f"{Path(name).stem}.png")
+    scattered = EXPOSURE * mean_of(store / "scattering", tests[0][0])
+    save_png(encode(scattered), out / "scattering" / f"{Path(tests[0][0]).stem}.png")
+    write_snow_truth(store, out, width, height)
+    write_weather_files(out)
+    write_list(out, ".", [name for name, _ in tests])
+    write_busy(store, out, known, width, height)
+    write_turned(out)
+    for folder in (out, beside(out, "busy"), beside(out, "turned")):
+        write_sums(folder)
+
+
+def beside(out: Path, variant: str) -> Path:
+    """Folder of a variant of the set in `out`."""
+    return out.with_name(f"{out.name}-{variant}")
+
+
+def write_snow_truth(store: Path, out: Path, width: int, height: int) -> None:
+    """Depth and thickness of the snow in the test views, kept in the store too."""
+    meshes = build_scene()
+    for kind, depth in SNOW.items():
+        with tempfile.TemporaryDirectory() as scratch:
+            scenes = None
+            for name, pose in measuring_poses():
+                kept = (store / "layers" / f"{kind}-{name}").with_suffix(".npz")
+                if not kept.exists():
+                    if scenes is None:
+                        whole = meshes + snow_meshes(meshes, depth)
+                        snowy = load(whole, Path(scratch), named=True)
+                        scenes = snowy, load(meshes, Path(scratch))
+                    np.savez(kept, **snow_layers(*scenes, pose, width, height))
+                with np.load(kept) as data:
+                    _save_arrays(
+                        out / "weather" / kind / f"{Path(name).stem}.npz",
+                        depth=data["depth"],
+                        # Over an edge the snow reaches half a cell beyond what it lies on.
+                        thickness=np.minimum(data["thickness"], MOST * depth).astype(np.float16),
+                    )
+
+
+def write_weather_files(out: Path) -> None:
+    """What the program is asked for to get each weather, in its own files."""
+    for kind, visibility in smog.VISIBILITY.items():
+        lines = ["[smog]", f'visibility = "{visibility:g} m"', f"colour = {list(smog.COLOUR)}"]
+        if kind in smog.FALLOFF:
+            lines.append(f'height-falloff = "{smog.FALLOFF[kind]:g} m"')
+        _save_text(out / "weather" / f"{kind}.toml", lines)
+    for kind, level in LEVELS.items():
+        wind = water.WIND if kind == "flood-waves" else 0.0
+        lines = [
+            f"seed = {water.SEED}", "[flood]", f'level = "{level:g} m"',
+            f'wind-speed = "{wind:g} m/s"', f"wave-scale = {water.WAVE_SCALE}",
+            "colour = [0.0, 0.0, 0.0]", f"attenuation = {[water.ABSORPTION] * 3}",
+            f"ior = {water.IOR}", "gloss = 1e9",
+        ]  # fmt: skip
+        _save_text(out / "weather" / f"{kind}.toml", lines)
+    for kind, depth in SNOW.items():
+        _save_text(out / "weather" / f"{kind}.toml", ["[snow]", f'depth = "{depth:g} m"'])
+
+
+def write_list(out: Path, truth: str, views: list[str]) -> None:
+    """reference.json: what is measured, and where its truth lies."""
+    kinds = [*smog.VISIBILITY, *LEVELS, *SNOW]
+    data = {
+        "schema_version": 1,
+        "truth": truth,
+        "views": views,
+        "weather": {k: {"time_s": WAVE_TIME if k == "flood-waves" else 0.0} for k in kinds},
+        "mirror_level_m": LEVELS["flood-high"],
+    }
+    _save_text(out / "reference.json", [json.dumps(data, indent=1)])
+
+
+def write_busy(
+    store: Path, out: Path, known: dict[str, dict[str, np.ndarray]], width: int, height: int
+) -> None:
+    """The variant in which people pass and no two pictures are exposed alike."""
+    walk, tests = camera_poses(), measuring_poses()
+    busy, rng = beside(out, "busy"), np.random.default_rng(5)
+    meshes = build_scene()
+    changed = set()
+    for index, (name, pose) in enumerate(walk):
+        someone = passers_by(index)
+        linear = mean_of(store / ("people" if someone else "clean"), name)
+        gain = EXPOSURE * np.exp(EXPOSURE_SPREAD * rng.standard_normal())
+        save_jpeg(gain * linear, busy / "images" / name)
+        if someone:
+            kept = (store / "layers" / f"people-{name}").with_suffix(".npz")
+            if not kept.exists():
+                with tempfile.TemporaryDirectory() as scratch:
+                    scene = load(meshes + someone, Path(scratch), named=True)
+                    np.savez(kept, **layers(scene, meshes + someone, pose, width, height))
+            with np.load(kept) as data:
+                save_png(data["label"], busy / "labels" / f"{Path(name).stem}.png")
+            changed.add(f"labels/{Path(name).stem}.png")
+        changed.add(f"images/{name}")
+
+    def shared(path: str) -> str:
+        return path if path in changed else f"../{out.name}/{path}"
+
+    heldout = {name for name, _ in tests}
+    write_scene(busy, walk + tests, heldout, known, width, height, shared)
+    write_list(busy, f"../{out.name}", [name for name, _ in tests])
+
+
+def write_turned(out: Path) -> None:
+    """The variant without up and metres: transforms.json in a frame of its own."""
+    from climatenerf.scene import load_scene
+    from climatenerf.scene.readers.ply import write_points
+
+    turned = beside(out, "turned")
+    scene = load_scene(out)
+    camera = scene.cameras[0]
+    similarity = np.eye(4)
+    similarity[:3, :3] = SHRUNK * _rotation(*TURN)
+    similarity[:3, 3] = SHIFT
+    frames = []
+    for view in scene.views:
+        pose = similarity @ view.c2w
+        pose[:3, :3] /= SHRUNK
+        opengl = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+        path = f"../{out.name}/images/{view.name}"
+        frames.append({"file_path": path, "transform_matrix": opengl.tolist()})
+    listed = {
+        split: [f"../{out.name}/images/{view.name}" for view in scene.of_split(split)]
+        for split in ("train", "heldout")
+    }
+    data = {
+        "camera_model": "PINHOLE",
+        "w": camera.width, "h": camera.height,
+        "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "ply_file_path": "points.ply",
+        "train_filenames": listed["train"], "test_filenames": listed["heldout"],
+        "frames": frames,
+    }  # fmt: skip
+    _save_text(turned / "transforms.json", [json.dumps(data, indent=1)])
+    assert scene.points is not None
+    write_points(turned / "points.ply", scene.points @ similarity[:3, :3].T + similarity[:3, 3])
+    write_list(turned, f"../{out.name}", [view.name for view in scene.of_split("heldout")])
+
+
+def write_sums(out: Path) -> None:
+    """SHA256SUMS of all files, as sha256sum writes it."""
+    lines = [
+        f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(out).as_posix()}"
+        for path in sorted(out.rglob("*"))
+        if path.is_file() and path.name != "SHA256SUMS"
+    ]
+    _save_text(out / "SHA256SUMS", lines)
+
+
+def _rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
+    """Rodrigues' formula."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    a = np.deg2rad(degrees)
+    return np.eye(3) + np.sin(a) * cross + (1 - np.cos(a)) * cross @ cross
+
+
+def _save_arrays(path: Path, **arrays: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **arrays)
+
+
+def _save_text(path: Path, lines: list[str]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

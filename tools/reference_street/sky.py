@@ -1,0 +1,53 @@
+"""The light: one equirectangular picture of a cloudy sky, bright where the sun is."""
+
+import numpy as np
+from jaxtyping import Float
+
+from tools.reference_street.textures import noise
+
+SUN_AZIMUTH = 218.0  # degrees from +y towards +x: the sun stands over the left, behind the walk
+SUN_ELEVATION = 40.0  # degrees
+SUN_WIDTH = 24.0  # degrees to 1/e: the sun through thin cloud. Broad, so that light which finds it
+# by chance, through water, makes no fireflies at any affordable number of samples.
+SUN_RADIANCE = 5.5  # relative to a cloudy sky of about 0.8
+
+
+def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
+    """Unit world vector towards an azimuth (from +y to +x) and elevation, in degrees."""
+    a, e = np.deg2rad([azimuth, elevation])
+    return np.array([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)])
+
+
+def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
+    """Linear radiance; row 0 is the zenith, column 0 faces +y, and columns turn towards +x."""
+    width = 2 * height
+    rng = np.random.default_rng(11)
+    azimuth = 2 * np.pi * (np.arange(width) + 0.5) / width
+    polar = np.pi * (np.arange(height) + 0.5) / height
+    az, po = np.meshgrid(azimuth, polar)
+    d = np.stack([np.sin(po) * np.sin(az), np.sin(po) * np.cos(az), np.cos(po)], -1)
+    up = np.clip(d[..., 2], 0, 1)[..., None]
+    zenith, horizon = np.array([0.66, 0.74, 0.86]), np.array([0.80, 0.84, 0.88])
+    sky = horizon + (zenith - horizon) * up**0.5
+    # A flat cloud layer seen in perspective: look the noise up where the ray meets the layer.
+    tile = 1024
+    layer = 0.75 * noise((tile, tile), 1.5, rng) + 0.25 * noise((tile, tile), 1.0, rng)
+    plane = d[..., :2] / (up + 0.18) * 190.0
+    low = np.floor(plane).astype(int)
+    fx, fy = np.moveaxis(plane - low, -1, 0)
+    cloud = sum(
+        layer[(low[..., 1] + j) % tile, (low[..., 0] + i) % tile]
+        * (fx if i else 1 - fx)
+        * (fy if j else 1 - fy)
+        for i in (0, 1)
+        for j in (0, 1)
+    )
+    cover = np.clip(1.4 * (cloud - 0.55), 0, 1) * np.clip((up[..., 0] - 0.03) / 0.2, 0, 1)
+    sky += 0.8 * cover[..., None] * (np.array([1.02, 1.0, 0.98]) - sky)
+    sun = direction(SUN_AZIMUTH, SUN_ELEVATION)
+    angle = np.rad2deg(np.arccos(np.clip(d @ sun, -1, 1)))
+    glow = SUN_RADIANCE * np.exp(-((angle / SUN_WIDTH) ** 2))
+    sky += glow[..., None] * np.array([1.0, 0.95, 0.86])
+    below = d[..., 2] < 0
+    sky[below] = np.array([0.16, 0.17, 0.12])  # never seen: the ground reaches past the hills
+    return sky

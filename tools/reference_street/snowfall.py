@@ -1,0 +1,221 @@
+"""Snow on the street: flakes that fall from above on the true meshes, slide, and settle.
+
+Nothing here is shared with the program's own snow. A field of heights as seen from above is filled
+flake by flake. A flake stays on a bare surface with the probability that roofs of that pitch keep
+their snow (EN 1991-1-3, 5.3: all up to 30 degrees, none from 60), on snow up to its angle of
+repose, and else goes on to the lowest neighbour, over an edge if need be. What lies under a roof or
+a table is never reached by a flake from above. Leaves that are level enough keep their share of
+what falls on them; the rest falls through to what lies below the crown, and settles there.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from jaxtyping import Float
+
+from tools.reference_street.geometry import Mesh
+
+# (half width in x, half width in y, cell) in m: fine where the test views look from.
+RINGS = ((16.0, 24.0, 0.03), (40.0, 60.0, 0.12), (200.0, 200.0, 0.8))
+FLAKES = 60  # for each cell
+REPOSE = np.tan(np.deg2rad(50.0))  # of fresh snow on snow
+KEEPS, SHEDS = 30.0, 60.0  # degrees of pitch between which bare surfaces keep less and less
+MOVES = 400  # of one flake at most
+STEEPEST = 2.5  # rise between neighbours, in cells, that still makes one surface
+LEAST = 0.002  # m: less is no snow
+
+
+@dataclass(frozen=True)
+class Cover:
+    """Snow on one field of cells.
+
+    Attributes:
+        x0: of the first cell's middle, m; y0 likewise.
+        cell: side, m.
+        ground: height of the highest surface, m; -inf where there is none.
+        depth: of the snow on it, m.
+    """
+
+    x0: float
+    y0: float
+    cell: float
+    ground: Float[np.ndarray, "rows columns"]
+    depth: Float[np.ndarray, "rows columns"]
+
+
+def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> tuple[Cover, Cover]:
+    """Snow over one of `RINGS`, of a mean depth on open level ground; that on leaves comes last."""
+    half_x, half_y, cell = RINGS[ring]
+    columns, rows = round(2 * half_x / cell), round(2 * half_y / cell)
+    x0, y0 = -half_x + 0.5 * cell, -half_y + 0.5 * cell
+    surfaces = []
+    for leaves in (False, True):
+        top, level = np.full((rows, columns), -np.inf), np.ones((rows, columns))
+        for mesh in meshes:
+            if (mesh.label == "vegetation") == leaves:
+                _from_above(mesh.vertices[mesh.faces], x0, y0, cell, top, level)
+        pitch = np.degrees(np.arccos(np.clip(level, 0, 1)))
+        surfaces.append((top, np.clip((SHEDS - pitch) / (SHEDS - KEEPS), 0, 1)))
+    (ground, keeps), (crown, holds) = surfaces
+    crown[crown <= ground] = -np.inf
+    rng = np.random.default_rng(seed)
+    steepest = STEEPEST * cell
+    lying, held = _settle(ground, keeps, crown, holds, depth / FLAKES, REPOSE * cell, rng)
+    covers = []
+    for top, snow in ((ground, lying), (crown, held)):
+        for _ in range(4):  # single flakes are no bumps
+            snow = _smooth(snow, top, steepest)
+        covers.append(Cover(x0, y0, cell, top, np.where(snow > LEAST, snow, 0.0)))
+    return covers[0], covers[1]
+
+
+def snow_meshes(meshes: list[Mesh], depth: float) -> list[Mesh]:
+    """The snow as meshes: one a ring, each without what finer ones cover."""
+    out = []
+    for ring, (_, _, cell) in enumerate(RINGS):
+        inner = RINGS[ring - 1][:2] if ring else (0.0, 0.0)
+        for where, cover in zip(("", "-leaves"), snow_cover(meshes, depth, ring), strict=True):
+            assert cell == cover.cell
+            mesh = cover_mesh(cover, inner)
+            out.append(mesh.tagged(f"snow{where}-{ring}", "snow", "terrain"))
+    return out
+
+
+def cover_mesh(cover: Cover, inner: tuple[float, float]) -> Mesh:
+    """Tops of all snowy cells, joined where they are one surface, with skirts where they end.
+
+    Args:
+        cover: the snow.
+        inner: half widths, m, of the part that is left out.
+    """
+    rows, columns = cover.depth.shape
+    x = cover.x0 + cover.cell * np.arange(columns)
+    y = cover.y0 + cover.cell * np.arange(rows)
+    snowy = cover.depth > 0
+    top = np.where(snowy, cover.ground + cover.depth, -np.inf)
+    wanted = snowy & ~((np.abs(x)[None] < inner[0]) & (np.abs(y)[:, None] < inner[1]))
+    j, i = np.nonzero(wanted)
+    padded = np.pad(top, 1, constant_values=-np.inf)
+    own = top[j, i]
+    corners = []
+    for dj, di in ((0, 0), (0, 1), (1, 1), (1, 0)):
+        total, count = np.zeros(len(own)), np.zeros(len(own))
+        for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            z = padded[j + dj + a, i + di + b]
+            near = np.abs(z - own) < STEEPEST * cover.cell
+            total += np.where(near, z, 0.0)
+            count += near
+        px, py = x[i] + (di - 0.5) * cover.cell, y[j] + (dj - 0.5) * cover.cell
+        corners.append(np.stack([px, py, total / count], -1))
+    tops = np.stack(corners, 1)  # n 4 3
+    parts = [tops]
+    foot = cover.ground[j, i] - 0.5 * cover.cell
+    for (dj, di), (a, b) in (
+        ((-1, 0), (0, 1)),
+        ((0, 1), (1, 2)),
+        ((1, 0), (2, 3)),
+        ((0, -1), (3, 0)),
+    ):
+        z = padded[j + 1 + dj, i + 1 + di]
+        open_side = ~(np.abs(z - own) < STEEPEST * cover.cell)
+        upper = tops[open_side][:, [a, b]]
+        lower = upper.copy()
+        lower[..., 2] = foot[open_side, None]
+        parts.append(np.stack([lower[:, 0], lower[:, 1], upper[:, 1], upper[:, 0]], 1))
+    quads = np.concatenate(parts)
+    first = 4 * np.arange(len(quads))[:, None]
+    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    vertices = quads.reshape(-1, 3)
+    return Mesh(vertices, faces, np.full((len(vertices), 2), 0.5))
+
+
+@numba.njit(cache=True)
+def _from_above(triangles, x0, y0, cell, ground, level):
+    """Highest surface over each cell's middle, and how level it is (|n_z| of its triangle)."""
+    rows, columns = ground.shape
+    for t in range(len(triangles)):
+        a, b, c = triangles[t]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if abs(area) < 1e-12:  # edge on: 0/0
+            continue
+        i0 = max(int(np.ceil((min(a[0], b[0], c[0]) - x0) / cell)), 0)
+        i1 = min(int(np.floor((max(a[0], b[0], c[0]) - x0) / cell)), columns - 1)
+        j0 = max(int(np.ceil((min(a[1], b[1], c[1]) - y0) / cell)), 0)
+        j1 = min(int(np.floor((max(a[1], b[1], c[1]) - y0) / cell)), rows - 1)
+        n = np.cross(b - a, c - a)
+        upright = abs(n[2]) / np.sqrt((n**2).sum())
+        for j in range(j0, j1 + 1):
+            y = y0 + j * cell
+            for i in range(i0, i1 + 1):
+                x = x0 + i * cell
+                u = ((b[0] - x) * (c[1] - y) - (b[1] - y) * (c[0] - x)) / area
+                v = ((c[0] - x) * (a[1] - y) - (c[1] - y) * (a[0] - x)) / area
+                w = 1.0 - u - v
+                if u < 0 or v < 0 or w < 0:
+                    continue
+                z = u * a[2] + v * b[2] + w * c[2]
+                if z > ground[j, i]:
+                    ground[j, i], level[j, i] = z, upright
+
+
+@numba.njit(cache=True)
+def _settle(ground, keeps, crown, holds, flake, steepest, rng):
+    """Depth of snow, below and on leaves, after all flakes have come to rest, one after the other.
+
+    A flake that has begun to slide goes on to where all snow is kept, or over the edge.
+    """
+    rows, columns = ground.shape
+    depth, held = np.zeros_like(ground), np.zeros_like(ground)
+    for _ in range(FLAKES * rows * columns):
+        j, i = int(rng.random() * rows), int(rng.random() * columns)
+        slides = False
+        if crown[j, i] > -np.inf and rng.random() < holds[j, i]:
+            held[j, i] += flake
+            continue
+        if ground[j, i] == -np.inf:
+            continue
+        for _ in range(MOVES):
+            own = ground[j, i] + depth[j, i]
+            best, best_j, best_i = 0.0, j, i
+            first = int(rng.random() * 8)
+            for k in range(8):
+                dj, di = _STEPS[(first + k) % 8]
+                jj, ii = j + dj, i + di
+                if jj < 0 or ii < 0 or jj >= rows or ii >= columns or ground[jj, ii] == -np.inf:
+                    continue
+                fall = (own - ground[jj, ii] - depth[jj, ii]) / np.sqrt(float(dj * dj + di * di))
+                if fall > best:
+                    best, best_j, best_i = fall, jj, ii
+            slides = keeps[j, i] < 1.0 and (slides or rng.random() >= keeps[j, i])
+            # Bare ground may be as steep as it likes: what it keeps is said above.
+            lies = depth[j, i] < LEAST or best <= steepest
+            if best <= 0.0 or (lies and not slides):
+                depth[j, i] += flake
+                break
+            j, i = best_j, best_i
+    return depth, held
+
+
+_STEPS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
+
+
+@numba.njit(cache=True)
+def _smooth(depth, ground, steepest):
+    """Each depth as the mean of its own and those of the four neighbours on the same surface.
+
+    Cells without a surface have no snow and give none: inf - inf is no height.
+    """
+    rows, columns = depth.shape
+    out = depth.copy()
+    for j in range(1, rows - 1):
+        for i in range(1, columns - 1):
+            total, count = 4 * depth[j, i], 4
+            for k in (1, 3, 4, 6):
+                dj, di = _STEPS[k]
+                apart = abs(ground[j + dj, i + di] - ground[j, i])
+                if apart < steepest:
+                    total += depth[j + dj, i + di]
+                    count += 1
+            out[j, i] = total / count
+    return out
