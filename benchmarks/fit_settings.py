@@ -31,9 +31,9 @@ from climatenerf.training.settings import Losses  # noqa: E402
 
 VARIANTS = {
     "as it is": {},
-    "a least chance of 0.1": {"LEAST_CHANCE": 0.1},
-    "a least chance of 0.1, 16 samples": {"LEAST_CHANCE": 0.1, "CHOSEN": 16},
-    "a least chance of 0.5": {"LEAST_CHANCE": 0.5},
+    "a least chance of 0.1": {"MIN_CHANCE": 0.1},
+    "a least chance of 0.1, 16 samples": {"MIN_CHANCE": 0.1, "CHOSEN": 16},
+    "a least chance of 0.5": {"MIN_CHANCE": 0.5},
     "near matter from the start": {"FIRST_NEAR": 0.0},
     "no pressure below the horizon": {"losses": Losses(solid=0.0)},
     "colours by direction from the start": {"VIEW_SHARES": (1.0, 1.0)},

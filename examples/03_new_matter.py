@@ -52,7 +52,7 @@ field, scene = load_field(run), load_scene(run)
 path = camera_path("still:0020", scene, frames=1, size=(192, 108))
 light = scene_irradiance(field, field.near, scene) / math.pi
 fall = Snow(depth=0.04, slope=math.radians(33))  # ash slides off earlier than snow
-layer = bake_snow(field.trusted(), fall, path.c2w[:, :3, 3], light.numpy())
+layer = bake_snow(field.observed_only(), fall, path.c2w[:, :3, 3], light.numpy())
 world = World(field, field.near, matter=None if layer is None else Ash(layer, light))
 picture, layers = render_frame(world, path.cameras[0], path.c2w[0])
 write_png(run / "ash.png", picture, SIMULATED)

@@ -188,7 +188,7 @@ def test_sheltered_places_stay_bare(fitted, rendered):
     from climatenerf.scene import load_scene
 
     _, run = fitted
-    field = load_field(run).trusted()
+    field = load_field(run).observed_only()
     path = camera_path("still", load_scene(run), 1, (160, 90))
     o, d = camera_rays(path.cameras[0], path.c2w[0])
     depth = torch.from_numpy(rendered["clean"]["depth"]).reshape(-1).float()

@@ -11,7 +11,7 @@ from support.toy_photos import BENT, pattern, photos
 from support.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
-from climatenerf.core.device import array_of
+from climatenerf.core.device import to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json
 from climatenerf.field.checkpoint import load_field
@@ -141,8 +141,8 @@ def test_photos_are_matched_alike_on_both():
             carving = Carving(field, pixels, matched, FitSettings())
             place = matched.rays_o + 0.3 * matched.depth[:, None] * matched.rays_d
             before = carving.in_the_way(place, torch.full_like(matched.depth, 0.01))
-            found.append(array_of(matched.depth))
-            empty.append(array_of(before))
+            found.append(to_numpy(matched.depth))
+            empty.append(to_numpy(before))
     assert len(found[0]) > 300 and np.array_equal(*found)
     assert empty[0].any() and np.array_equal(*empty)
 

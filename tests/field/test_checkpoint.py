@@ -10,7 +10,7 @@ from support.random_field import directions, points, random_field
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.samples import MIN_TAU
 from climatenerf.core.storage import read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import FILE_NAME, SCHEMA_VERSION, load_field, save_field
 from climatenerf.render.volume import render_view
@@ -47,7 +47,7 @@ def test_a_loaded_field_renders_bit_identically(tmp_path, refined):
     assert picture.std() > 0.01
     assert np.array_equal(render_view(loaded, CAMERA, pose), picture)
     x, d = points(field, 200), directions(200)
-    for one, other in ((field, loaded), (field.trusted(), loaded.trusted())):
+    for one, other in ((field, loaded), (field.observed_only(), loaded.observed_only())):
         assert torch.equal(one.density(x), other.density(x))
         assert torch.equal(one.colour(x, d), other.colour(x, d))
         assert torch.equal(one.sky(d), other.sky(d))
@@ -72,7 +72,7 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
     assert torch.equal(loaded.density(x), field.density(x))
     assert torch.equal(loaded.colour(x, d), field.colour(x, d))
     assert not loaded.knows_normals and not loaded.knows_classes
-    assert loaded.thin == LEAST_TAU
+    assert loaded.thin == MIN_TAU
 
 
 def test_a_folder_without_a_field(tmp_path):

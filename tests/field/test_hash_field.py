@@ -177,7 +177,7 @@ def test_rays_of_snow_and_sun_meet_what_cameras_do():
     for name, own, start in (
         ("camera", field, 5 * field.unit),  # from five units away
         ("beside", field, 0.0),
-        ("snow", field.trusted(), 0.0),
+        ("snow", field.observed_only(), 0.0),
     ):
         begin = torch.full((1,), start)
         samples = own.march(o - start * d, d, begin, begin + field.unit)
@@ -194,7 +194,7 @@ def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
     o, d = points(field, 400, spread=0.2), directions(400)
     towards = d * torch.tensor([1.0, 1.0, 0.2])
     field.mark_seen(o, torch.nn.functional.normalize(towards, dim=-1))
-    trusted = field.trusted()
+    trusted = field.observed_only()
     for (name, mine), (_, shared) in zip(
         field.named_parameters(), trusted.named_parameters(), strict=True
     ):

@@ -39,10 +39,10 @@ pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def by(kernels, monkeypatch):
     """From here on all operations are by those kernels."""
     monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: kernels)
-    monkeypatch.setattr(dispatch, "_array", array_of if kernels is cpu else tensor_of)
+    monkeypatch.setattr(dispatch, "_array", to_numpy if kernels is cpu else tensor_of)
 
 
-def array_of(tensor):
+def to_numpy(tensor):
     return tensor_of(tensor).numpy()
 
 
@@ -284,7 +284,7 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     d[0] = torch.nn.functional.normalize(o[0] - field.centre, dim=-1)
     near = torch.full((n,), 0.2)
     for module in (field_module, view_module):
-        monkeypatch.setattr(module, "LEAST_WEIGHT", least)
+        monkeypatch.setattr(module, "MIN_WEIGHT", least)
     with torch.no_grad():
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
@@ -365,10 +365,12 @@ def test_places_that_views_agree_on(generator):
     row = torch.cat([each.view(-1) for each in maps]).to(torch.uint8)
     views = row, torch.cat([ends[:1] * 0, ends[:-1]]), sizes, pinholes, c2w
     for least in ((1, 0.5, 0.2), (2, 0.7, 0.5)):
-        ours = dispatch.voices_of(
+        ours = dispatch.label_votes(
             x.to(DEVICE), radius.to(DEVICE), tuple(each.to(DEVICE) for each in views), least
         ).cpu()
-        real = reference.voices_of(x, radius, [each.float() for each in maps], pinholes, c2w, least)
+        real = reference.label_votes(
+            x, radius, [each.float() for each in maps], pinholes, c2w, least
+        )
         # Rounding may put a place that lies on a pixel's border into its neighbour.
         assert (ours != real).sum() <= 1 and 10 < real.sum() < 200
 

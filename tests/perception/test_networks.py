@@ -51,7 +51,7 @@ def test_classes_of_no_kin_are_unknown(tmp_path):
 def test_few_scores_at_once_give_labels_of_full_size(tmp_path, monkeypatch):
     network = load_segmentation(str(networks.save_segformer(tmp_path / "net")))
     whole = network.predict(networks.picture())
-    monkeypatch.setattr("climatenerf.perception.segmentation._MOST_NUMBERS", 5 * 30 * 48 // 4)
+    monkeypatch.setattr("climatenerf.perception.segmentation._MAX_NUMBERS", 5 * 30 * 48 // 4)
     coarse = network.predict(networks.picture())
     assert coarse.shape == whole.shape and (coarse == whole).mean() > 0.7
 

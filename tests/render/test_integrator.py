@@ -10,7 +10,7 @@ from support.analytic_fields import AnalyticField, Box, HalfSpace
 from support.random_field import directions, random_field
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.samples import LEAST_TAU, Samples
+from climatenerf.core.samples import MIN_TAU, Samples
 from climatenerf.render import integrator as trace_module
 from climatenerf.render.frame import render_frame
 from climatenerf.render.integrator import trace
@@ -200,7 +200,7 @@ def test_a_bed_s_rays_leave_out_next_to_nothing(monkeypatch):
     linear(World(street()))
     assert set(asked) == {None}
     linear(World(street(), water=flooded()))
-    assert set(asked) == {None, LEAST_TAU}
+    assert set(asked) == {None, MIN_TAU}
 
 
 def test_flooded_pixels_are_nested_as_the_level_rises():

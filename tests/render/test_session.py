@@ -27,7 +27,7 @@ C2W[:3, 3] = (0.0, -3.0, 1.6)
 class Place(AnalyticField):
     near: float = 0.0
 
-    def trusted(self):
+    def observed_only(self):
         return self
 
 

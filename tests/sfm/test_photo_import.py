@@ -126,7 +126,7 @@ def test_too_few(tmp_path, count):
 def test_large_pictures_are_made_smaller_and_huge_ones_refused(tmp_path, monkeypatch):
     fill(tmp_path / "in", 3)
     monkeypatch.setattr(module, "LONGEST", 100)
-    monkeypatch.setattr(module, "MOST_PIXELS", 100_000)
+    monkeypatch.setattr(module, "MAX_PIXELS", 100_000)
     photo(tmp_path / "in" / "large.jpg", (300, 150))
     photo(tmp_path / "in" / "huge.png", (600, 400))
     taken = take_in(tmp_path / "in", tmp_path / "work", quiet)

@@ -8,7 +8,7 @@ import torch
 from support.toy_scene import TINY, make_scene
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.samples import MIN_TAU
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import Dry, Place
 from climatenerf.field.checkpoint import load_field
@@ -78,7 +78,7 @@ def test_each_row_leaves_out_just_what_it_says():
     plain = rows["plain NGP"]
     assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
     assert not plain.sky_labels and not plain.match and plain.decay == 0 < full.decay
-    assert not plain.cautious and not plain.crowded and plain.thin == LEAST_TAU < full.thin
+    assert not plain.cautious and not plain.crowded and plain.thin == MIN_TAU < full.thin
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 

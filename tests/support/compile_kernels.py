@@ -82,7 +82,7 @@ def compile_all() -> None:
     maps, few = torch.zeros(s, dtype=torch.uint8), torch.zeros(2, dtype=torch.long)
     views = maps, few, torch.zeros(2, 2, dtype=torch.long), torch.zeros(2, 4), torch.zeros(2, 4, 4)
     for count in (views, tuple(each[:1] for each in views)):
-        gpu_witness.voices_of(u, some, count, (1, 0.1, 0.5), maps)
+        gpu_witness.label_votes(u, some, count, (1, 0.1, 0.5), maps)
     gpu.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
     for size in PRESETS.values():  # their widths are constants of the kernels
         rays = torch.zeros(n, size.colour_hidden), order

@@ -426,13 +426,15 @@ def test_a_checkpoint_in_the_middle_knows_what_photos_see(scene, tmp_path):
         fitting.run(stop_at(20))
     checkpoint(fitting, tmp_path)
     early = load_field(tmp_path)
-    assert early.trusted().occupancy.occupied.any(), "all is haze: nothing is seen, all is trusted"
+    assert early.observed_only().occupancy.occupied.any(), (
+        "all is haze: nothing is seen, all is trusted"
+    )
     with torch.no_grad():
         fitting.field.geometry_net[-1].add_(8.0)  # surfaces, as a longer fit would find
     checkpoint(fitting, tmp_path)
     field = load_field(tmp_path)
     assert field.occupancy.seen.sum() > 10
-    assert 0 < field.trusted().occupancy.occupied.sum() < field.occupancy.occupied.sum()
+    assert 0 < field.observed_only().occupancy.occupied.sum() < field.occupancy.occupied.sum()
 
 
 def test_a_resumed_run_stays_in_its_own_metres(scene, tmp_path):

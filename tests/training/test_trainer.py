@@ -11,7 +11,7 @@ from support.toy_scene import CAMERA, FIELD, make_scene, picture
 
 from climatenerf.core.classes import ROAD, SKY, VEHICLE
 from climatenerf.core.colour import decode_srgb, encode_srgb
-from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.samples import MIN_TAU
 from climatenerf.evaluation.metrics import psnr
 from climatenerf.field.normalisation import find_extent
 from climatenerf.ops import dispatch
@@ -214,7 +214,7 @@ def test_thin_matter_counts_as_empty_once_light_ends_on_dense(scene, steps):
             met = tau[tau > field.thin]
             fitting.thin_out(met, torch.ones_like(met))
             if step < fit.THIN_FROM * steps:
-                assert field.thin == LEAST_TAU
+                assert field.thin == MIN_TAU
         ends[kind] = field.thin
     assert ends["surfaces"] == pytest.approx(fitting.settings.thin)
     assert ends["haze"] < 0.5 * fitting.settings.thin

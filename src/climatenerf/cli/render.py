@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from climatenerf.paths.camera_path import CameraPath
     from climatenerf.render.session import Stage
 
-MOST_RAYS = 2**26  # in one frame: 6 GB
+MAX_RAYS = 2**26  # in one frame: 6 GB
 PREVIEW = "preview.png"
 LAYER_NAMES = ("depth", "normal", "label", "water_depth", "transmittance", "snow_thickness",
                "mask_water", "mask_snow", "mask_smog")  # fmt: skip
@@ -199,10 +199,10 @@ def check_fps(fps: float) -> float:
 def check_amount(size: tuple[int, int], supersample: int) -> None:
     """Refuses frames that would not fit into memory."""
     rays = size[0] * size[1] * supersample**2
-    if max(size) > 8192 or rays > MOST_RAYS:
+    if max(size) > 8192 or rays > MAX_RAYS:
         raise UserError(
             f"a frame of {size[0]}x{size[1]} pixels with {supersample}x{supersample} rays each is"
-            f" too large; at most 8192 pixels a side and {MOST_RAYS / 1e6:.0f} million rays"
+            f" too large; at most 8192 pixels a side and {MAX_RAYS / 1e6:.0f} million rays"
         )
 
 

@@ -12,28 +12,28 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 
-def placed(array: np.ndarray) -> Tensor:
+def to_device(array: np.ndarray) -> Tensor:
     """An array's numbers on the device in use; on a CPU they share its memory."""
     return torch.from_numpy(array).to(torch.get_default_device())
 
 
-def array_of(tensor: Tensor) -> np.ndarray:
+def to_numpy(tensor: Tensor) -> np.ndarray:
     """A tensor's numbers on the CPU; it shares the memory of one that is there."""
     return tensor.detach().cpu().numpy()
 
 
 def uniform(generator: torch.Generator, *shape: int) -> Float[Tensor, "..."]:
     """Random numbers in [0,1)."""
-    return sent(torch.rand(shape, generator=generator, device="cpu"))
+    return upload(torch.rand(shape, generator=generator, device="cpu"))
 
 
 def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> Int[Tensor, "..."]:
     """Random whole numbers from low to high - 1."""
     drawn = torch.randint(low, high, shape, generator=generator, device="cpu")
-    return sent(drawn)
+    return upload(drawn)
 
 
-def sent(tensor: Tensor) -> Tensor:
+def upload(tensor: Tensor) -> Tensor:
     """Numbers of the CPU on the device in use; on a GPU they arrive before they are asked for."""
     device = torch.get_default_device()
     if device.type != "cuda":

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-LEAST_WEIGHT = 1e-4  # samples that weigh less are given no colour
-LEAST_TAU = 1e-3  # optical depth of samples that count as empty; later in a fit `Field.thin`
+MIN_WEIGHT = 1e-4  # samples that weigh less are given no colour
+MIN_TAU = 1e-3  # optical depth of samples that count as empty; later in a fit `Field.thin`
 
 
 @dataclass

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.samples import MIN_TAU
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, warp_error
@@ -234,7 +234,7 @@ def open_sky(place: Place) -> float:
     rays_o[:, 2] += LIFTED
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(found), 3).contiguous()
     start, end = torch.zeros(len(found)), torch.full((len(found),), 1e9)
-    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP, thin=LEAST_TAU)
+    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP, thin=MIN_TAU)
     _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
     return float(left.mean())
 

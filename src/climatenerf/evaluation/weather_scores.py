@@ -10,7 +10,7 @@ from climatenerf.render.depth_normals import plane_normals
 JOINED, JOINED_SHARE = 0.5, 0.05  # m, and of the distance: neighbours this close are one surface
 NEAR = 30.0  # m: snow is compared up to here
 NO_LINE = 10.0  # m: said of a line that is not there, and the most of one that is
-LEAST_SNOW = 0.005  # m: less is bare ground
+MIN_SNOW = 0.005  # m: less is bare ground
 
 Layers = dict[str, np.ndarray]
 
@@ -116,7 +116,7 @@ def snow_scores(
         thickness = real["thickness"].astype(np.float64)
         rays_c = truth.rays_d @ truth.c2w[:3, :3]
         place = ground_or_roof(truth) & (truth.depth < NEAR)
-        white = place & (thickness > LEAST_SNOW) & np.isfinite(real["depth"])
+        white = place & (thickness > MIN_SNOW) & np.isfinite(real["depth"])
         normal = plane_normals(np.zeros(3), rays_c, real["depth"], pixel_angle)
         depth = np.minimum(ours["depth"], 2 * np.where(white, real["depth"], 1.0))
         gap = np.abs(depth - np.where(white, real["depth"], depth)) * np.abs(

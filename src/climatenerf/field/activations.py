@@ -10,7 +10,7 @@ from torch import Tensor
 from climatenerf.core.colour import decode_srgb
 from climatenerf.core.vectors import length
 from climatenerf.ops.cpu import activations as cpu_pointwise
-from climatenerf.ops.cpu.activations import BLACK, LARGEST_RAW, LEAST_SLOPE, SHARPNESS
+from climatenerf.ops.cpu.activations import BLACK, LARGEST_RAW, MIN_SLOPE, SHARPNESS
 
 
 def radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -68,7 +68,7 @@ class _Brightness(torch.autograd.Function):
         (x,) = ctx.saved_tensors
         slope = torch.sigmoid(SHARPNESS * x)
         # Steps go against the gradient: negative ones brighten.
-        return grad * torch.where(grad < 0, slope.clamp_min(LEAST_SLOPE), slope * (x > BLACK))
+        return grad * torch.where(grad < 0, slope.clamp_min(MIN_SLOPE), slope * (x > BLACK))
 
 
 class _Radiance(torch.autograd.Function):

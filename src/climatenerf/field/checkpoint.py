@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.core.errors import UserError
-from climatenerf.core.samples import LEAST_TAU
+from climatenerf.core.samples import MIN_TAU
 from climatenerf.core.storage import check_schema, read_safetensors, write_safetensors
 from climatenerf.field.hash_field import Field
 from climatenerf.field.occupancy import Occupancy
@@ -50,7 +50,7 @@ def load_field(run: Path) -> Field:
         about = json.loads(metadata["climatenerf"])
         check_schema(about["schema_version"], SCHEMA_VERSION, f"the field in {run}")
         size = FieldSize(**about["size"])
-        thin = about.get("thin", LEAST_TAU)  # earlier runs ended with what fits begin with
+        thin = about.get("thin", MIN_TAU)  # earlier runs ended with what fits begin with
         numbers = [about["unit"], about["near"], thin, *arrays["centre"].tolist()]
         if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0 or thin < 0:
             raise ValueError("a length is not a finite number above 0, or a bound is below it")
@@ -59,7 +59,7 @@ def load_field(run: Path) -> Field:
         )
         field.thin = float(thin)
         field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
-        tensors = {k: placed(v) for k, v in arrays.items()}
+        tensors = {k: to_device(v) for k, v in arrays.items()}
         if about["schema_version"] == 1:  # without normals and classes: nothing is learned of them
             fresh = field.state_dict()
             tensors |= {k: fresh[k] for k in fresh if k.startswith(("surface_", "learned"))}

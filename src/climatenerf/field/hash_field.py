@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from climatenerf.core.classes import SOLID
-from climatenerf.core.samples import LEAST_TAU, LEAST_WEIGHT, Samples
+from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples
 from climatenerf.core.vectors import unit as unit_vector
 from climatenerf.field import activations
 from climatenerf.field import spherical_harmonics as directions
@@ -79,7 +79,7 @@ class Field(nn.Module):
         self.size = size
         self.unit = unit
         self.near = near
-        self.thin = LEAST_TAU
+        self.thin = MIN_TAU
         """Optical depth below which a sample on a camera's ray is empty; see `training.fit`."""
         self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
         self.register_buffer(
@@ -255,7 +255,7 @@ class Field(nn.Module):
             torch.stack([t_min / self.unit, endless, start], dim=-1),
             self.occupancy.cells(),
             (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin if thin is None else thin),
-            (stop, LEAST_WEIGHT),
+            (stop, MIN_WEIGHT),
             self._net(),
             ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
         )
@@ -331,7 +331,7 @@ class Field(nn.Module):
         cells, inside = self._cells(self.to_grid(x))
         self.occupancy.seen.view(-1)[cells[inside]] = 1
 
-    def trusted(self) -> "Field":
+    def observed_only(self) -> "Field":
         """The same field without what no training image has seen (shares all parameters).
 
         Photos say nothing about space that they do not show; haze left there would shelter the
@@ -339,7 +339,7 @@ class Field(nn.Module):
         Rays of snow and sun begin beside matter, with fine steps, so next to none counts as empty.
         """
         twin = copy.copy(self)
-        twin.thin = LEAST_TAU
+        twin.thin = MIN_TAU
         if not bool(self.occupancy.seen.any()):
             return twin
         twin.__dict__["_modules"] = dict(self._modules)

@@ -363,27 +363,27 @@ Views = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 c2w."""
 
 
-def voices_of(
+def label_votes(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
     views: Views,
     least: tuple[int, float, float],
 ) -> Bool[Tensor, "n"]:
-    """See `reference.voices_of`."""
+    """See `reference.label_votes`."""
     kernels = _kernels(x, radius, *views)
     if kernels is None:
         reach, starts, sizes, pinholes, c2w = views
         corners = zip(starts.tolist(), sizes.tolist(), strict=True)
         maps = [reach[start : start + h * w].view(h, w) for start, (h, w) in corners]
-        return reference.voices_of(x, radius, maps, pinholes, c2w, least)
+        return reference.label_votes(x, radius, maps, pinholes, c2w, least)
     agreed = torch.empty_like(radius, dtype=torch.uint8)
     given = _array(x), _array(radius), tuple(map(_array, views)), least
     if kernels is cpu:
-        cpu.voices_of(*given, _array(agreed))
+        cpu.label_votes(*given, _array(agreed))
     else:
         from climatenerf.ops.triton import visual_hull as gpu_witness
 
-        gpu_witness.voices_of(*given, agreed)
+        gpu_witness.label_votes(*given, agreed)
     return agreed.bool()
 
 

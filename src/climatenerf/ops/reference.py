@@ -233,7 +233,7 @@ def merge_order(
     return torch.cat(order), offsets_a + offsets_b
 
 
-def voices_of(
+def label_votes(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
     reach: list[Tensor],

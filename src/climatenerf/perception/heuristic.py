@@ -25,14 +25,14 @@ WORKING_SIZE = 800
 """Photos are looked at with at most this many pixels on the longer side."""
 SAMPLE = 16
 """Photos by which a capture is judged to be outdoors."""
-LEAST_SHARE = 0.25
+MIN_SHARE = 0.25
 """Of these, the share that must show sky."""
 
 _EDGE = 3  # pixels of the working size between sky and what is not
 _GAP = 4  # width of wires and twigs over which sky goes on, working pixels
 _SMOOTH = 0.035  # largest step to a neighbour, of display values 0 to 1
 _FIT = 0.06  # from the smooth colour of a photo's sky, display values
-_LEAST_AREA = 0.004  # of the photo
+_MIN_AREA = 0.004  # of the photo
 _HORIZON = np.sin(np.radians(1.5))  # levelling is good to a few degrees
 _BELOW = np.sin(np.radians(-4.0))
 _KNOTS = 33
@@ -79,7 +79,7 @@ def shows_sky(scene: Scene) -> bool:
     every = max(1, len(scene.views) // SAMPLE)
     sample = scene.views[every // 2 :: every][:SAMPLE]
     found = [bool((simple_labels(view, scene, None) == SKY).any()) for view in sample]
-    return sum(found) >= max(2, LEAST_SHARE * len(found))
+    return sum(found) >= max(2, MIN_SHARE * len(found))
 
 
 def find_sky(
@@ -103,7 +103,7 @@ def find_sky(
         return nothing
     # Not stopped at the horizon: what looks like sky and goes on below it is a wall or a road.
     sky = _spread(seeds, coloured & smooth)
-    if sky.mean() < _LEAST_AREA:
+    if sky.mean() < _MIN_AREA:
         return nothing
     for _ in range(2):  # the second time knowing how the sky goes on behind wires and twigs
         alike = coloured & _fits(values, sky)
@@ -117,7 +117,7 @@ def find_sky(
     if (solid & sky).sum() > 0.3 * sky.sum():
         return nothing
     sky = ~_grown(~sky, _EDGE) & ~solid
-    return sky if sky.mean() >= _LEAST_AREA else nothing
+    return sky if sky.mean() >= _MIN_AREA else nothing
 
 
 def _sky_coloured(values: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:

@@ -32,7 +32,7 @@ _STEEP = 0.8  # of the ground
 _SUPPORT = 3.0  # cells that a plane must rest on
 _ROUNDS = 6
 _CROWD = 0.2  # standing points to one on the ground
-_LEAST_POINTS = 4  # of ground in a photo
+_MIN_POINTS = 4  # of ground in a photo
 _FAR = -0.05  # sine of the ray to the furthest ground, 20 camera heights away
 _EDGES = 25.0  # how much longer a way is with steps of all the display range
 _BORDER, _BORDERS = 0.15, 5.0  # change that is a border; reaches for one of all the display range
@@ -101,7 +101,7 @@ def find_ground_in(
     pixels = np.floor(np.where(np.isfinite(pixels), pixels, -1).clip(-1, 1e6)).astype(np.int64)
     inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
     pixels //= every
-    if (on & inside).sum() < _LEAST_POINTS:
+    if (on & inside).sum() < _MIN_POINTS:
         return nothing
     drop = float(np.median(pose[2, 3] - points[on & inside, 2]))
     below = rays[..., 2] < _FAR

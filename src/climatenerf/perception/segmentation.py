@@ -46,8 +46,8 @@ NEAREST = {
     "minibike": "motorcycle",
     "signboard": "traffic sign",
 }
-LEAST_CLASSES = 3
-_MOST_NUMBERS = 2**27  # of scores held at once, half a gigabyte
+MIN_CLASSES = 3
+_MAX_NUMBERS = 2**27  # of scores held at once, half a gigabyte
 
 
 def train_ids(names: Mapping[int, str], model: str) -> UInt8[np.ndarray, " n"]:
@@ -67,7 +67,7 @@ def train_ids(names: Mapping[int, str], model: str) -> UInt8[np.ndarray, " n"]:
         name = NEAREST.get(name, name)
         if name in CITYSCAPES:
             table[number] = CITYSCAPES.index(name)
-    if len(set(table[table != UNKNOWN].tolist())) < LEAST_CLASSES:
+    if len(set(table[table != UNKNOWN].tolist())) < MIN_CLASSES:
         some = ", ".join(list(names.values())[:3])
         raise UserError(
             f"the model {model} does not name its classes as Cityscapes or ADE20K do (it has:"
@@ -93,7 +93,7 @@ def load_segmentation(name: str) -> Network:
 
         height, width = picture.shape[:2]
         # Scores of many classes for each pixel of a large photo would fill the memory.
-        shrink = max(1.0, math.sqrt(len(ids) * height * width / _MOST_NUMBERS))
+        shrink = max(1.0, math.sqrt(len(ids) * height * width / _MAX_NUMBERS))
         size = max(1, round(height / shrink)), max(1, round(width / shrink))
         with torch.inference_mode():
             inputs = processor(images=Image.fromarray(picture), return_tensors="pt", **tasked)

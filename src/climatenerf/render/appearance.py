@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.field.hash_field import Field
 
 FALL = 4  # with which power of its distance a photo's say falls; 2 and 6 do as well
@@ -29,5 +29,5 @@ def nearby_appearance(
     way = np.linalg.norm(photos[:, :3, 3] - c2w[:3, 3], axis=-1) / field.unit
     # 1e-3: from where a photo was taken its distance is 0, and 1/0 has no share.
     share = (1e-3 + np.hypot(angle, way)) ** -FALL
-    share = placed((share / share.sum()).astype(np.float32))
+    share = to_device((share / share.sum()).astype(np.float32))
     return (share @ field.embeddings)[None].detach()

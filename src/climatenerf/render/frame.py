@@ -10,7 +10,7 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
-from climatenerf.core.device import array_of, placed
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.hash_field import Field
 from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
@@ -48,7 +48,7 @@ def render_frame(
 
 def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Linear radiance as a screen shows it."""
-    return array_of((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8))
+    return to_numpy((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8))
 
 
 def traced_rays(
@@ -120,16 +120,16 @@ def _surface(
     """Normals and classes that the field has learned for a picture's rays; None what it has not."""
     if not isinstance(field, Field) or not (field.knows_normals or field.knows_classes):
         return None, None
-    rays_d = placed(directions.reshape(-1, 3))
-    origin = placed(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
+    rays_d = to_device(directions.reshape(-1, 3))
+    origin = to_device(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
     normal, label = see_surface(field, origin, rays_d)
     return (
-        array_of(normal.view(directions.shape)) if field.knows_normals else None,
-        array_of(label.view(directions.shape[:2])) if field.knows_classes else None,
+        to_numpy(normal.view(directions.shape)) if field.knows_normals else None,
+        to_numpy(label.view(directions.shape[:2])) if field.knows_classes else None,
     )
 
 
 def _middle(values: Tensor, shape: tuple[int, int, int, int]) -> np.ndarray:
     """Of each pixel's sub-pixels the one next to its centre."""
     middle = shape[1] // 2
-    return array_of(values.view(*shape, *values.shape[1:])[:, middle, :, middle])
+    return to_numpy(values.view(*shape, *values.shape[1:])[:, middle, :, middle])

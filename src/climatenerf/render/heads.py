@@ -5,7 +5,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from climatenerf.core.classes import SKY, SOLID
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import dispatch
 from climatenerf.render.volume import rays_at_once, weighed_samples
@@ -37,6 +37,6 @@ def see_surface(
         away = (mean * d).sum(-1, keepdim=True) > 0
         normals.append(torch.where(away, -mean, mean))
         best = dispatch.accumulate(seen.weights, logits, seen.offsets).argmax(-1)
-        kind = placed(SOLID)[best].to(torch.uint8)
+        kind = to_device(SOLID)[best].to(torch.uint8)
         labels.append(torch.where(solid, kind, torch.full_like(kind, SKY)))
     return torch.cat(normals), torch.cat(labels)

@@ -13,16 +13,24 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.core.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
+from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples, offsets_of
 from climatenerf.ops import dispatch
 from climatenerf.render.volume import RENDER_STEP, composited, rays_at_once
 from climatenerf.weather.flood import optics as water_physics
 from climatenerf.weather.flood import waves
 from climatenerf.weather.smog import medium as smog
-from climatenerf.weather.world import SKY_OPACITY, TINY, FieldLike, Seen, Water, World, together
+from climatenerf.weather.world import (
+    SKY_OPACITY,
+    TINY,
+    FieldLike,
+    RenderOutput,
+    Water,
+    World,
+    concatenate,
+)
 
 HIDDEN = 1e-3  # what this share of the light or less comes from is not looked for
-LEAST_SHARE = 1.0 / 2048  # of a pixel that water must have to be traced: below an 8-bit step
+MIN_SHARE = 1.0 / 2048  # of a pixel that water must have to be traced: below an 8-bit step
 BOUNCES = 2  # meetings with the water, then the plain field
 SECONDARY_STEP = 5.0  # marching step of what is seen by way of the water; RENDER_STEP: of the rest
 SKIN = 2e-3  # secondary rays begin this far from the water, m
@@ -35,7 +43,7 @@ def trace(
     rays_d: Float[Tensor, "n 3"],
     pixel_angle: Float[Tensor, "n"],
     roll: Float[Tensor, "n"] | None = None,
-) -> Seen:
+) -> RenderOutput:
     """What camera rays see. Independent of how rays are grouped.
 
     Args:
@@ -60,7 +68,7 @@ def trace(
                 bounces=BOUNCES,
             )
         )
-    return together(parts, slice(None))
+    return concatenate(parts, slice(None))
 
 
 def _trace(
@@ -71,7 +79,7 @@ def _trace(
     roll: Float[Tensor, "n"] | None,
     t_min: Float[Tensor, "n"],
     bounces: int,
-) -> Seen:
+) -> RenderOutput:
     """See `trace`; at most `bounces` more meetings with the water, then the plain field."""
     n = rays_o.shape[0]
     water = world.water if bounces > 0 else None
@@ -90,7 +98,7 @@ def _trace(
                 given = (rays_o[wet], rays_d[wet], pixel_angle[wet])
                 turn = None if roll is None else roll[wet]
                 parts.append(_trace(world, *given, turn, t_min[wet], bounces))
-            return together(parts, torch.cat([dry, wet]).argsort())
+            return concatenate(parts, torch.cat([dry, wet]).argsort())
     samples, is_matter = _all_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
@@ -109,7 +117,7 @@ def _trace(
     sky_share = left * (t_plane == torch.inf)
 
     # --- Light of the matter this side of the water, through the air -----------------------------
-    keep = (front > LEAST_WEIGHT).nonzero()[:, 0]
+    keep = (front > MIN_WEIGHT).nonzero()[:, 0]
     colour = _sample_colour(world, samples, ray, is_matter, keep, rays_o, rays_d)
     own_t = samples.t[keep]
     colour = _through(world, water, below[ray[keep]], colour, rays_o, rays_d, ray[keep], own_t)
@@ -118,7 +126,7 @@ def _trace(
 
     # --- Sky ---------------------------------------------------------------------------------
     endless = torch.full((n,), torch.inf)
-    skyward = (sky_share > LEAST_WEIGHT).nonzero()[:, 0]
+    skyward = (sky_share > MIN_WEIGHT).nonzero()[:, 0]
     sky = world.field.sky(rays_d[skyward])
     sky = _through(world, water, below[skyward], sky, rays_o, rays_d, skyward, endless[skyward])
     rgb = rgb.index_add(0, skyward, sky_share[skyward, None] * sky)
@@ -126,7 +134,7 @@ def _trace(
     # --- Water ---------------------------------------------------------------------------------
     water_depth = torch.zeros(n)
     wave_normal = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
-    wet = (water_share > LEAST_SHARE).nonzero()[:, 0]
+    wet = (water_share > MIN_SHARE).nonzero()[:, 0]
     if water is not None and wet.numel():
         bed_t = _sum(weights * beyond * samples.t, samples.offsets) / _sum(
             weights * beyond, samples.offsets
@@ -167,17 +175,17 @@ def _trace(
         thickness = dispatch.accumulate(front[mine], height[:, None], offsets_of(ray[mine], n))[
             :, 0
         ]
-        thickness = thickness / snow_share.clamp_min(TINY) * (snow_share > LEAST_SHARE)
+        thickness = thickness / snow_share.clamp_min(TINY) * (snow_share > MIN_SHARE)
     normal = torch.where((water_share > 0.5)[:, None], wave_normal, torch.zeros(n, 3))
     if world.matter is not None and bounces == BOUNCES:
         mine = ((snow_share > 0.5) & (water_share <= 0.5)).nonzero()[:, 0]
         normal[mine] = world.matter.normal(rays_o[mine] + depth[mine, None] * rays_d[mine])
-    return Seen(
+    return RenderOutput(
         rgb=rgb,
         depth=depth,
         normal=normal,
         transmittance=air,
-        water_depth=water_depth * (water_share > LEAST_SHARE),
+        water_depth=water_depth * (water_share > MIN_SHARE),
         snow_thickness=thickness,
         mask_water=water_share.clamp_max(1.0),
         mask_snow=snow_share,
@@ -187,15 +195,15 @@ def _trace(
 
 def _see_plain(
     field: FieldLike, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
-) -> Seen:
+) -> RenderOutput:
     """What rays see of the scene without weather: as `_trace`, in one go on a GPU."""
     n = t_min.shape[0]
     rgb, left, far = composited(field, rays_o, rays_d, t_min, step_scale)
-    skyward = (left > LEAST_WEIGHT).nonzero()[:, 0]
+    skyward = (left > MIN_WEIGHT).nonzero()[:, 0]
     rgb = rgb.index_add(0, skyward, left[skyward, None] * field.sky(rays_d[skyward]))
     depth = far / (1 - left).clamp_min(TINY)
     nothing = torch.zeros(n)
-    return Seen(
+    return RenderOutput(
         rgb=rgb,
         depth=torch.where(left < SKY_OPACITY, depth, torch.full_like(depth, torch.inf)),
         normal=torch.zeros(n, 3),
@@ -255,7 +263,7 @@ def _beyond(
     the rays that have matter within a pixel of the plane.
     """
     beyond = (samples.t > t_plane[ray]).float()
-    some = ((weights > LEAST_WEIGHT) & (t_plane[ray] < torch.inf)).nonzero()[:, 0]
+    some = ((weights > MIN_WEIGHT) & (t_plane[ray] < torch.inf)).nonzero()[:, 0]
     own = ray[some]
     arguments = (t_plane[own], samples.t[some], rays_d[own], pixel_angle[own])
     soft = water_physics.shore_coverage(*arguments)
@@ -397,13 +405,13 @@ def _other_side(
     beta = torch.tensor(water_physics.attenuation(water.flood))
     # Under the straight ray's depth of opaque water no bed shows: no ray is spent on it. Light
     # comes down through the depth and goes up through at least as much.
-    shows = torch.exp(-2 * beta.min() * depth) > LEAST_SHARE
+    shows = torch.exp(-2 * beta.min() * depth) > MIN_SHARE
     down = (~below & shows & (direction[:, 2] < 0)).nonzero()[:, 0]
     if down.numel():
         o, d = start[down], direction[down]
         zero = torch.zeros(down.shape[0])
         # A bed is seen as it is; its steps are fine.
-        matter, left, length = composited(world.field, o, d, zero, RENDER_STEP, thin=LEAST_TAU)
+        matter, left, length = composited(world.field, o, d, zero, RENDER_STEP, thin=MIN_TAU)
         opacity = (1 - left).clamp_min(TINY)
         dry, path = matter / opacity[:, None], length / opacity
         light = water_physics.light_cosine(water.flood, water.sun_elevation)

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.render.integrator import Seen, trace
-from climatenerf.weather.world import World, together
+from climatenerf.render.integrator import RenderOutput, trace
+from climatenerf.weather.world import World, concatenate
 
 SPACINGS = (4, 2, 1)  # rays between those that are known after each pass
 
@@ -20,7 +20,7 @@ Rays = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Flo
 
 def trace_coarse_first(
     world: World, rays: Rays, width: int, show: Callable[[Float[Tensor, "h w 3"]], None]
-) -> Seen:
+) -> RenderOutput:
     """`trace` of a picture's rays, row by row, coarse ones first.
 
     Args:
@@ -42,4 +42,4 @@ def trace_coarse_first(
             linear[some], known[some] = parts[-1].rgb, True
         nearest = row // spacing * spacing * width + column // spacing * spacing
         show(linear[nearest].view(-1, width, 3))
-    return together(parts, torch.cat(order).argsort())
+    return concatenate(parts, torch.cat(order).argsort())

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.core.device import array_of
+from climatenerf.core.device import to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.field.hash_field import Field
 from climatenerf.render.irradiance import scene_irradiance
@@ -104,10 +104,10 @@ def prepare(
     snow = None
     if snowy:
         snow = bake_snow(
-            field.trusted(),
+            field.observed_only(),
             snowy[-1].snow,
             places,
-            array_of(irradiance / math.pi),
+            to_numpy(irradiance / math.pi),
             sun_direction(snowy[-1].sun),
             snowy[-1].seed,
             progress=lambda share: progress("snowfall", share),

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
-from climatenerf.core.device import array_of, placed
-from climatenerf.core.samples import LEAST_WEIGHT, offsets_of
+from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.samples import MIN_WEIGHT, offsets_of
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import dispatch
 from climatenerf.weather.world import FieldLike
@@ -26,8 +26,8 @@ def camera_rays(
     camera: Camera, c2w: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[Tensor, "hw 3"], Float[Tensor, "hw 3"]]:
     """Origins (world m) and unit directions of all pixels, row by row."""
-    directions = placed(camera.directions().reshape(-1, 3).astype(np.float32))
-    pose = placed(np.asarray(c2w, np.float32))
+    directions = to_device(camera.directions().reshape(-1, 3).astype(np.float32))
+    pose = to_device(np.asarray(c2w, np.float32))
     rays_d = directions @ pose[:3, :3].T
     return pose[:3, 3].expand(rays_d.shape[0], 3).contiguous(), rays_d.contiguous()
 
@@ -59,7 +59,7 @@ def weighed_samples(
     near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
     samples = field.march(rays_o, rays_d, near, far, RENDER_STEP)
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-    keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+    keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
     ray = samples.ray_index()[keep]
     u = field.sample_positions(rays_o, rays_d, samples)[keep]
     return Weighed(weights[keep], u, ray, offsets_of(ray, n), left)
@@ -88,7 +88,7 @@ def composited(
     samples = field.march(rays_o, rays_d, t_min, endless, step_scale, stop=stop, thin=thin)
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
     far = dispatch.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
-    keep = (weights > LEAST_WEIGHT).nonzero()[:, 0]
+    keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
     ray = samples.ray_index()[keep]
     colour = field.colour(rays_o[ray] + samples.t[keep, None] * rays_d[ray], rays_d, ray)
     offsets = offsets_of(ray, t_min.shape[0])
@@ -114,4 +114,4 @@ def render_view(
 ) -> Float[np.ndarray, "h w 3"]:
     """Display picture in [0,1] of the clean scene from one camera (c2w in world metres)."""
     linear = field_radiance(field, *camera_rays(camera, c2w))
-    return array_of(encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3))
+    return to_numpy(encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3))

@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 
 FULL_FRAME = math.hypot(36.0, 24.0)  # mm: the 35 mm equivalent keeps the diagonal's angle (CIPA)
 SUBSECONDS = ExifTags.Base.SubsecTimeOriginal
-MOST_ROLL = 2.0  # degrees of a gimbal: beyond, the camera was being turned
+MAX_ROLL = 2.0  # degrees of a gimbal: beyond, the camera was being turned
 Down = tuple[float, float, float]
 # Where a direction (x right, y down) comes to lie when a picture is turned as EXIF's tag says.
 _TURNED = {
@@ -126,7 +126,7 @@ def _gimbal(xmp: object) -> Down | None:
         match = re.search(rf"drone-dji:Gimbal{name}Degree(?:=.|>)([+-]?\d+(\.\d+)?)", text)
         found[name] = _number(match.group(1)) if match else None
     pitch, roll = found["Pitch"], found["Roll"]
-    if pitch is None or abs(pitch) > 90 or abs(roll or 0.0) > MOST_ROLL:
+    if pitch is None or abs(pitch) > 90 or abs(roll or 0.0) > MAX_ROLL:
         return None
     return 0.0, math.cos(math.radians(pitch)), -math.sin(math.radians(pitch))
 

@@ -22,7 +22,7 @@ from climatenerf.sfm.exif import Exif, read_exif
 from climatenerf.sfm.photos import FEWEST, find_photos, is_video, too_few
 
 LONGEST = 2000  # pixels: more than a radiance field of a place resolves, and features need less
-MOST_PIXELS = 400_000_000  # of a picture that is decoded at all: 1.2 GB
+MAX_PIXELS = 400_000_000  # of a picture that is decoded at all: 1.2 GB
 JPEG_QUALITY = 96
 VIDEO_FRAMES = 100  # frames taken from a video, the sharpest of as many intervals
 CANDIDATES = 5  # looked at in each interval
@@ -174,13 +174,13 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
     name = _words(Path(path.name))
     if path.suffix.lower() in (".heic", ".heif"):
         _register_heif(name)
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MOST_PIXELS
+    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MAX_PIXELS
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{name} is empty")
         # Through an open file: Pillow garbles turned TIFFs that it maps into memory by their name.
         with path.open("rb") as file, Image.open(file) as image:
-            if image.width * image.height > MOST_PIXELS:
+            if image.width * image.height > MAX_PIXELS:
                 raise UserError(f"{name} has {image.width}x{image.height} pixels: too large")
             exif, profile = read_exif(image), image.info.get("icc_profile")
             image.draft("RGB", (LONGEST, LONGEST))  # a JPEG is decoded smaller at once
@@ -212,7 +212,7 @@ def _in_words(error: Exception) -> str:
     if isinstance(error, IsADirectoryError):
         return "is a folder with the name of a picture"
     if isinstance(error, Image.DecompressionBombError):
-        return f"exceeds {MOST_PIXELS / 1e6:g} megapixels: too large"
+        return f"exceeds {MAX_PIXELS / 1e6:g} megapixels: too large"
     if isinstance(error, MemoryError):
         return "takes more memory to read than there is"
     return "is damaged or cut off"

@@ -29,11 +29,11 @@ MORE_PAIRS = 10_000  # of the second chance: ten minutes or so
 TRIES = 4  # of the mapper at most
 AGREEING = 0.95  # of the observations: two models that explain as much are sound
 LARGE_TRIANGULATION = 16.0  # degrees between the first two photos
-LEAST_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
+MIN_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
 
 DATABASE, CHOSEN, RESULT = "database.db", "chosen", "poses.json"  # in the work folder
 NO_PYCOLMAP = 'poses need pycolmap; run `pip install "climatenerf[capture]"`'
-LEAST_POINTS = 30  # of a model: with fewer its poses mean nothing
+MIN_POINTS = 30  # of a model: with fewer its poses mean nothing
 
 Told = Callable[[str, float], None]
 
@@ -314,7 +314,7 @@ def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell
     A bent model explains fewer of the matches, so the one with most observations is taken as soon
     as another agrees with it. Where nothing comes out a smaller baseline is accepted.
     """
-    for least_angle in (LARGE_TRIANGULATION, LEAST_TRIANGULATION):
+    for least_angle in (LARGE_TRIANGULATION, MIN_TRIANGULATION):
         tries: list[tuple[int, list]] = []
         for number in range(TRIES):
             start = seed + number
@@ -322,7 +322,7 @@ def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell
             good = [
                 m
                 for m in found.values()
-                if m.num_reg_images() >= FEWEST and m.num_points3D() >= LEAST_POINTS
+                if m.num_reg_images() >= FEWEST and m.num_points3D() >= MIN_POINTS
             ]
             best = max((m.compute_num_observations() for m in good), default=0)
             tries.append((best, good))

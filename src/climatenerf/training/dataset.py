@@ -13,7 +13,7 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
-from climatenerf.core.device import array_of, integers, placed, sent
+from climatenerf.core.device import integers, to_device, to_numpy, upload
 from climatenerf.core.errors import UserError
 from climatenerf.training.evidence.frusta import pyramids
 from climatenerf.training.evidence.visual_hull import Witness
@@ -81,7 +81,7 @@ class TrainingPixels:
         Images, labels, masks and depths are taken one at a time, so a generator saves memory.
         Masks: pixels where a mask is 0 are never drawn, and their labels count as unknown.
         """
-        self.c2w = placed(np.asarray(c2w, np.float32))
+        self.c2w = to_device(np.asarray(c2w, np.float32))
         self.cameras = [cameras[i] for i in camera_of]
         self.directions = Directions(cameras)
         self.camera = torch.as_tensor(list(camera_of))
@@ -92,14 +92,14 @@ class TrainingPixels:
         self.pixel_start = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
         shapes = [(camera.height, camera.width) for camera in self.cameras]
         rgb, _ = in_one_row(shapes, images, np.uint8, 0, channels=3)
-        self.rgb = placed(rgb)
+        self.rgb = to_device(rgb)
         self.usable, self.drawable, self.share = None, None, 1.0
         self.spacings = torch.tensor(SPACINGS)
         self.axes = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
         usable = (None if mask is None else mask > 0 for mask in masks or ())
         flat, shown = in_one_row(shapes, usable, np.bool_, True)
         if flat.size:
-            self.usable, self.drawable = placed(flat), torch.from_numpy(flat)
+            self.usable, self.drawable = to_device(flat), torch.from_numpy(flat)
             self.share = int(flat.sum()) / flat.size
         self.label = None
         self.witness = None
@@ -111,16 +111,16 @@ class TrainingPixels:
                 own[~shown[image]] = UNKNOWN
             # Networks take puddles and wet walls for the sky that they mirror.
             row, column = np.nonzero(own == SKY)
-            place = placed(column), placed(row)
+            place = to_device(column), to_device(row)
             d = self.directions.of(self.camera[image].expand(len(row)), *place)
-            low = array_of(d @ self.c2w[image, 2, :3] < HORIZON)
+            low = to_numpy(d @ self.c2w[image, 2, :3] < HORIZON)
             own[row[low], column[low]] = UNKNOWN
         if (flat != UNKNOWN).any():  # labels that know nothing are none
-            self.label = placed(flat)
+            self.label = to_device(flat)
         if self.label is not None and bool((self.label == SKY).any()):
             at = [np.flatnonzero(sky_edge(each)) for each in merged]
-            starts = array_of(self.pixel_start)[:-1]
-            self.edge = placed(np.concatenate([e + s for e, s in zip(at, starts, strict=True)]))
+            starts = to_numpy(self.pixel_start)[:-1]
+            self.edge = to_device(np.concatenate([e + s for e, s in zip(at, starts, strict=True)]))
             self.witness = Witness(self.cameras, c2w, merged, [SKY], SKY_SHARE)
         self.ground_witness = self.standing_witness = None
         if self.label is not None and bool(
@@ -130,7 +130,7 @@ class TrainingPixels:
             self.standing_witness = Witness(self.cameras, c2w, merged, STANDING, STANDING_SHARE)
         scaled = (None if depth is None else in_units(depth) for depth in relative or ())
         flat, _ = in_one_row(shapes, scaled, np.float16, np.nan)
-        self.relative = placed(flat) if flat.size else None
+        self.relative = to_device(flat) if flat.size else None
 
     def without_sky(self) -> "TrainingPixels":
         """The same pixels, with what is labelled sky unknown."""
@@ -145,14 +145,14 @@ class TrainingPixels:
     ) -> Float[Tensor, "n 2"]:
         """Where in its picture, (x, y) in (0,1), an image shows a direction; NaN outside it."""
         out = torch.full((image.shape[0], 2), torch.nan)
-        for i in array_of(image.unique()).tolist():
+        for i in to_numpy(image.unique()).tolist():
             some = (image == i).nonzero()[:, 0]
             camera = self.cameras[i]
-            pixel = camera.project(array_of(rays_d[some] @ self.c2w[i, :3, :3]))
+            pixel = camera.project(to_numpy(rays_d[some] @ self.c2w[i, :3, :3]))
             place = pixel / (camera.width, camera.height)
             with np.errstate(invalid="ignore"):  # behind the camera: NaN
                 inside = np.all((place >= 0) & (place < 1), axis=-1)
-            out[some[placed(inside)]] = placed(place[inside].astype(np.float32))
+            out[some[to_device(inside)]] = to_device(place[inside].astype(np.float32))
         return out
 
     def pixel_towards(
@@ -280,7 +280,7 @@ class TrainingPixels:
             more = min(int((n - found.shape[0]) / self.share) + 1, AT_MOST)
             pixel = torch.randint(0, total, (more,), generator=generator, device="cpu")
             found = torch.cat([found, pixel[self.drawable[pixel]]])
-        return sent(found[:n])
+        return upload(found[:n])
 
     def sides(
         self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator

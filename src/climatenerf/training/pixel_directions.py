@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.core.vectors import unit
 
 SPACING = 4  # pixels
@@ -32,7 +32,7 @@ class Directions:
         self.across = torch.tensor([each.shape[1] for each in lattices])
         self.start = torch.tensor([0, *np.cumsum(counts)[:-1].tolist()])
         flat = [each.reshape(-1, 3) for each in lattices]
-        self.lattice = placed(np.concatenate(flat).astype(np.float32))
+        self.lattice = to_device(np.concatenate(flat).astype(np.float32))
 
     def of(
         self, camera: Int[Tensor, "n"], column: Int[Tensor, "n"], row: Int[Tensor, "n"]

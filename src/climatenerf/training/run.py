@@ -12,7 +12,7 @@ from PIL import Image
 
 import climatenerf
 from climatenerf.core.cameras import Camera
-from climatenerf.core.device import array_of, placed
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import (
     atomic_path,
@@ -54,7 +54,7 @@ PREVIEW_WIDTH = 240
 SMALLEST = 16  # pixels; the structural similarity looks at windows of 11
 ONE_SPOT = 1e-3  # m within which cameras are in one place,
 ROUNDING = 1e-6  # or units of the poses as given
-LEAST_SHARE = 1e-3  # of the pixels that masks must leave
+MIN_SHARE = 1e-3  # of the pixels that masks must leave
 
 
 def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
@@ -80,7 +80,7 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         (load_mask(view, scene, downscale) for view in views),
         (load_relative_depth(view, scene, downscale) for view in views),
     )
-    if pixels.share < LEAST_SHARE:
+    if pixels.share < MIN_SHARE:
         raise UserError(
             f"the masks of {scene.root} leave {pixels.share:.4%} of the pixels to learn from; what"
             " is to be ignored is black in them, the rest white"
@@ -272,7 +272,7 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
         state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
     state["relative"] = fitting.relative.sums
-    state["barred"] = torch.from_numpy(np.packbits(array_of(fitting.field.occupancy.barred)))
+    state["barred"] = torch.from_numpy(np.packbits(to_numpy(fitting.field.occupancy.barred)))
     state["generator"] = fitting.generator.get_state()
     numbers = [fitting.steps, fitting.samples, fitting.rays]
     state["counters"] = torch.tensor(numbers)
@@ -287,8 +287,8 @@ def with_corrections(scene: Scene, fitting: Fitting) -> Scene:
     if not fitting.settings.refine_poses:
         return scene
     views = scene.of_split("train")
-    given = placed(np.stack([scene.c2w_world(view) for view in views])).float()
-    corrected = array_of(fitting.poses.corrected(given, fitting.field.unit).double())
+    given = to_device(np.stack([scene.c2w_world(view) for view in views])).float()
+    corrected = to_numpy(fitting.poses.corrected(given, fitting.field.unit).double())
     back = np.linalg.inv(scene.world_from_input)
     moved = {}
     for view, c2w in zip(views, corrected, strict=True):

@@ -13,7 +13,7 @@ from climatenerf.core.device import uniform
 from climatenerf.training.static_shapes import Rooms
 
 CHOSEN = 32  # samples of a ray, about
-LEAST_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
+MIN_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
 
 
 def choose(
@@ -27,9 +27,9 @@ def choose(
         rooms: for the list.
         generator: of randomness.
     """
-    chance = (CHOSEN * weights).clamp(LEAST_CHANCE, 1.0) * there
+    chance = (CHOSEN * weights).clamp(MIN_CHANCE, 1.0) * there
     # Systematic sampling: drawn ones are spread evenly among those like them.
     passed = chance.double().cumsum(0) + uniform(generator, 1).double()
     kept = rooms.chosen("kept", passed.floor() > (passed - chance).floor())
     # What fills a room has no chance, 0/0.
-    return kept, chance[kept].clamp_min(LEAST_CHANCE)
+    return kept, chance[kept].clamp_min(MIN_CHANCE)

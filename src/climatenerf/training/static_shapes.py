@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.core.device import array_of
+from climatenerf.core.device import to_numpy
 
 LATE = 2  # steps until the card's numbers are read: when it still has the last one to do
 SPARE = 1.5  # times what the last steps took
@@ -104,7 +104,7 @@ class Rooms:
             counted, noted, numbers, arrived = self.sent.popleft()
             if arrived is not None:
                 arrived.synchronize()
-            values = array_of(numbers).tolist()
+            values = to_numpy(numbers).tolist()
             for name, value in zip(counted, values[: len(counted)], strict=True):
                 self.taken[name] = max(value, FORGET * self.taken.get(name, 0.0))
             self.known.update(zip(noted, values[len(counted) :], strict=True))

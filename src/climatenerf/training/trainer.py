@@ -17,8 +17,8 @@ from torch import Tensor
 
 from climatenerf.core.classes import SKY, SOLID_OF, UNKNOWN, VEGETATION
 from climatenerf.core.colour import encode_srgb
-from climatenerf.core.device import array_of, placed, uniform
-from climatenerf.core.samples import LEAST_TAU, LEAST_WEIGHT, Samples, offsets_of
+from climatenerf.core.device import to_device, to_numpy, uniform
+from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples, offsets_of
 from climatenerf.core.vectors import unit
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import Extent
@@ -79,7 +79,7 @@ class Fitting:
         self.points = points
         self.first_near = FIRST_NEAR * extent.unit if settings.cautious else 0.0
         if points is not None:  # a street that was driven along lies nearer than that
-            nearest = float(np.quantile(array_of(points.depth), 0.02))
+            nearest = float(np.quantile(to_numpy(points.depth), 0.02))
             self.first_near = min(self.first_near, nearest / 2)
         self.pixels = pixels
         self.extent = extent
@@ -104,7 +104,7 @@ class Fitting:
         self.measured = [each for each in (points, matched) if each is not None]
         kinds = pixels.kinds()
         self.still = still_cells(pixels, self.measured, images)
-        self.solid_of = placed(SOLID_OF.astype(np.int64))
+        self.solid_of = to_device(SOLID_OF.astype(np.int64))
         kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]
         # A head that has met one class alone, or nothing but ground, would say so of everything.
         classed = kinds.numel() > 1 and not bool(on_the_ground(kinds).all())
@@ -231,7 +231,7 @@ class Fitting:
         weights, left = dispatch.render_weights(tau, samples.offsets)
 
         share = weights[kept] / chance
-        seen = self.rooms.chosen("seen", share.detach() > LEAST_WEIGHT)
+        seen = self.rooms.chosen("seen", share.detach() > MIN_WEIGHT)
         ray = samples.ray_index()[kept][seen]
         radiance = self.radiance(batch, u[seen], ray, share[seen], left, spread[seen])
         error = losses.colour_error(radiance, batch.rgb)
@@ -380,7 +380,7 @@ class Fitting:
     ) -> tuple[Int[Tensor, "k"], Bool[Tensor, "k"]]:
         """Samples on sky rays; whether other photos see sky there too, and no point is known."""
         ray = samples.ray_index()
-        asked = self.rooms.chosen("sky", (batch.label == SKY)[ray] & (weights > LEAST_WEIGHT))
+        asked = self.rooms.chosen("sky", (batch.label == SKY)[ray] & (weights > MIN_WEIGHT))
         own = ray[asked]
         x = batch.rays_o.detach()[own] + samples.t[asked, None] * batch.rays_d.detach()[own]
         return asked, self.carving.shows_sky(x)
@@ -477,12 +477,12 @@ class Fitting:
         Once surfaces are found, what is thin are veils, above all between leaves and the sky.
         """
         grown = min(1.0, max(0.0, (self.stage - THIN_FROM) / (FINE_AT - THIN_FROM)))
-        goal = LEAST_TAU * (self.settings.thin / LEAST_TAU) ** grown
+        goal = MIN_TAU * (self.settings.thin / MIN_TAU) ** grown
         denser = 2 * self.field.thin
         if goal <= self.field.thin:
             return
         share = (weights * (tau < denser)).sum() / weights.sum()  # no light at all: NaN, not less
-        name = f"thinner by {round(math.log2(denser / LEAST_TAU))}"  # not those of a lower bound
+        name = f"thinner by {round(math.log2(denser / MIN_TAU))}"  # not those of a lower bound
         if self.rooms.late(name, share, math.inf) < THIN_SHARE:
             self.field.thin = min(goal, denser)
 
@@ -511,7 +511,7 @@ class Fitting:
         drawn = torch.zeros(n).index_add(0, ray, share.detach())
         # 1e-3: rays of which nothing was drawn, 0/0.
         own = own * ((1 - left.detach()) / drawn.clamp_min(1e-3)).clamp_max(4.0)[:, None]
-        through = left.detach() > LEAST_WEIGHT
+        through = left.detach() > MIN_WEIGHT
         skyward = torch.arange(n) if self.rooms.fixed else through.nonzero()[:, 0]
         left = left * through
         sky = self.field.sky_colour(batch.rays_d[skyward], appearance[skyward])
@@ -543,7 +543,7 @@ class Fitting:
         """
         budget = self.settings.samples_per_step * min(1.0, 0.25 + 2.5 * self.stage)
         factor = min(2.0, max(0.5, budget / max(samples, 1)))
-        most = max(16384, self.settings.samples_per_step // LEAST_SAMPLES)
+        most = max(16384, self.settings.samples_per_step // MIN_SAMPLES)
         self.rays = int(min(most, max(256, rays * factor)))
         self.step_scale *= 1.03 if samples > SAMPLES_PER_RAY * rays else 0.98
         coarsest = 1 + (MAX_STEP_SCALE - 1) * max(0.0, 1 - self.stage / FINE_AT)
@@ -591,7 +591,7 @@ SURE_PULL = 4.0  # of the ground loss's weight, once the field's own classes tel
 GROUND_WEIGHT = 1e-3  # of samples that are asked for their height
 POINT_SHARE = 16  # rays of photos for one to a sparse point, and one to a matched one
 MAX_STEP_SCALE = 8.0
-LEAST_SAMPLES = 4  # of a ray in the mean: empty ones cost too
+MIN_SAMPLES = 4  # of a ray in the mean: empty ones cost too
 SAMPLES_PER_RAY = 40  # steps are coarser while rays have more samples than this
 THIN_FROM = 0.5  # stage from which ever denser samples count as empty, until `FINE_AT`,
 THIN_SHARE = 0.2  # while samples up to twice as dense take no more of the light that matter does

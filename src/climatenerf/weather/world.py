@@ -104,7 +104,7 @@ class World:
 
 
 @dataclass
-class Seen:
+class RenderOutput:
     """What rays see; all per ray, colours linear."""
 
     rgb: Float[Tensor, "n 3"]
@@ -121,10 +121,13 @@ class Seen:
     mask_smog: Float[Tensor, "n"]
 
 
-def together(parts: Sequence[Seen], order: Int[Tensor, "n"] | slice) -> Seen:
+def concatenate(parts: Sequence[RenderOutput], order: Int[Tensor, "n"] | slice) -> RenderOutput:
     """What all the parts' rays see, one part after the other, and then in this order."""
-    return Seen(
-        **{key: torch.cat([getattr(p, key) for p in parts])[order] for key in Seen.__annotations__}
+    return RenderOutput(
+        **{
+            key: torch.cat([getattr(p, key) for p in parts])[order]
+            for key in RenderOutput.__annotations__
+        }
     )
 
 

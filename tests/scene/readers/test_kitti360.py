@@ -10,7 +10,7 @@ from support.scene_builders import look_at, pinhole, seen_at, write_images
 from climatenerf.core.errors import UserError
 from climatenerf.scene import load_image, read_scene, save_scene
 from climatenerf.scene.images import load_labels
-from climatenerf.scene.readers.kitti360 import MOST_PICTURES, parse_frames, read_kitti360
+from climatenerf.scene.readers.kitti360 import MAX_PICTURES, parse_frames, read_kitti360
 
 DRIVE = "2013_05_28_drive_0000_sync"
 OTHER = "2013_05_28_drive_0002_sync"
@@ -150,7 +150,7 @@ def test_the_folder_of_one_drive_of_several(tmp_path):
 
 
 def test_too_many_pictures_name_the_remedy(tmp_path):
-    frames = range(10, 11 + MOST_PICTURES)
+    frames = range(10, 11 + MAX_PICTURES)
     make(tmp_path, frames, cameras=("00",))
     with pytest.raises(UserError, match=r"has 401 pictures .* --frames 1538:1601"):
         read_kitti360(tmp_path)

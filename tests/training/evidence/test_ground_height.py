@@ -43,7 +43,7 @@ def test_hills_are_found_from_few_points_though_a_fifth_of_them_stand_on_it():
 def test_the_tolerance_of_smooth_ground_is_the_least():
     xy = places(500)
     ground = draw_ground(on(xy, hills(xy)))
-    assert ground is not None and ground.tolerance == ground_map.LEAST_TOLERANCE
+    assert ground is not None and ground.tolerance == ground_map.MIN_TOLERANCE
 
 
 def test_a_plane_is_exact_far_from_points_too_and_known_near_them_only():
@@ -69,12 +69,12 @@ def test_points_in_a_line_or_in_one_place_give_numbers():
 
 
 def test_few_points_draw_no_map():
-    assert draw_ground(torch.zeros(ground_map.LEAST_POINTS - 1, 3)) is None
+    assert draw_ground(torch.zeros(ground_map.MIN_POINTS - 1, 3)) is None
     assert draw_ground(torch.full((500, 3), 9.0)) is None, "all of them are outside"
 
 
 def test_many_points_are_thinned_evenly(monkeypatch):
-    monkeypatch.setattr(ground_map, "MOST_POINTS", 300)
+    monkeypatch.setattr(ground_map, "MAX_POINTS", 300)
     asked = []
     cells = ground_map._cells
     monkeypatch.setattr(ground_map, "_cells", lambda q: asked.append(q) or cells(q))

@@ -96,7 +96,7 @@ def slow_likeness(cameras, c2w, images, i, j, x, y, s):
             world = c2w[i][:3, :3] @ local + c2w[i][:3, 3]
             there = c2w[j][:3, :3].T @ (world - c2w[j][:3, 3])
             other.append(looked_up(images[j], cameras[j].project(there[None])[0]))
-    return np.corrcoef(own, other)[0, 1] if np.std(other) > kernels.LEAST_CONTRAST else np.nan
+    return np.corrcoef(own, other)[0, 1] if np.std(other) > kernels.MIN_CONTRAST else np.nan
 
 
 def looked_up(image, at):

@@ -161,8 +161,8 @@ def test_the_kernel_matches_its_twin():
         row[start : start + h * w].view(h, w).float()
         for start, (h, w) in zip(starts.tolist(), sizes.tolist(), strict=True)
     ]
-    least = (witness.LEAST_VOICES, found.share, found.apart)
-    real = reference.voices_of(x, radius, reach, *views, least)
+    least = (witness.MIN_VOICES, found.share, found.apart)
+    real = reference.label_votes(x, radius, reach, *views, least)
     ours = found.agreed(x, radius)
     # Rounding may put a place that lies on a pixel's border into its neighbour.
     assert (ours == real).float().mean() > 0.999

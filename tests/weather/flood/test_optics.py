@@ -213,7 +213,7 @@ def test_neighbouring_pixels_roll_differently():
 
 
 def test_wet_bed_against_path_traced_figures():
-    """Seen from the nadir under an even sky: .076 .202 .453 for dry albedos .1 .3 .6."""
+    """RenderOutput from the nadir under an even sky: .076 .202 .453 for dry albedos .1 .3 .6."""
     sky = torch.tensor([math.pi] * 3)
     for albedo, expected in ((0.1, 0.076), (0.3, 0.202), (0.6, 0.453)):
         bed = water.bed_radiance(torch.full((1, 3), albedo), sky, IOR)

@@ -60,7 +60,7 @@ def test_thickness_over_planes(case):
     feet = on_plane(plane, 60, 0.6, seed=case)
     assert snow.covered(feet).all()
     assert snow.depth_over(feet).numpy() == pytest.approx(np.full(60, depth), rel=0.1)
-    # Seen from the side, too.
+    # RenderOutput from the side, too.
     aside = torch.tensor(rng.normal(0, 1.0, (60, 3)), dtype=torch.float32)
     aside[:, 2] = 2.0
     direction = -aside / aside.norm(dim=1, keepdim=True)

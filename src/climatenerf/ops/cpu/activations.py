@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 SHARPNESS = 8.0  # of the softplus
-LEAST_SLOPE = 0.1  # upwards
+MIN_SLOPE = 0.1  # upwards
 BLACK = -0.5  # below it the display value is under .003, and nothing darkens further
 LARGEST_RAW = 15.0  # logarithm of a density: beyond it a float32 would be infinite soon
 # NaN keeps its meaning: what has diverged is to be seen.
@@ -98,7 +98,7 @@ def radiance_backward(raw, value, grad_out, grad):
             if at < np.float32(0.0):
                 slope *= e
             if own < np.float32(0.0):
-                slope = max(slope, np.float32(LEAST_SLOPE))
+                slope = max(slope, np.float32(MIN_SLOPE))
             elif at <= np.float32(BLACK):
                 slope = np.float32(0.0)
             grad[i] = own * slope

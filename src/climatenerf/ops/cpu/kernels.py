@@ -544,8 +544,8 @@ def adam(parameter, gradient, first, second, rate, beta1, beta2, epsilon, correc
 
 
 @njit(cache=True, parallel=True)
-def voices_of(x, radius, views, least, agreed):
-    """Which places enough views see before nothing but sky, or ground: see `reference.voices_of`.
+def label_votes(x, radius, views, least, agreed):
+    """Which places enough views see before nothing but sky, or ground: see `reference.label_votes`.
 
     Args: views: their maps in one row, each from starts [v] on and of sizes [v, 2], pinholes, c2w.
     """

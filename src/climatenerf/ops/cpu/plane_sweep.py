@@ -13,10 +13,10 @@ from numba import njit, prange
 
 SIDE = 2  # pixels from a window's middle to its border
 STEP = 1.0  # pixels that the projection moves between two distances that are tried, or more:
-MOST_STEPS = 256  # what comes near moves over all of a large picture
+MAX_STEPS = 256  # what comes near moves over all of a large picture
 FINE = 8  # smaller steps to either side of the best one
 APART = 3  # steps from the best one that count as another place
-LEAST_CONTRAST = 4.0  # standard deviation of a window, 8-bit levels
+MIN_CONTRAST = 4.0  # standard deviation of a window, 8-bit levels
 UNSEEN = 0  # the level of a pixel that a picture does not show
 TILES = 3  # along each side of a picture: each has neighbours of its own
 STEEP = 20.0  # times a window's reach in depth that it must be away: 1/z is taken from a series
@@ -154,7 +154,7 @@ def _take_window(pictures, i, x, y, window):
     for k in range(at):
         window[k] -= mean
         squared += window[k] ** 2
-    if not squared > at * LEAST_CONTRAST**2:
+    if not squared > at * MIN_CONTRAST**2:
         return False
     for k in range(at):
         window[k] /= np.sqrt(squared)
@@ -185,12 +185,12 @@ def _steps(pictures, i, tile, x, y):
         far = _direction(pictures, i, tile, k, x, y, 0.0)
         near = _direction(pictures, i, tile, k, x, y, pictures.most[i, tile])
         if far[2] <= 1e-3 or near[2] <= 1e-3:  # passes the camera: over all of the picture
-            return MOST_STEPS
+            return MAX_STEPS
         fx, fy = pictures.intrinsics[j, 0], pictures.intrinsics[j, 1]
         across = fx * (near[0] / near[2] - far[0] / far[2])
         down = fy * (near[1] / near[2] - far[1] / far[2])
         length = max(length, np.sqrt(across * across + down * down))
-    return min(MOST_STEPS, int(length / STEP) + 2 * APART)
+    return min(MAX_STEPS, int(length / STEP) + 2 * APART)
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -251,7 +251,7 @@ def _alike(pictures, i, tile, x, y, s, window):
                 both += grey * window[at]
                 at += 1
         variance = squared - total * total / at
-        if not variance > at * LEAST_CONTRAST**2:  # NaN where not shown
+        if not variance > at * MIN_CONTRAST**2:  # NaN where not shown
             continue
         own_likeness = np.float32(both / np.sqrt(variance))
         if own_likeness > first:

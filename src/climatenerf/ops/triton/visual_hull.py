@@ -1,4 +1,4 @@
-"""What views agree to see behind places, on a GPU, in Triton: see `reference.voices_of`."""
+"""What views agree to see behind places, on a GPU, in Triton: see `reference.label_votes`."""
 
 # Triton's functions have no types that pyright could know.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
@@ -51,7 +51,7 @@ def _voices_of(x, radius, views, least, agreed, n, count, BLOCK: tl.constexpr):
     tl.store(agreed + i, enough.to(tl.uint8), mask=some)
 
 
-def voices_of(
+def label_votes(
     x: Tensor,
     radius: Tensor,
     views: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],

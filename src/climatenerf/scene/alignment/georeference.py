@@ -11,10 +11,10 @@ from climatenerf.scene.alignment.scale import rescaled, with_witness
 from climatenerf.scene.scene import Scene
 
 FEWEST = 5
-MOST_PAIRS = 2000  # that are tried for a start
-LEAST_ERROR = 0.005  # of the scale: the map's and the fit's own
+MAX_PAIRS = 2000  # that are tried for a start
+MIN_ERROR = 0.005  # of the scale: the map's and the fit's own
 EXACT = 0.005  # of the extent: residuals below are not looked at for correlation
-LEAST_INDEPENDENT = 4.0  # fixes
+MIN_INDEPENDENT = 4.0  # fixes
 WORST_SCALE = 0.2  # relative standard error from which GPS says nothing of use
 NAMED = 3  # photos, in a sentence about several
 # WGS 84 (EPSG:4326): equatorial radius, m, and first eccentricity squared.
@@ -107,9 +107,9 @@ def find_georeference(
     # The fit takes 4 of the 2 n degrees of freedom; with two independent fixes none is left.
     if abs(turn) * extent < 1e-9:
         return Unused(photos, "the photos lie too close together")
-    if independent < LEAST_INDEPENDENT:
+    if independent < MIN_INDEPENDENT:
         drift = f"its errors drift from photo to photo, which leaves {independent:.1f} fixes"
-        return Unused(photos, f"{drift} where {LEAST_INDEPENDENT:g} are needed")
+        return Unused(photos, f"{drift} where {MIN_INDEPENDENT:g} are needed")
     spread = math.sqrt(float((np.abs(away) ** 2).mean()) / 2 * independent / (independent - 2))
     error = spread / (abs(turn) * extent * math.sqrt(independent))
     if error > WORST_SCALE:
@@ -191,7 +191,7 @@ def _independent(away: Complex[np.ndarray, "n"]) -> float:
 
 def apply_georeference(scene: Scene, found: Georeference, keep_scale: bool) -> Scene:
     """The scene with x to the east and y to the north, and GPS's scale unless a better is known."""
-    error = max(found.scale_error, LEAST_ERROR)
+    error = max(found.scale_error, MIN_ERROR)
     if keep_scale:
         out = with_witness(scene, "gps", found.scale, error)
     else:
@@ -224,7 +224,7 @@ def _similarity(
     i, j = np.triu_indices(n, 1)
     apart = source[j] - source[i]
     far = np.flatnonzero(np.abs(apart) > 0.3 * np.abs(apart).max())
-    far = far[:: max(1, len(far) // MOST_PAIRS)]
+    far = far[:: max(1, len(far) // MAX_PAIRS)]
     if not len(far):
         return 0j, complex(target.mean()), np.ones(n)
     turns = (target[j[far]] - target[i[far]]) / apart[far]

@@ -23,9 +23,9 @@ from climatenerf.scene.alignment.scale import rescaled, with_witness
 from climatenerf.scene.scene import Scene
 
 FILE_NAME = "marks.toml"
-LEAST_ANGLE = 1.0  # degrees between the rays to a mark: below, its distance is a guess
+MIN_ANGLE = 1.0  # degrees between the rays to a mark: below, its distance is a guess
 CLICK = 2.0  # pixels: how well an end is marked, on each axis
-LEAST_ERROR = 0.005  # a mark is never better than this share of the length
+MIN_ERROR = 0.005  # a mark is never better than this share of the length
 DISAGREEMENT = 0.1  # between two known lengths, from which the user is warned
 
 Marks = dict[str, dict[str, dict[str, tuple[float, float]]]]
@@ -102,7 +102,7 @@ def measure(scene: Scene, marks: Marks, name: str, known: float) -> Measured:
     if not found > 0:
         raise UserError(f"both ends of {name!r} are marked at one place; mark them anew")
     error = float(np.hypot(*errors)) / found
-    return Measured(name, known, found, max(error, LEAST_ERROR))
+    return Measured(name, known, found, max(error, MIN_ERROR))
 
 
 def _meet(
@@ -128,7 +128,7 @@ def _meet(
         directions.append(camera.directions(np.array(pixel)) @ c2w[:3, :3].T)
     o, d = np.array(origins), np.array(directions)
     widest = np.degrees(np.arccos(np.clip((d @ d.T).min(), -1, 1)))
-    if widest < LEAST_ANGLE:
+    if widest < MIN_ANGLE:
         raise UserError(
             f"[{where}] is marked in pictures from nearly one place ({widest:.1f} degrees apart);"
             " mark it in pictures taken further apart"

@@ -12,9 +12,9 @@ from climatenerf.scene.alignment.ground_plane import find_ground
 from climatenerf.scene.images import load_depth
 from climatenerf.scene.scene import Scene
 
-LEAST_DEPTHS = 5  # points in a view, and views, that depth files must reach
-LEAST_ERROR = 0.01  # of the scale by depth files
-MOST_SPREAD = 0.15  # of log depth over points: metric depth is within a tenth nearly everywhere
+MIN_DEPTHS = 5  # points in a view, and views, that depth files must reach
+MIN_ERROR = 0.01  # of the scale by depth files
+MAX_SPREAD = 0.15  # of log depth over points: metric depth is within a tenth nearly everywhere
 ASSUMED_WARNING = "The scale is assumed"  # how the warning begins
 SIGMAS = 2.0  # between two pieces of evidence, from which the user is warned
 
@@ -118,11 +118,11 @@ def by_depth(scene: Scene) -> tuple[float, float] | None:
         inside = (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
         ratio = np.log(depth[y[inside], x[inside]] / local[inside, 2])
         ratio = ratio[np.isfinite(ratio)]
-        if len(ratio) >= LEAST_DEPTHS:
+        if len(ratio) >= MIN_DEPTHS:
             ratios.append(float(np.median(ratio)))
             spreads.append(float(np.median(np.abs(ratio - np.median(ratio)))))
-    if len(ratios) < LEAST_DEPTHS or np.median(spreads) > MOST_SPREAD:
+    if len(ratios) < MIN_DEPTHS or np.median(spreads) > MAX_SPREAD:
         return None
     middle = float(np.median(ratios))
     apart = 1.4826 * float(np.median(np.abs(np.array(ratios) - middle)))
-    return float(np.exp(middle)), max(apart / np.sqrt(len(ratios)), LEAST_ERROR)
+    return float(np.exp(middle)), max(apart / np.sqrt(len(ratios)), MIN_ERROR)

@@ -21,7 +21,7 @@ PITCH_SIGMA = 8.0  # degrees: how much cameras look up or down on average
 PLANE_SIGMA = 2.5  # degrees: how level open ground is
 LINES_SIGMA = 0.6  # degrees: how upright posts and walls are, at best
 GRAVITY_SIGMA = 1.0  # degrees: how well a camera's accelerometer is aligned with its picture
-LEAST_READINGS = 3  # of gravity
+MIN_READINGS = 3  # of gravity
 FAR_ORIGIN = 10_000  # m: 32-bit numbers resolve a millimetre up to 16 km from the origin
 FOCUS_SHARE = 0.35  # camera height over distance to what is looked at, when no ground is seen
 
@@ -187,7 +187,7 @@ def up_from_gravity(scene: Scene, gravity: Mapping[str, Sequence[float]]) -> UpE
     The mean of those within `OUTLIER` degrees of the median direction, which most must be.
     """
     down = [v.c2w[:3, :3] @ np.asarray(gravity[v.name]) for v in scene.views if v.name in gravity]
-    if len(down) < LEAST_READINGS:
+    if len(down) < MIN_READINGS:
         return None
     up = -np.array(down)
     middle = np.median(up, axis=0)
@@ -195,7 +195,7 @@ def up_from_gravity(scene: Scene, gravity: Mapping[str, Sequence[float]]) -> UpE
         return None
     apart = np.array([_degrees(u, middle / np.linalg.norm(middle)) for u in up])
     near = apart < OUTLIER
-    if near.mean() < 0.5 or near.sum() < LEAST_READINGS:
+    if near.mean() < 0.5 or near.sum() < MIN_READINGS:
         return None
     mean = up[near].mean(axis=0)
     # The mean of many is sharper than one, but they share how the sensor sits in its camera.

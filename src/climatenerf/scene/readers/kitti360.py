@@ -24,7 +24,7 @@ from climatenerf.scene.readers.capture import Capture, checked_camera, checked_p
 from climatenerf.scene.readers.text import frame_rows, keyed_lines, matrix_of
 from climatenerf.scene.scene import View
 
-MOST_PICTURES = 400  # of a drive's thousands, that are taken without being picked
+MAX_PICTURES = 400  # of a drive's thousands, that are taken without being picked
 CAMERAS = ("image_00", "image_01")
 _DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}_sync")
 _FRAME = re.compile(r"\d{10}")
@@ -105,7 +105,7 @@ def read_kitti360(path: Path, frames: tuple[int, int] | None = None) -> Capture:
             f"{folder} has no picture with a pose{chosen}{poses_there}; choose other --frames or"
             " restore the pictures."
         )
-    if frames is None and len(views) > MOST_PICTURES:
+    if frames is None and len(views) > MAX_PICTURES:
         raise UserError(
             f"{drive} has {len(views)} pictures with poses, more than a scene is made of; pick some"
             " with --frames FIRST:LAST, such as --frames 1538:1601."

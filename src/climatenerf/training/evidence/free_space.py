@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from climatenerf.core.classes import GROUND, SOLID
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import reference
 from climatenerf.training.dataset import TrainingPixels
@@ -37,7 +37,7 @@ class Carving:
     ):
         self.field, self.pixels, self.points = field, pixels, points
         self.carves, self.moves = settings.carve, settings.refine_poses
-        self.solid = placed(SOLID)
+        self.solid = to_device(SOLID)
         self.knows_ground = settings.losses.ground > 0 and points is not None
         self.find_ground()
         self.bar()
@@ -111,7 +111,7 @@ class Carving:
         reach = torch.zeros(count)
         for image in range(count):
             depth = self.points.depth[self.points.image == image]
-            if depth.numel() >= LEAST_POINTS:
+            if depth.numel() >= MIN_POINTS:
                 reach[image] = IN_THE_WAY * depth.quantile(NEAREST)
         eyes = self.pixels.c2w[:, :3, 3]
         before = before_a_camera(x, radius, self.pixels.pyramids, eyes, reach)
@@ -193,7 +193,7 @@ class Carving:
         ahead, _ = self.ground.over(q + STEP * rays_d)
         nearing = (over - ahead) / STEP
         off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
-        far = rooms.chosen("far", known & (nearing > LEAST_NEARING) & (off != 0))
+        far = rooms.chosen("far", known & (nearing > MIN_NEARING) & (off != 0))
         cells, _ = self.field._cells(q[far])
         pulled = torch.zeros(far.shape[0], dtype=torch.bool)
         if classed:
@@ -201,7 +201,7 @@ class Carving:
         rest = rooms.chosen("rest", ~pulled & ~self.stands.view(-1)[cells])
         pulled[rest] = self.shows_ground(q[far[rest]], torch.zeros(rest.shape[0]))
         # Rays that do not near the ground, in a room's rest: 0/0.
-        on = off[far] / nearing[far].clamp_min(LEAST_NEARING)
+        on = off[far] / nearing[far].clamp_min(MIN_NEARING)
         return far, (t[far] + on).clamp_min(0.0), pulled
 
     @torch.no_grad()
@@ -224,7 +224,7 @@ def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:
 AT_ONCE = 2**18  # cells that are asked about: their places take room
 SAME = 1e-4  # grid units within which two ends are one point
 STEP = 0.05  # grid units over which a ray nears the ground
-LEAST_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst
+MIN_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst
 NEAREST = 0.02  # quantile of the distances of a photo's points that stands for the nearest,
-LEAST_POINTS = 20  # where it has so many
+MIN_POINTS = 20  # where it has so many
 IN_THE_WAY = 0.8  # of that distance: what is nearer shows no point because it is not there

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 
 AT_ONCE = 800_000  # distances between places and views that fit into the cache
 BORDER = 64  # points along each side of a picture from which its pyramid of sight is found
@@ -45,7 +45,7 @@ def pyramids(cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]) -> Floa
         outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
         normal = outward @ pose[:3, :3].T
         planes.append(np.concatenate([normal, -normal @ pose[:3, 3:]], axis=-1))
-    return placed(np.stack(planes).astype(np.float32))
+    return to_device(np.stack(planes).astype(np.float32))
 
 
 def in_view(

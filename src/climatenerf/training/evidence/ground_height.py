@@ -12,18 +12,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 
 CELLS = 33  # lines along an edge
 HALF_SIDE = 4.0  # grid units
-LEAST_POINTS, MOST_POINTS = 50, 6000  # by which a map is drawn
+MIN_POINTS, MAX_POINTS = 50, 6000  # by which a map is drawn
 REACH = 0.5  # grid units around a point in which the map is believed
 AROUND = 2  # lines of the map that a place has to be above
 FINE_CELLS = 64  # along an edge: next to a point's own, the map is sure
 STIFF = 0.05  # price of bending against the points' mean distance
 ROUNDS = 15  # of reweighted least squares
 FINEST = 2e-3  # grid units: points are not believed to be nearer the ground
-LEAST_TOLERANCE = 7.5e-3  # grid units: kerbs and tufts that the map does not know
+MIN_TOLERANCE = 7.5e-3  # grid units: kerbs and tufts that the map does not know
 ROUGHNESS = 2.0  # tolerance over the distance within which nine tenths of the points lie
 
 
@@ -70,9 +70,9 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
     The least mean distance (not squared: labels err) plus the price of bending, the thin plate's.
     """
     q = q[(q[:, :2].abs() < HALF_SIDE).all(-1)]
-    if q.shape[0] < LEAST_POINTS:
+    if q.shape[0] < MIN_POINTS:
         return None
-    q = q[:: -(-q.shape[0] // MOST_POINTS)]
+    q = q[:: -(-q.shape[0] // MAX_POINTS)]
     n, size = q.shape[0], CELLS * CELLS
     # Each point looks at four places of the map only.
     corners = list(_corners(*_cells(q)))
@@ -93,14 +93,14 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
         height = torch.linalg.solve(pull.view(size, size) + price, goal)
         off = ((look * height[place]).sum(-1) + middle - z).abs()
         weight = 1 / (off.clamp_min(FINEST) * n)
-    line = placed(np.linspace(-HALF_SIDE, HALF_SIDE, CELLS, dtype=np.float32))
+    line = to_device(np.linspace(-HALF_SIDE, HALF_SIDE, CELLS, dtype=np.float32))
     lines = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
     near = torch.cdist(lines, q[:, :2]).amin(-1)
     return GroundMap(
         height=(height + middle).float().view(CELLS, CELLS),
         known=(near < REACH).view(CELLS, CELLS),
         sure=_next_to(q),
-        tolerance=max(LEAST_TOLERANCE, ROUGHNESS * float(off.quantile(0.9))),
+        tolerance=max(MIN_TOLERANCE, ROUGHNESS * float(off.quantile(0.9))),
     )
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 KEPT = 0.95  # of the sums from step to step
-LEAST_RAYS = 20.0  # of an image, before its scale and shift are believed
+MIN_RAYS = 20.0  # of an image, before its scale and shift are believed
 
 
 class RelativeDepth:
@@ -54,5 +54,5 @@ class RelativeDepth:
         scale = (xd / safe - x * d / safe**2) / variance_x.clamp_min(1e-12)
         shift = d / safe - scale * x / safe
         # Nearer must be larger: a scene that stands inside out says nothing yet.
-        known = (n > LEAST_RAYS) & (variance_x > 1e-12) & (scale > 0)
+        known = (n > MIN_RAYS) & (variance_x > 1e-12) & (scale > 0)
         return scale.float(), shift.float(), (variance_d * known).clamp_min(0).float()

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import SKY
-from climatenerf.core.device import array_of, placed
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.ops.cpu.plane_sweep import TILES, UNSEEN, Pictures, match
 from climatenerf.training.dataset import TrainingPixels, in_one_row
 from climatenerf.training.evidence.sparse_depth import PointRays
@@ -25,10 +25,10 @@ BEST_ANGLE = 6.0  # degrees between the rays to a place from two photos that sui
 ANGLES = (1.0, 25.0)  # and those that do at all
 FACING = 0.5  # least cosine between their axes
 NEARER = 0.5  # of the nearest point's distance: nothing is looked for before it
-LEAST_LIKENESS = 0.8
+MIN_LIKENESS = 0.8
 SAME_PLACE = 0.02  # of the distance from a neighbour that finds it too
-LEAST_LEAD = 0.05  # of it over that at any other distance
-LEAST_POINTS = 20  # of a photo or a tile, which tell its distances
+MIN_LEAD = 0.05  # of it over that at any other distance
+MIN_POINTS = 20  # of a photo or a tile, which tell its distances
 WIDE = 0.1  # least cosine from a camera's axis: beyond it no pinhole sees a pixel
 WEIGHTS = (0.299, 0.587, 0.114)  # of grey (Rec. 601)
 
@@ -57,7 +57,7 @@ def match_photos(
     within, width = pixel - pixels.pixel_start[image], pixels.width[image]
     row = within.div(width, rounding_mode="floor")
     d = pixels.directions.of(pixels.camera[image], within % width, row)
-    of, local = array_of(image), array_of(d).astype(np.float64)
+    of, local = to_numpy(image), to_numpy(d).astype(np.float64)
     ahead = local[:, 2] > WIDE
     of, local = of[ahead], local[ahead] / local[ahead, 2:]
     pixel = _pixels(pictures, of, local)
@@ -67,7 +67,11 @@ def match_photos(
     kept = seen_back(pictures, of, local * z[:, None])
     if not kept.any():
         return None
-    of, local, z = placed(of[kept]), placed(local[kept].astype(np.float32)), placed(z[kept])
+    of, local, z = (
+        to_device(of[kept]),
+        to_device(local[kept].astype(np.float32)),
+        to_device(z[kept]),
+    )
     c2w, length = pixels.c2w[of], local.norm(dim=-1)
     return PointRays(
         rays_o=c2w[:, :3, 3].contiguous(),
@@ -131,7 +135,7 @@ def _sure(
     """Whether windows were found alike in one place alone, and not at an end of the search."""
     inverse, likeness, second = found.T
     most = pictures.most[of, _tiles(pixel / pictures.size[of])]
-    alike = (likeness > LEAST_LIKENESS) & (likeness - second > LEAST_LEAD)
+    alike = (likeness > MIN_LIKENESS) & (likeness - second > MIN_LEAD)
     return alike & (inverse > 0) & (inverse < most)
 
 
@@ -142,19 +146,19 @@ def distances(
     count = pixels.c2w.shape[0]
     near, middle = (np.full((count, TILES**2), each) for each in typical)
     if points is not None:
-        image = array_of(points.image)
-        turn = array_of(pixels.c2w).astype(np.float64)[image, :3, :3]
-        local = np.einsum("nij,ni->nj", turn, array_of(points.rays_d))
-        depth = array_of(points.depth)
+        image = to_numpy(points.image)
+        turn = to_numpy(pixels.c2w).astype(np.float64)[image, :3, :3]
+        local = np.einsum("nij,ni->nj", turn, to_numpy(points.rays_d))
+        depth = to_numpy(points.depth)
         z = depth * np.maximum(local[:, 2], WIDE)  # behind a fisheye: else 1/0
         tile = _tiles_towards(pixels, image, local)
         near[:], middle[:] = np.quantile(z, 0.02), np.median(depth)
-        for i in np.flatnonzero(np.bincount(image, minlength=count) >= LEAST_POINTS):
+        for i in np.flatnonzero(np.bincount(image, minlength=count) >= MIN_POINTS):
             own = image == i
             near[i], middle[i] = np.quantile(z[own], 0.02), np.median(depth[own])
             for j in range(TILES**2):
                 some = own & (tile == j)
-                if some.sum() >= LEAST_POINTS:
+                if some.sum() >= MIN_POINTS:
                     near[i, j], middle[i, j] = np.quantile(z[some], 0.02), np.median(depth[some])
         near *= NEARER
     return near, middle
@@ -166,10 +170,10 @@ def pictures_of(
     middle: Float[np.ndarray, "v tiles"],
 ) -> Pictures:
     """The photos in grey, without distortion, and how each is seen by its neighbours."""
-    c2w = array_of(pixels.c2w).astype(np.float64)
-    starts = array_of(pixels.pixel_start)
-    rgb = array_of(pixels.rgb)
-    usable = None if pixels.usable is None else array_of(pixels.usable)
+    c2w = to_numpy(pixels.c2w).astype(np.float64)
+    starts = to_numpy(pixels.pixel_start)
+    rgb = to_numpy(pixels.rgb)
+    usable = None if pixels.usable is None else to_numpy(pixels.usable)
     straight = (
         straightened(camera, rgb[a:b], None if usable is None else usable[a:b])
         for camera, a, b in zip(pixels.cameras, starts[:-1], starts[1:], strict=True)
@@ -205,16 +209,16 @@ def straightened(
         return _levels(flat).reshape(camera.height, camera.width)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     d = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    place = placed(camera.project(d).astype(np.float32))
+    place = to_device(camera.project(d).astype(np.float32))
     size = torch.tensor([camera.width, camera.height])
     seen = torch.nn.functional.grid_sample(
-        placed(flat).view(1, 1, camera.height, camera.width),
+        to_device(flat).view(1, 1, camera.height, camera.width),
         (2 * place / size - 1).nan_to_num(9.0)[None],
         align_corners=False,
         padding_mode="border",
     )
     outside = ~((place >= 0) & (place < size)).all(-1)
-    return _levels(array_of(seen[0, 0].masked_fill(outside, torch.nan)))
+    return _levels(to_numpy(seen[0, 0].masked_fill(outside, torch.nan)))
 
 
 def _levels(grey: Float32[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:

@@ -20,7 +20,7 @@ ROWS, COLUMNS = 32, 64  # of the map: height over the horizon in even steps of i
 LOWEST = -0.05  # sine of the lowest elevation: reflected rays and the horizon's haze
 LOOKS = 400_000  # pixels that are looked at, or four times all there are
 ALBEDO = 0.2  # of common ground: soil .05 to .40, grass .16 to .26, asphalt .05 to .20 (Oke 1987)
-LEAST_LOOKS = 3  # of them for a cell to be seen: a single one may be labelled wrongly
+MIN_LOOKS = 3  # of them for a cell to be seen: a single one may be labelled wrongly
 SPREADS = 400  # rounds of spreading, over some 20 cells; what lies farther stays near the mean
 
 
@@ -84,7 +84,7 @@ def looked_at(
     cell = row * COLUMNS + column
     total = torch.zeros(ROWS * COLUMNS, 3).index_add(0, cell, colour)
     count = torch.bincount(cell, minlength=ROWS * COLUMNS).float()
-    seen = (count >= LEAST_LOOKS).view(ROWS, COLUMNS)
+    seen = (count >= MIN_LOOKS).view(ROWS, COLUMNS)
     # 1: a cell that nothing looks at, 0/0.
     return (total / count.clamp_min(1)[:, None]).view(ROWS, COLUMNS, 3), seen
 

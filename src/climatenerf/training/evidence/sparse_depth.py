@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.core.device import integers, placed
+from climatenerf.core.device import integers, to_device
 from climatenerf.scene.scene import Scene
 from climatenerf.training.dataset import TrainingPixels
 
@@ -59,10 +59,10 @@ def find_point_rays(scene: Scene) -> PointRays | None:
         return None
     rays_d = (end - eye)[kept] / depth[kept, None]
     return PointRays(
-        rays_o=placed(eye[kept].astype(np.float32)),
-        rays_d=placed(rays_d.astype(np.float32)),
-        depth=placed(depth[kept].astype(np.float32)),
-        image=placed(np.concatenate(of)[kept].astype(np.int64)),
+        rays_o=to_device(eye[kept].astype(np.float32)),
+        rays_d=to_device(rays_d.astype(np.float32)),
+        depth=to_device(depth[kept].astype(np.float32)),
+        image=to_device(np.concatenate(of)[kept].astype(np.int64)),
     )
 
 

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import UNKNOWN
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.ops import dispatch
 
 VOICES = 64  # views that are asked, at most
 WIDEST = 400  # pixels of the maps that they are asked by
 REACH = 24  # pixels: within larger footprints nothing is claimed
-LEAST_VOICES = 2  # views that must agree
+MIN_VOICES = 2  # views that must agree
 APART = 0.1  # of the cameras' spread: neighbouring frames err alike, so they have one voice
 
 
@@ -46,19 +46,19 @@ class Witness:
         sizes = np.array([each.shape for each, _ in maps], np.int64)
         poses = np.ascontiguousarray(np.asarray(c2w, np.float32)[asked])
         self.views = (
-            placed(np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])),
-            placed(np.append(0, sizes.prod(1).cumsum()[:-1]).astype(np.int64)),
-            placed(sizes),
-            placed(np.array([pinhole for _, pinhole in maps], np.float32)),
-            placed(poses),
+            to_device(np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])),
+            to_device(np.append(0, sizes.prod(1).cumsum()[:-1]).astype(np.int64)),
+            to_device(sizes),
+            to_device(np.array([pinhole for _, pinhole in maps], np.float32)),
+            to_device(poses),
         )
         eyes = poses[:, :3, 3]
         self.apart = APART * float(np.linalg.norm(eyes - eyes.mean(0), axis=-1).mean())
 
     def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether enough views see nothing else within `radius` (m) of places x (world m)."""
-        least = (LEAST_VOICES, self.share, self.apart)
-        return dispatch.voices_of(x, radius, self.views, least)
+        least = (MIN_VOICES, self.share, self.apart)
+        return dispatch.label_votes(x, radius, self.views, least)
 
 
 def depth_within(

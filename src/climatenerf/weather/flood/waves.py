@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Complex, Float, Int64
 from torch import Tensor
 
-from climatenerf.core.device import placed
+from climatenerf.core.device import to_device
 from climatenerf.weather.flood.spectrum import (
     LOWEST,
     MAX_CUTOFF,
@@ -159,13 +159,13 @@ def make_tile(
     kept, shared = _level_variances(slope_power, kx, ky, length)
     return WaveTile(
         length,
-        placed(np.stack([kx, ky], axis=-1)).float(),
-        placed(omega),
+        to_device(np.stack([kx, ky], axis=-1)).float(),
+        to_device(omega),
         forward.to(torch.get_default_device(), torch.complex64),
         backward.to(torch.get_default_device(), torch.complex64),
         float(slope_power.sum()),
-        placed(kept).float(),
-        placed(shared).float(),
+        to_device(kept).float(),
+        to_device(shared).float(),
     )
 
 

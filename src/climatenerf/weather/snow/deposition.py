@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from climatenerf.core.device import array_of, placed
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import Samples
 from climatenerf.weather.parameters import Snow
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid
@@ -227,13 +227,13 @@ def _first_hits(
     alive = np.arange(len(rays_o))
     while len(alive):
         start = begin[alive]
-        origins = placed((rays_o[alive] + start[:, None] * direction).astype(np.float32))
+        origins = to_device((rays_o[alive] + start[:, None] * direction).astype(np.float32))
         directions = torch.tensor(direction, dtype=torch.float32).expand_as(origins).contiguous()
-        t_min = placed(np.maximum(-start, 0).astype(np.float32))
-        t_max = placed(np.minimum(length - start, stretch).astype(np.float32))
+        t_min = to_device(np.maximum(-start, 0).astype(np.float32))
+        t_max = to_device(np.minimum(length - start, stretch).astype(np.float32))
         samples = field.march(origins, directions, t_min, t_max)
         parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
-        found = halfway(*(array_of(part) for part in parts), depth[alive])
+        found = halfway(*(to_numpy(part) for part in parts), depth[alive])
         where[alive] = np.where(np.isnan(found[0]), where[alive], found[0] + start)
         depth[alive] = found[1]
         begin[alive] += stretch
@@ -262,7 +262,7 @@ def _shade(
     lower, upper = field.bounds
     across = float((upper - lower).norm())
     shades = []
-    for points in placed(hits).split(_CHUNK):
+    for points in to_device(hits).split(_CHUNK):
         nearest = viewers[torch.cdist(points, viewers).argmin(1)]
         away = points - nearest
         # A camera inside the ground's fuzz would give a direction of length 0.
@@ -279,5 +279,5 @@ def _shade(
             thick.index_add_(0, samples.ray_index(), (samples.sigma * samples.dt).detach())
             visible = torch.exp(-thick).float()
         shade = shade * (snow.sun_share * visible + snow.shade)
-        shades.append(array_of(shade.clamp(0, 1).float()))
+        shades.append(to_numpy(shade.clamp(0, 1).float()))
     return np.concatenate(shades)

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from climatenerf.core.device import array_of, placed
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import Samples
 from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu.metaballs import THRESHOLD, Lattice
@@ -72,20 +72,20 @@ class BakedSnow:
             _array(rays_o), _array(rays_d), _array(t_min), _array(t_max), self.lattice
         )
         return Samples(
-            placed(offsets),
-            placed(t),
-            placed(dt),
-            placed(sigma),
+            to_device(offsets),
+            to_device(t),
+            to_device(dt),
+            to_device(sigma),
         )
 
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Extinction O of the snow at points (m), 1/m."""
-        density = placed(metaballs.evaluate(_array(x), self.lattice)[2][:, 2])
+        density = to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 2])
         return density if self.floor_z is None else density * (x[:, 2] >= self.floor_z)
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the analytic gradient of the sum; up where there is none."""
-        gradient = placed(metaballs.evaluate(_array(x), self.lattice)[1])
+        gradient = to_device(metaballs.evaluate(_array(x), self.lattice)[1])
         return _normal(gradient)
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -97,16 +97,16 @@ class BakedSnow:
         _, gradient, rest = metaballs.evaluate(_array(x), self.lattice)
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
-        facing = _normal(placed(gradient)) @ torch.tensor(towards, dtype=torch.float32)
+        facing = _normal(to_device(gradient)) @ torch.tensor(towards, dtype=torch.float32)
         # Negative only for a wrap below 1, on the side that faces away.
         wrap = ((facing + self.snow.wrap) / (1 + self.snow.wrap)).clamp(min=0)
-        shade = placed(rest[:, 1])
+        shade = to_device(rest[:, 1])
         white = torch.tensor(self.light.irradiance_over_pi, dtype=torch.float32)
         return (shade * wrap)[:, None] * white
 
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
-        return placed(metaballs.evaluate(_array(x), self.lattice)[2][:, 0]).clamp(min=0)
+        return to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 0]).clamp(min=0)
 
     def depth_over(self, ground: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Thickness of the snow over points of the ground (m), m; 0 where it is bare."""
@@ -128,7 +128,7 @@ class BakedSnow:
 
     def covered(self, ground: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether points of the ground (m) lie under snow."""
-        sums = placed(metaballs.evaluate(_array(ground), self.lattice)[0])
+        sums = to_device(metaballs.evaluate(_array(ground), self.lattice)[0])
         return (sums > THRESHOLD) & (self.density(ground) > 0)
 
 
@@ -162,7 +162,7 @@ def bake_snow(
     cameras = np.asarray(cameras, np.float64).reshape(-1, 3)
     light = Light(np.asarray(irradiance_over_pi, np.float64), sun_direction)
     if grid is None:
-        lower, upper = (array_of(b).astype(np.float64) for b in field.bounds)
+        lower, upper = (to_numpy(b).astype(np.float64) for b in field.bounds)
         grid = choose_grid(lower, upper, cameras)
     with torch.no_grad():
         deposits = find_deposits(field, snow, grid, light, cameras, seed, progress)
@@ -170,7 +170,7 @@ def bake_snow(
 
 
 def _array(x: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(array_of(x), np.float32)
+    return np.ascontiguousarray(to_numpy(x), np.float32)
 
 
 def _normal(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
