@@ -21,7 +21,7 @@ from climatenerf.core.errors import UserError
 # Before torch and Numba are imported, unless the user has chosen otherwise. Both bring an OpenMP
 # run time of their own. Idle threads of the one that spin for long after each parallel region take
 # the cores from the other, and those that sleep at once wake late: some tens of microseconds are
-# best (docs/decisions.md). Numba's OpenMP layer is asked for because it may be entered from several
+# best (docs/adr/0001). Numba's OpenMP layer is asked for because it may be entered from several
 # threads at once, which its last fallback may not.
 THREADING = {
     "OMP_WAIT_POLICY": "PASSIVE",

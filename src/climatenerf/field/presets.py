@@ -14,7 +14,7 @@ class FieldSize:
     geometry_hidden: int = 32
     appearance_levels: int = 12
     appearance_log2_rows: int = 19
-    """Fewer have less to paint with: foliage stays blurred (docs/decisions.md)."""
+    """Fewer have less to paint with: foliage stays blurred (docs/adr/0011)."""
     appearance_finest: int = 4096
     colour_hidden: int = 64
     surface_levels: int = 8

@@ -25,7 +25,7 @@ STORED = BRICK + 3
 REACH = BALL_REACH
 """Support 1.5 R of the kernel in lattice spacings."""
 RADIUS = REACH / 1.5
-"""R of the kernel in lattice spacings (measured in docs/decisions.md)."""
+"""R of the kernel in lattice spacings (measured in docs/adr/0016)."""
 THRESHOLD = 0.497
 """tau: the surface of a half-space lies where half of the sum is reached; the 0.003 make up for
 rays that see a little (0.006 spacings, the same for every lattice) into the snow."""
