@@ -107,3 +107,15 @@ def test_citation_names_this_version():
     text = (ROOT / "CITATION.cff").read_text()
     assert f"\nversion: {climatenerf.__version__}\n" in text
     assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["license"] in text
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_code_in_pages_exists(page):
+    """Paths such as `ops/reference.py:march` are relative to the package or to the checkout."""
+    wrong = []
+    for path, name in re.findall(r"`([\w.]+(?:/[\w.]+)+\.py)(?::([\w.]+))?`", page.read_text()):
+        files = [folder / path for folder in (SOURCE, ROOT) if (folder / path).is_file()]
+        known = files[0].read_text() if files else ""
+        if not files or not all(re.search(rf"\b{word}\b", known) for word in name.split(".")):
+            wrong.append(f"{path}:{name}")
+    assert not wrong, f"{name_of(page)} names {wrong}"
