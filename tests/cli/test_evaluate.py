@@ -12,7 +12,7 @@ from PIL import Image
 from climatenerf import cli
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import write_json
-from climatenerf.evaluation.report import check_place
+from climatenerf.output.score_report import check_folder
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "street"
 
@@ -49,23 +49,23 @@ def test_a_folder_without_a_run_is_refused(capsys, tmp_path):
 
 
 def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
-    check_place(tmp_path / "new" / "report", ["clean"])
+    check_folder(tmp_path / "new" / "report", ["clean"])
     assert not (tmp_path / "new" / "report").exists(), "nothing stays of a run that is stopped"
     other = tmp_path / "other"
     other.mkdir()
     (other / "clean.jpg").write_bytes(b"mine")
     with pytest.raises(UserError, match="overwritten"):
-        check_place(other, ["clean"])
+        check_folder(other, ["clean"])
     write_json(other / "report.json", {"mine": 1})
     with pytest.raises(UserError, match="no report"):
-        check_place(other, ["clean"])
+        check_folder(other, ["clean"])
     write_json(other / "report.json", {"scores": {}, "pictures": ["haze.jpg"]})
     (other / "haze.jpg").write_bytes(b"old")
     with pytest.raises(UserError, match="overwritten"):
-        check_place(other, ["clean"])
+        check_folder(other, ["clean"])
     assert (other / "clean.jpg").read_bytes() == b"mine" and (other / "haze.jpg").exists()
     (other / "clean.jpg").unlink()
-    assert "haze.jpg" in check_place(other, ["clean"]), "to be removed when the new one is there"
+    assert "haze.jpg" in check_folder(other, ["clean"]), "to be removed when the new one is there"
     assert (other / "haze.jpg").exists()
 
 

@@ -54,9 +54,9 @@ def run(options: Evaluate) -> int:
 
     from climatenerf.core.storage import read_json
     from climatenerf.evaluation.reference import read_reference
-    from climatenerf.evaluation.report import check_place, table_text, write_report
     from climatenerf.evaluation.scores import Place, check_views, evaluate
     from climatenerf.field.checkpoint import load_field
+    from climatenerf.output.score_report import check_folder, table_text, write_report
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
 
@@ -70,7 +70,7 @@ def run(options: Evaluate) -> int:
     measured = options.run / "metrics.json"  # absent where a fit was stopped before its end
     metrics = read_json(measured, "the run's measurements") if measured.exists() else {}
     names = ["clean", *(kind.name for kind in reference.weathers)]
-    old = check_place(options.out, names)
+    old = check_folder(options.out, names)
     with progress.Bar("evaluate", len(names) + 7) as bar:
         scores = evaluate(
             Place(field, scene, reference), lambda what: bar.advance(1, {"now": what})
