@@ -70,7 +70,7 @@ def test_files_that_belong_to_no_picture_are_told_of(tmp_path, monkeypatch):
     assert told.startswith("2 of 9 pictures") and "called like its picture, and is PNG" in told
     save_scene(replace(read_scene(tmp_path, metric_input=True), warnings=()), tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr("climatenerf.scene.read.by_camera_height", lambda scene, height: scene)
+        patch.setattr("climatenerf.scene.read.rescale_by_camera_height", lambda scene, _: scene)
         again = read_scene(tmp_path, camera_height=2.0).warnings
     assert any("masks" in w for w in again), "also of a scene that is scaled anew"
     (tmp_path / "scene.json").unlink()

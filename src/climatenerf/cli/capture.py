@@ -25,14 +25,14 @@ from climatenerf.scene.alignment.georeference import (
     Georeference,
     apply_georeference,
     find_georeference,
-    gps_note,
+    gps_warning,
 )
 from climatenerf.scene.alignment.known_length import FILE_NAME as MARKS
 from climatenerf.scene.alignment.scale import (
-    by_depth,
+    scale_from_depth_files,
     scale_warnings,
-    with_capture_remedies,
-    with_witness,
+    with_capture_flags,
+    with_scale_evidence,
 )
 from climatenerf.scene.images import picture_header
 from climatenerf.scene.readers.colmap import read_colmap
@@ -297,10 +297,10 @@ def in_metres(options: Capture, new: Path, intake) -> Scene:
             if down is not None:
                 gravity[view.name] = down
     scene = read_scene(new, camera_height=options.camera_height, gravity=gravity)
-    scene = with_capture_remedies(scene)
+    scene = with_capture_flags(scene)
     places = {name: exif.place for name, exif in known.items() if exif.place is not None}
     found = find_georeference(scene, places)
-    note = gps_note(found, {picture.name: picture.source for picture in intake.pictures})
+    note = gps_warning(found, {picture.name: picture.source for picture in intake.pictures})
     if note is not None:
         scene = replace(scene, warnings=(*scene.warnings, note))
     if not isinstance(found, Georeference):
@@ -310,7 +310,7 @@ def in_metres(options: Capture, new: Path, intake) -> Scene:
 
 def as_shown(options: Capture, path: Path, camera: Camera) -> bool:
     """Whether a camera is that of its photo as shown: ours always, COLMAP's if only so it fits."""
-    return options.from_colmap is None or picture_header(path).turned_for(camera)
+    return options.from_colmap is None or picture_header(path).rotates_to_fit(camera)
 
 
 def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
@@ -331,11 +331,11 @@ def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
         scene = bring_along(scene, kind, getattr(options, kind), photos)
     if options.depth is None:
         return scene
-    said = by_depth(scene)
+    said = scale_from_depth_files(scene)
     if said is None:
         progress.say("The depth files have no one scale; they say nothing of the scene's size.")
         return scene
-    return with_witness(scene, "depth files", *said)
+    return with_scale_evidence(scene, "depth files", *said)
 
 
 class Stages:

@@ -16,7 +16,7 @@ from climatenerf.scene.alignment.known_length import (
     measure,
     read_marks,
 )
-from climatenerf.scene.alignment.scale import scale_warnings, scale_words
+from climatenerf.scene.alignment.scale import scale_summary, scale_warnings
 from climatenerf.training.folder import check_folder, check_resumable
 from climatenerf.training.settings import FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
@@ -196,7 +196,7 @@ def frame_line(scene: Scene) -> str:
     if others:
         up += f" ({', '.join(f'{name} {angle:.1f} deg' for name, angle in others.items())} from it)"
     return (
-        f"Scene: {len(scene.views)} photos; up from {up}; {scale_words(scene)}; cameras"
+        f"Scene: {len(scene.views)} photos; up from {up}; {scale_summary(scene)}; cameras"
         f" {heights[len(heights) // 2]:.1f} m above the ground datum, lowest ground"
         f" {scene.lowest_ground_z - scene.ground_z:+.1f} m from it"
     )

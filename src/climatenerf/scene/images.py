@@ -19,7 +19,7 @@ from climatenerf.scene.srgb import to_linear
 
 RELATIVE_DEPTH = "depth_relative"
 _ORIENTATION_TAG = 0x0112
-EXIF_TURNS = {
+EXIF_TRANSPOSES = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
     4: Image.Transpose.FLIP_TOP_BOTTOM,
@@ -56,7 +56,7 @@ class Header:
     alpha: bool
     orientation: int
 
-    def turned_for(self, camera: Camera) -> bool:
+    def rotates_to_fit(self, camera: Camera) -> bool:
         """Whether loading turns the picture by 90 degrees to fit the camera.
 
         Poses refer to the stored pixels unless only the turned picture has the camera's size, so
@@ -67,7 +67,7 @@ class Header:
 
     def up_in_picture(self, camera: Camera) -> tuple[int, int]:
         """(x, y), y down: where the top of the picture as shown is, seen in the loaded pixels."""
-        return (0, -1) if self.turned_for(camera) else _SHOWN_UP.get(self.orientation, (0, -1))
+        return (0, -1) if self.rotates_to_fit(camera) else _SHOWN_UP.get(self.orientation, (0, -1))
 
 
 def picture_header(path: Path) -> Header:
@@ -287,8 +287,8 @@ def _decode(path: Path, camera: Camera) -> Image.Image:
         with Image.open(path) as image:
             image.load()
             header = _header(image)
-            if header.turned_for(camera):
-                return image.transpose(EXIF_TURNS[header.orientation])
+            if header.rotates_to_fit(camera):
+                return image.transpose(EXIF_TRANSPOSES[header.orientation])
             decoded = image.copy()
     except _BAD_IMAGE as error:
         raise _unreadable(path, error) from None

@@ -11,7 +11,7 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.scene.alignment.scale import by_camera_height
+from climatenerf.scene.alignment.scale import rescale_by_camera_height
 from climatenerf.scene.alignment.up import level
 from climatenerf.scene.images import Header, picture_header
 from climatenerf.scene.label_spaces import checked_label_space
@@ -96,7 +96,7 @@ def read_scene(
         # Up and place are known already, maybe from what the pictures no longer tell.
         changed = {"cameras": capture.cameras, "views": views, "label_space": space}
         known = replace(scene, warnings=kept, **changed)
-        scaled = by_camera_height(known, camera_height)
+        scaled = rescale_by_camera_height(known, camera_height)
         if scaled is not None:
             return scaled
     scene = Scene(
@@ -200,7 +200,7 @@ def _check_images(capture: Capture) -> Capture:
 def _fit_camera(view: View, camera: Camera, header: Header) -> Camera:
     """The camera scaled to the picture's real size."""
     width, height = header.width, header.height
-    if (width, height) == (camera.width, camera.height) or header.turned_for(camera):
+    if (width, height) == (camera.width, camera.height) or header.rotates_to_fit(camera):
         return camera
     sx, sy = width / camera.width, height / camera.height
     # Down-scalers round each side to a whole pixel, by up to one in the smaller picture.

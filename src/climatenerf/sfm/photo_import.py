@@ -17,7 +17,7 @@ from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, explain, make_folder, read_json, write_json
-from climatenerf.scene.images import EXIF_TURNS, to_rgb
+from climatenerf.scene.images import EXIF_TRANSPOSES, to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
 from climatenerf.sfm.photos import FEWEST, find_photos, is_video, too_few
 
@@ -187,7 +187,7 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
             image.load()
             # A TIFF's decoder has turned the picture already and taken the tag away.
             kept = image.getexif().get(ExifTags.Base.Orientation, 1) == exif.orientation
-            turn = EXIF_TURNS.get(exif.orientation) if kept else None
+            turn = EXIF_TRANSPOSES.get(exif.orientation) if kept else None
             # Made smaller before all else: a copy of 200 megapixels takes 600 MB.
             small = image if image.mode in ("RGB", "L") else Image.fromarray(to_rgb(image))
             small.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS, reducing_gap=3.0)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
 from climatenerf.core.storage import atomic_path, write_bytes
-from climatenerf.scene.alignment.scale import scale_words
+from climatenerf.scene.alignment.scale import scale_summary
 from climatenerf.scene.scene import Scene
 from climatenerf.sfm.diagnose import Lost
 from climatenerf.sfm.photo_import import Intake
@@ -47,7 +47,7 @@ def report_text(
         f"- Ground within {GROUND_REACH:g} camera heights of the path that {SEEN_OFTEN} pictures"
         f" or more look at: {ground:.0%}",
         f"- Sky (directions more than 10 degrees up) that any picture looks at: {sky:.0%}",
-        f"- Up from {scene.up_report.get('used', '?')}; {scale_words(scene)}; lowest ground"
+        f"- Up from {scene.up_report.get('used', '?')}; {scale_summary(scene)}; lowest ground"
         f" {scene.lowest_ground_z - scene.ground_z:+.2f} m from the datum",
     ]
     angles = {k: v for k, v in scene.up_report.items() if isinstance(v, int | float)}

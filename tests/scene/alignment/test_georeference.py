@@ -12,7 +12,7 @@ from climatenerf.scene.alignment.georeference import (
     apply_georeference,
     east_north,
     find_georeference,
-    gps_note,
+    gps_warning,
 )
 from climatenerf.scene.alignment.scale import scale_warnings
 
@@ -62,7 +62,7 @@ def test_scale_and_heading(tmp_path, noise):
     scene = scene_of(ring(24, radius=15.0), tmp_path)
     places = places_of(scene, 1.7, 2.1, noise)
     found = find_georeference(scene, places)
-    assert isinstance(found, Georeference) and gps_note(found, {}) is None
+    assert isinstance(found, Georeference) and gps_warning(found, {}) is None
     assert found.scale == pytest.approx(1.7, rel=max(1e-3, 3 * found.scale_error))
     assert found.scale_error < 0.06
     assert found.heading == pytest.approx(2.1, abs=max(1e-3, 3 * found.scale_error))
@@ -133,7 +133,7 @@ def test_a_third_of_wild_fixes_does_no_harm(tmp_path):
     found = find_georeference(scene, places)
     assert isinstance(found, Georeference) and found.scale == pytest.approx(1.3, rel=0.05)
     assert set(found.left_out) == {f"{i}.png" for i in range(8)} and found.photos == 16
-    note = gps_note(found, {"0.png": "IMG_0.HEIC"})
+    note = gps_warning(found, {"0.png": "IMG_0.HEIC"})
     assert note is not None and "GPS of 8 of 24 photos" in note and "IMG_0.HEIC, 1.png, " in note
 
 
@@ -169,9 +169,9 @@ def test_gps_that_says_nothing_is_left_alone_and_told_of(tmp_path, what, words):
     if what == "lag":
         places = dict.fromkeys(places, places["0.png"])
     found = find_georeference(scene, places)
-    assert isinstance(found, Unused) and str(gps_note(found, {})).startswith(words)
+    assert isinstance(found, Unused) and str(gps_warning(found, {})).startswith(words)
 
 
 def test_no_gps_is_nothing_to_tell_of(tmp_path):
     found = find_georeference(scene_of(ring(9), tmp_path), {})
-    assert isinstance(found, Unused) and gps_note(found, {}) is None
+    assert isinstance(found, Unused) and gps_warning(found, {}) is None

@@ -6,12 +6,12 @@ from support.scene_builders import look_at
 
 from climatenerf.scene import Camera, Scene, View, read_scene, save_scene
 from climatenerf.scene.alignment.scale import (
-    by_camera_height,
-    by_depth,
+    rescale_by_camera_height,
     rescaled,
+    scale_from_depth_files,
+    scale_summary,
     scale_warnings,
-    scale_words,
-    with_witness,
+    with_scale_evidence,
 )
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -49,13 +49,13 @@ def test_all_evidence_is_told_in_the_metres_that_are_used(scene):
     back = rescaled(out, 0.5, "gps", 0.02)
     assert back.scale == pytest.approx(1) and "gps" not in back.scale_report
     assert back.scale_report["known-length"]["times"] == pytest.approx(2)
-    words = scale_words(out)
+    words = scale_summary(out)
     assert "known-length (+-1%)" in words and "gps says 0.50 times that (+-2%)" in words
 
 
 def test_only_what_errors_do_not_explain_is_warned_of(scene):
     assert scale_warnings(scene) == []
-    told = scale_warnings(with_witness(scene, "depth files", 1.3, 0.02))
+    told = scale_warnings(with_scale_evidence(scene, "depth files", 1.3, 0.02))
     assert len(told) == 1 and told[0].startswith("depth files makes the scene 1.30 times")
 
 
@@ -63,12 +63,12 @@ def test_camera_height_keeps_the_heading_of_a_scene_that_is_level(scene, tmp_pat
     turn = np.eye(4)
     turn[:2, :2] = [[0.0, -1.0], [1.0, 0.0]]
     turned = replace(scene, world_from_input=turn, georeference={"latitude": 47.0})
-    out = by_camera_height(turned, 3.2)
+    out = rescale_by_camera_height(turned, 3.2)
     assert out is not None and out.scale == pytest.approx(2, rel=0.01)
     assert out.scale_source == "camera-height"
     assert out.scale_report["gps"]["times"] == pytest.approx(0.5, rel=0.01)
     np.testing.assert_allclose(out.world_from_input[:3, :3] / out.scale, turn[:3, :3], atol=1e-9)
-    assert by_camera_height(replace(scene, points=None), 3.2) is None
+    assert rescale_by_camera_height(replace(scene, points=None), 3.2) is None
     # The same through the reader, of a scene folder.
     save_scene(turned, tmp_path)
     again = read_scene(tmp_path, camera_height=3.2)
@@ -91,11 +91,11 @@ def depths(scene, folder, of):
 
 
 def test_depth_files_that_measure_say_how_large_the_scene_is(scene, tmp_path):
-    said = by_depth(depths(scene, tmp_path, lambda z: 1.3 * z))
+    said = scale_from_depth_files(depths(scene, tmp_path, lambda z: 1.3 * z))
     # Points that share a pixel are at slightly different depths.
     assert said is not None and said[0] == pytest.approx(1.3, rel=0.01) and said[1] < 0.03
 
 
 def test_relative_depths_say_nothing_of_size(scene, tmp_path):
-    assert by_depth(depths(scene, tmp_path, lambda z: 8 / z)) is None
-    assert by_depth(scene) is None
+    assert scale_from_depth_files(depths(scene, tmp_path, lambda z: 8 / z)) is None
+    assert scale_from_depth_files(scene) is None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Complex, Float
 
-from climatenerf.scene.alignment.scale import rescaled, with_witness
+from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
 from climatenerf.scene.scene import Scene
 
 FEWEST = 5
@@ -128,7 +128,7 @@ def find_georeference(
     )
 
 
-def gps_note(found: Georeference | Unused, sources: Mapping[str, str]) -> str | None:
+def gps_warning(found: Georeference | Unused, sources: Mapping[str, str]) -> str | None:
     """What the user should know of GPS that is not used; None if there is none or all is.
 
     Args:
@@ -193,7 +193,7 @@ def apply_georeference(scene: Scene, found: Georeference, keep_scale: bool) -> S
     """The scene with x to the east and y to the north, and GPS's scale unless a better is known."""
     error = max(found.scale_error, MIN_ERROR)
     if keep_scale:
-        out = with_witness(scene, "gps", found.scale, error)
+        out = with_scale_evidence(scene, "gps", found.scale, error)
     else:
         out = rescaled(scene, found.scale, "gps", error)
     turn = np.eye(4)

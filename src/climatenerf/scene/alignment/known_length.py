@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError
-from climatenerf.scene.alignment.scale import rescaled, with_witness
+from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
 from climatenerf.scene.scene import Scene
 
 FILE_NAME = "marks.toml"
@@ -161,7 +161,7 @@ def apply_known_lengths(scene: Scene, measured: list[Measured]) -> Scene:
     out = rescaled(scene, factor, "known-length", combined)
     for m, r in zip(measured, ratio, strict=True):
         if len(measured) > 1:
-            out = with_witness(out, m.name, float(r) / factor, m.error)
+            out = with_scale_evidence(out, m.name, float(r) / factor, m.error)
     if spread > DISAGREEMENT:
         told = ", ".join(f"{m.name} x{r:.2f}" for m, r in zip(measured, ratio, strict=True))
         warning = f"The known lengths disagree ({told}); check their marks."

@@ -44,13 +44,13 @@ def rescaled(scene: Scene, factor: float, source: str, error: float) -> Scene:
     )
 
 
-def with_witness(scene: Scene, name: str, times: float, error: float) -> Scene:
+def with_scale_evidence(scene: Scene, name: str, times: float, error: float) -> Scene:
     """The scene with one more piece of evidence that does not set its scale."""
     witness = {"times": times, "error": error}
     return replace(scene, scale_report={**scene.scale_report, name: witness})
 
 
-def by_camera_height(scene: Scene, height: float) -> Scene | None:
+def rescale_by_camera_height(scene: Scene, height: float) -> Scene | None:
     """The scene in the metres in which its cameras are `height` above the ground below them.
 
     Up, heading and place stay. None where no ground is seen.
@@ -64,7 +64,7 @@ def by_camera_height(scene: Scene, height: float) -> Scene | None:
     return rescaled(scene, height / ground.camera_height, "camera-height", error)
 
 
-def scale_words(scene: Scene) -> str:
+def scale_summary(scene: Scene) -> str:
     """What sets the scale and what the others say, in one clause."""
     words = [f"scale from {scene.scale_source} (+-{percent(scene.scale_error)})"]
     for name, said in scene.scale_report.items():
@@ -72,7 +72,7 @@ def scale_words(scene: Scene) -> str:
     return "; ".join(words)
 
 
-def with_capture_remedies(scene: Scene) -> Scene:
+def with_capture_flags(scene: Scene) -> Scene:
     """The scene with the flags named that `capture` knows too where its scale is assumed."""
     remedy = "; give --camera-height or --known-length."
     told = [
@@ -100,7 +100,7 @@ def scale_warnings(scene: Scene) -> list[str]:
     return out
 
 
-def by_depth(scene: Scene) -> tuple[float, float] | None:
+def scale_from_depth_files(scene: Scene) -> tuple[float, float] | None:
     """How many times as large the scene is by its views' depth files, and the relative error.
 
     The median over views of the median ratio of file to sparse points. None where the files do not
