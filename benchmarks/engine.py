@@ -171,7 +171,7 @@ def loss_of(field: Field, at: Drawn) -> Float[Tensor, ""]:
     radiance = radiance + left[:, None] * field.sky_colour(batch.rays_d, embedding)
     loss = losses.colour_error(radiance, batch.rgb).mean()
     loss = loss + 1e-2 * losses.distortion_loss(weights, t, dt, samples.offsets)
-    loss = loss + 2e-4 * losses.opacity_loss(left)
+    loss = loss + 2e-4 * losses.opacity_entropy_loss(left)
     goal = field.density_normal(at.q)
     logits, apart = dispatch.surface(weights.detach(), field.surface_raw(u), goal, samples.offsets)
     target = torch.arange(n) % len(SOLID)  # their cost does not depend on what they are
@@ -325,7 +325,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     scene = load_scene(options.run)
-    fitting = begin(scene, FitSettings(seed=options.seed, match=False), 1)
+    fitting = begin(scene, FitSettings(seed=options.seed, multiview_stereo=False), 1)
     fitting.field = load_field(options.run).requires_grad_()
     found: dict[str, object] = {"run": options.run.name, "capture": scene.root.name}
     found["step"] = steps(fitting, options.samples, options.twin_samples, options.repeats)

@@ -35,7 +35,7 @@ VARIANTS = {
     "a least chance of 0.1, 16 samples": {"MIN_CHANCE": 0.1, "CHOSEN": 16},
     "a least chance of 0.5": {"MIN_CHANCE": 0.5},
     "near matter from the start": {"FIRST_NEAR": 0.0},
-    "no pressure below the horizon": {"losses": Losses(solid=0.0)},
+    "no pressure below the horizon": {"losses": Losses(below_horizon_opacity=0.0)},
     "colours by direction from the start": {"VIEW_SHARES": (1.0, 1.0)},
 }
 

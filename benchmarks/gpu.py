@@ -54,7 +54,7 @@ def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
 
 def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
     """Samples a second of a step, ours and eager PyTorch's, on the same field and rays."""
-    fitting = begin(load_scene(run), FitSettings(seed=seed, match=False), 1)
+    fitting = begin(load_scene(run), FitSettings(seed=seed, multiview_stereo=False), 1)
     fitting.field = load_field(run).requires_grad_()
     at = drawn(fitting, samples)
     size, found = at.samples.t.shape[0], {}

@@ -34,9 +34,9 @@ WIDTH, HEIGHT = 192, 108
 BLUR = 1.5  # pixels
 ERROR, ERROR_WIDTH = 0.1, 24.0  # share of the inverse depth; pixels over which it changes
 ROWS = {
-    "no depth": Losses(points=0.0, ground=0.0, monocular=0.0),
-    "relative depth": Losses(points=0.0, ground=0.0),
-    "sparse points": Losses(monocular=0.0),
+    "no depth": Losses(sparse_depth=0.0, ground_height=0.0, monocular_depth=0.0),
+    "relative depth": Losses(sparse_depth=0.0, ground_height=0.0),
+    "sparse points": Losses(monocular_depth=0.0),
     "both": Losses(),
 }
 

@@ -101,7 +101,7 @@ def main() -> None:
     options = parser.parse_args()
     random = np.random.default_rng(0)
     scene = read_scene(ROOT / "reference" / "street")
-    fitting = begin(scene, FitSettings(minutes=None, steps=1, match=False), 1)
+    fitting = begin(scene, FitSettings(minutes=None, steps=1, multiview_stereo=False), 1)
     size = options.size
     jobs = {
         "metaball sums": snow_sums(random, int(2**18 * size)),

@@ -74,9 +74,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as work:
         for fit in options.fits:
             scene, factor = (capture, 1.0) if fit == "sparse" else (truth, float(fit))
-            losses = Losses(points=factor * Losses().points)
+            losses = Losses(sparse_depth=factor * Losses().sparse_depth)
             settings = FitSettings(
-                minutes=None, steps=options.steps, seed=options.seed, losses=losses, match=False
+                minutes=None,
+                steps=options.steps,
+                seed=options.seed,
+                losses=losses,
+                multiview_stereo=False,
             )
             run = Path(work) / fit
             fit_scene(

@@ -119,7 +119,7 @@ def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
             minutes=None,
             steps=8,
             samples_per_step=2**12,
-            losses=Losses(bend=0.01),
+            losses=Losses(normal_consistency=0.01),
             refine_poses=True,
         )
         extent = find_extent(poses, None)

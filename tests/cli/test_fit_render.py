@@ -155,7 +155,7 @@ def test_the_command_to_go_on_with_repeats_the_flags():
         (["--loss", "foo=1"], "Names: distortion"),
         (["--loss", "sky"], "--loss wants"),
         (["--loss", "sky=-1"], "--loss wants"),
-        (["--loss", "bend=1", "--loss", "normals=0"], "needs predicted normals"),
+        (["--loss", "normal_consistency=1", "--loss", "normals=0"], "needs predicted normals"),
     ],
 )
 def test_losses_that_cannot_be_used(tmp_path, capsys, words, expected):
@@ -164,13 +164,15 @@ def test_losses_that_cannot_be_used(tmp_path, capsys, words, expected):
 
 
 def test_losses_come_from_flags_on_top_of_the_preset():
-    fit = Fit(Path("a"), Path("b"), preset="paper", loss=("sky=0", "flat=0.5"))
+    fit = Fit(Path("a"), Path("b"), preset="paper", loss=("sky=0", "planarity=0.5"))
     settings = fit_settings(fit)
-    assert settings.losses == dataclasses.replace(PAPER.losses, sky=0.0, flat=0.5)
+    assert settings.losses == dataclasses.replace(PAPER.losses, sky=0.0, planarity=0.5)
     assert settings.preset == "paper" and settings.opaque_sky
-    assert fit_settings(dataclasses.replace(fit, mono_depth="none")).losses.monocular == 0
+    assert fit_settings(dataclasses.replace(fit, mono_depth="none")).losses.monocular_depth == 0
+    earlier = dataclasses.replace(fit, loss=("sky=0", "flat=0.5"))
+    assert fit_settings(earlier) == settings, "earlier names of losses are taken as well"
     words = resuming(fit)
-    assert "--loss sky=0 --loss flat=0.5" in words and "--preset paper" in words
+    assert "--loss sky=0 --loss planarity=0.5" in words and "--preset paper" in words
     assert resuming(Fit(Path("a"), Path("b"), refine_poses=True)).endswith("--refine-poses")
 
 

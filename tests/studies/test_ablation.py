@@ -70,15 +70,21 @@ def test_each_row_leaves_out_just_what_it_says():
         "no appearance": {"appearance"},
         "no distortion": {"distortion"},
         "no normals": {"normals"},
-        "no flatness": {"flat"},
+        "no flatness": {"planarity"},
         "no sky": {"sky_labels"},
         "no depth": {"points", "ground", "monocular"},
         "full": set(),
     }
     plain = rows["plain NGP"]
-    assert not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.carve
-    assert not plain.sky_labels and not plain.match and plain.decay == 0 < full.decay
-    assert not plain.cautious and not plain.crowded and plain.thin == MIN_TAU < full.thin
+    assert (
+        not any(dataclasses.astuple(plain.losses)) and not plain.appearance and not plain.free_space
+    )
+    assert not plain.sky_labels and not plain.multiview_stereo and plain.decay == 0 < full.decay
+    assert (
+        not plain.warm_up
+        and not plain.near_camera_gradient_scaling
+        and plain.pruning_threshold == MIN_TAU < full.pruning_threshold
+    )
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 

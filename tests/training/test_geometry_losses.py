@@ -28,33 +28,33 @@ def test_planes_do_not_bend_however_tilted(normal):
     for down, right in ((0, 1), (5, 0), (8, 8), (3, -3)):
         middle = z[20, 30]
         left, right_ = z[20 - down, 30 - right], z[20 + down, 30 + right]
-        assert abs(losses.bending(torch.stack([middle, left, right_])[None])) < 1e-6
+        assert abs(losses.second_difference(torch.stack([middle, left, right_])[None])) < 1e-6
 
 
 def test_ground_loss_is_the_mean_distance_from_the_ground_up_to_a_bound():
     weights = torch.tensor([0.5, 0.5, 0.2], requires_grad=True)
     t, goal = torch.tensor([0.5, 0.9, 1.0]), torch.tensor([0.53, 0.89, 4.0])
-    loss = losses.ground_loss(weights, t, goal, 4)
+    loss = losses.ground_height_loss(weights, t, goal, 4)
     assert loss.item() == pytest.approx((0.5 * 0.03 + 0.5 * 0.01 + 0.2 * losses.FAR) / 4)
     (gradient,) = torch.autograd.grad(loss, weights)
     assert torch.allclose(gradient, torch.tensor([0.03, 0.01, losses.FAR]) / 4)
     nothing = torch.zeros(0)
-    assert losses.ground_loss(nothing, nothing, nothing, 4) == 0
+    assert losses.ground_height_loss(nothing, nothing, nothing, 4) == 0
 
 
 def test_a_bump_bends_and_an_edge_costs_no_more_than_one():
     bump, edge = torch.tensor([[0.97, 1.0, 1.0]]), torch.tensor([[1.0, 1.0, 9.0]])
-    assert losses.bending(bump) == pytest.approx(2 * (0.97 - 1.0), rel=1e-4)
+    assert losses.second_difference(bump) == pytest.approx(2 * (0.97 - 1.0), rel=1e-4)
     counts = torch.ones(1)
-    assert 0.5 < losses.flat_loss(bump, counts) < losses.flat_loss(edge, counts) <= 1.0
-    assert losses.flat_loss(edge, torch.zeros(1)) == 0
+    assert 0.5 < losses.planarity_loss(bump, counts) < losses.planarity_loss(edge, counts) <= 1.0
+    assert losses.planarity_loss(edge, torch.zeros(1)) == 0
 
 
 def test_an_edge_feels_next_to_no_pull_and_a_bump_much():
     pulls = []
     for row in ([0.98, 1.0, 1.0], [1.0, 1.0, 9.0]):
         z = torch.tensor([row], requires_grad=True)
-        losses.flat_loss(z, torch.ones(1)).backward()
+        losses.planarity_loss(z, torch.ones(1)).backward()
         assert z.grad is not None
         pulls.append(float(z.grad.abs().max()))
     assert pulls[1] < 0.01 * pulls[0]
@@ -120,8 +120,8 @@ def test_a_tilted_plane_does_not_bend_along_triples():
     t = 3.0 / (batch.rays_d @ torch.tensor([0.3, -0.5, 0.8]))
     rows = torch.arange(m) + torch.tensor([[0], [n - 2 * m], [n - m]])
     z = (t * batch.cosine)[rows][:, batch.in_line]
-    assert losses.bending(z.T).abs().max() < 1e-4
-    assert losses.bending(t[rows][:, batch.in_line].T).abs().max() > 1e-2
+    assert losses.second_difference(z.T).abs().max() < 1e-4
+    assert losses.second_difference(t[rows][:, batch.in_line].T).abs().max() > 1e-2
 
 
 def test_sky_below_the_horizon_is_none():

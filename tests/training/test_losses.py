@@ -44,7 +44,7 @@ def test_distortion_of_known_weights():
 def test_light_left_below_the_horizon_counts_squared_and_above_not_at_all():
     left = torch.tensor([0.5, 0.5, 0.0, 1.0], requires_grad=True)
     below = torch.tensor([True, False, True, True])
-    loss = losses.solid_loss(left, below)
+    loss = losses.below_horizon_loss(left, below)
     assert loss.item() == pytest.approx((0.25 + 0.0 + 0.0 + 1.0) / 4)
     (gradient,) = torch.autograd.grad(loss, left)
     assert torch.allclose(gradient, torch.tensor([0.25, 0.0, 0.0, 0.5]))
@@ -58,7 +58,7 @@ def test_depth_loss_is_the_mean_distance_of_weight_from_the_point():
     # Bounded: 2 -> 1.5, 4 -> 1.75, infinity -> 2.
     first = 0.25 * 0.25 + 0.5 * 0.25 + 0.25 * 1.25
     second = 0.5 * 0.25 + 0.5 * 0.5
-    loss = losses.depth_loss(weights, left, t, depth, ray)
+    loss = losses.sparse_depth_loss(weights, left, t, depth, ray)
     assert loss.item() == pytest.approx((first + second) / 2)
     (gradient,) = torch.autograd.grad(loss, weights)
     assert torch.allclose(gradient, torch.tensor([0.25, 0.25, 0.25]) / 2)
@@ -66,11 +66,11 @@ def test_depth_loss_is_the_mean_distance_of_weight_from_the_point():
 
 def test_opacity_is_pushed_to_none_or_all():
     left = torch.tensor([0.0, 1.0], requires_grad=True)
-    loss = losses.opacity_loss(left)
+    loss = losses.opacity_entropy_loss(left)
     assert abs(loss.item()) < 2e-5
     loss.backward()
     assert torch.isfinite(left.grad).all()
-    half = losses.opacity_loss(torch.tensor([0.5]))
+    half = losses.opacity_entropy_loss(torch.tensor([0.5]))
     assert half == pytest.approx(0.5 * math.log(2))
 
 
@@ -93,7 +93,7 @@ def only(scene, weight=1.0, **settings):
 
 
 def test_surfaces_that_no_label_names_are_flattened_less(scene):
-    fitting, (batch, *rest) = only(scene, loss="flat")
+    fitting, (batch, *rest) = only(scene, loss="planarity")
     found = {
         kind: float(
             fitting.geometry_loss(replace(batch, label=torch.full_like(batch.label, kind)), *rest)
@@ -110,10 +110,10 @@ def test_distortion_and_opacity_of_a_step_are_the_functions_of_their_names(scene
     found = fitting.geometry_loss(batch, samples, weights, left, t, dt)
     wanted = losses.distortion_loss(weights, t, dt, samples.offsets)
     assert wanted > 0 and found == pytest.approx(3.0 * wanted)
-    fitting, (batch, samples, weights, _, t, dt) = only(scene, loss="opacity", weight=3.0)
+    fitting, (batch, samples, weights, _, t, dt) = only(scene, loss="opacity_entropy", weight=3.0)
     left = torch.linspace(0.0, 1.0, 900)
     found = fitting.geometry_loss(batch, samples, weights, left, t, dt)
-    wanted = losses.opacity_loss(left)
+    wanted = losses.opacity_entropy_loss(left)
     assert wanted > 0 and found == pytest.approx(3.0 * wanted)
 
 
@@ -132,7 +132,7 @@ def test_an_opaque_sky_is_asked_to_be_far(scene):
 def test_relative_depth_counts_by_its_weight_where_it_is_known(scene):
     found = []
     for weight, known in ((1.0, True), (2.0, True), (1.0, False)):
-        fitting, (batch, *rest) = only(scene, loss="monocular", weight=weight)
+        fitting, (batch, *rest) = only(scene, loss="monocular_depth", weight=weight)
         relative = torch.rand(900, generator=torch.Generator().manual_seed(1))
         batch = replace(batch, relative=relative if known else relative * torch.nan)
         found.append(float(fitting.geometry_loss(batch, *rest)))

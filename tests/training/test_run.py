@@ -24,9 +24,16 @@ from climatenerf.training import run as run_module
 from climatenerf.training.evidence import free_space as carving_module
 from climatenerf.training.evidence.sparse_depth import PointRays
 from climatenerf.training.evidence.visual_hull import Witness
+from climatenerf.training.folder import check_config
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
-from climatenerf.training.settings import PAPER, FitSettings, Losses
+from climatenerf.training.settings import (
+    PAPER,
+    RENAMED_LOSSES,
+    RENAMED_SETTINGS,
+    FitSettings,
+    Losses,
+)
 
 
 @pytest.fixture(scope="module")
@@ -317,6 +324,20 @@ def test_a_run_of_an_earlier_version_is_not_resumed(scene, tmp_path):
         fitted(scene, tmp_path / "run", steps=8, resume=True)
 
 
+def test_a_run_with_the_earlier_names_of_settings_is_read_and_resumed(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=4)
+    config = read_json(tmp_path / "run" / "config.json")
+    now = config["settings"]
+    names = {new: old for old, new in (RENAMED_SETTINGS | RENAMED_LOSSES).items()}
+    before = {names.get(name, name): value for name, value in now.items()}
+    before["losses"] = {names.get(name, name): value for name, value in now["losses"].items()}
+    assert {"carve", "match", "crowded", "cautious", "thin"} <= before.keys()
+    assert {"flat", "solid", "opacity", "points", "bend"} <= before["losses"].keys()
+    write_json(tmp_path / "run" / "config.json", {**config, "settings": before})
+    assert check_config(tmp_path / "run")["settings"] == now
+    assert fitted(scene, tmp_path / "run", steps=6, resume=True)["steps"] == 6
+
+
 def test_resuming_counts_on(scene, tmp_path):
     first = fitted(scene, tmp_path / "run", steps=8)
     second = fitted(scene, tmp_path / "run", steps=16, resume=True)
@@ -575,7 +596,9 @@ def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
 
     monkeypatch.setattr(run_module, "match_photos", match_photos)
     monkeypatch.setattr(run_module, "Fitting", begin)
-    for index, chosen in enumerate(({}, {"match": False}, {"losses": Losses(points=0.0)})):
+    for index, chosen in enumerate(
+        ({}, {"multiview_stereo": False}, {"losses": Losses(sparse_depth=0.0)})
+    ):
         settings = FitSettings(preset="tiny", minutes=None, steps=1, seed=5, **chosen)
         run = tmp_path / str(index)
         run_module.fit_scene(scene, run, settings, 1, False, lambda _: None, lambda *_: None)

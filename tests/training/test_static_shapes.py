@@ -47,7 +47,7 @@ class Watch(TorchDispatchMode):
 
 def begun(scene, fixed):
     """A fit with labels, points, relative depth and masks, in which no parameter moves."""
-    losses = Losses(bend=0.01)
+    losses = Losses(normal_consistency=0.01)
     fitting = with_labels(scene, np.asarray, losses=losses, refine_poses=True)
     pixels = fitting.pixels
     depth = torch.rand(pixels.rgb.shape[0], generator=torch.Generator().manual_seed(1))

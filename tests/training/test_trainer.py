@@ -195,7 +195,7 @@ def test_near_matter_is_believed_later(scene):
     assert fitting.near() == pytest.approx(fit.FIRST_NEAR * fitting.field.unit)
     fitting.steps = 50
     assert fitting.near() == fitting.field.near
-    assert begin(scene, steps=100, cautious=False).near() == fitting.field.near
+    assert begin(scene, steps=100, warm_up=False).near() == fitting.field.near
 
 
 @pytest.mark.parametrize("steps", [100, 5000])
@@ -216,14 +216,14 @@ def test_thin_matter_counts_as_empty_once_light_ends_on_dense(scene, steps):
             if step < fit.THIN_FROM * steps:
                 assert field.thin == MIN_TAU
         ends[kind] = field.thin
-    assert ends["surfaces"] == pytest.approx(fitting.settings.thin)
-    assert ends["haze"] < 0.5 * fitting.settings.thin
+    assert ends["surfaces"] == pytest.approx(fitting.settings.pruning_threshold)
+    assert ends["haze"] < 0.5 * fitting.settings.pruning_threshold
 
 
 def test_colours_may_depend_on_the_view_from_the_first_step(scene):
     """As in a plain NGP, which the ablation compares with and the paper starts from."""
     for cautious in (True, False):
-        fitting = begin(scene, steps=100, cautious=cautious)
+        fitting = begin(scene, steps=100, warm_up=cautious)
         before = fitting.field.view_net[0].detach().clone()
         fitting.step(fitting.pixels.draw(256, fitting.generator))
         assert torch.equal(fitting.field.view_net[0].detach(), before) == cautious
@@ -234,7 +234,7 @@ def test_rays_below_the_horizon_end_on_matter(scene):
     """They do even where nothing else asks for it: with no colour to explain."""
     left = {}
     for weight in (0.0, 1.0):
-        fitting = begin(scene, steps=100, losses=Losses(solid=weight))
+        fitting = begin(scene, steps=100, losses=Losses(below_horizon_opacity=weight))
         fitting.run(lambda _: None)
         batch = fitting.pixels.draw(2000, torch.Generator().manual_seed(0))
         below = batch.rays_d[:, 2] < fit.HORIZON
@@ -274,7 +274,7 @@ def test_points_put_matter_where_they_are(scene):
         tau = samples.sigma * samples.dt
         weights, left = dispatch.render_weights(tau, samples.offsets)
         unit = fitting.field.unit
-        off[name] = losses.depth_loss(
+        off[name] = losses.sparse_depth_loss(
             weights, left, samples.t / unit, rays.depth / unit, samples.ray_index()
         )
     assert off["with"] < 0.6 * off["without"], off
@@ -393,7 +393,7 @@ def test_a_step_has_every_loss_and_all_gradients_are_finite(scene):
         minutes=None,
         steps=60,
         samples_per_step=2**13,
-        losses=Losses(bend=0.01),
+        losses=Losses(normal_consistency=0.01),
         refine_poses=True,
     )
     fitting = Fitting(pixels, 20, begin(scene).extent, settings)
@@ -408,7 +408,14 @@ def test_a_step_has_every_loss_and_all_gradients_are_finite(scene):
 def test_switched_off_losses_have_no_part(scene):
     """Without any of them the fit is the plain one: masks, classes and normals stay untouched."""
     nothing = Losses(**{each.name: 0.0 for each in dataclasses.fields(Losses)})
-    fitting = begin(scene, steps=40, losses=nothing, appearance=False, carve=False, crowded=0.0)
+    fitting = begin(
+        scene,
+        steps=40,
+        losses=nothing,
+        appearance=False,
+        free_space=False,
+        near_camera_gradient_scaling=0.0,
+    )
     before = {k: v.clone() for k, v in fitting.field.named_parameters()}
     masks = [p.clone() for p in fitting.masks.parameters()]
     fitting.run(lambda _: None)

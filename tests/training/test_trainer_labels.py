@@ -47,7 +47,7 @@ def test_pixels_labelled_sky_lose_their_matter(scene):
 
 
 def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
-    fitting = begin(scene, steps=1, losses=Losses(sky_fill=0.0))
+    fitting = begin(scene, steps=1, losses=Losses(sky_prior=0.0))
     fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
     fitting.pixels.label[0] = SKY  # labels that know of sky
     fitting = Fitting(fitting.pixels, 20, fitting.extent, fitting.settings)
@@ -64,7 +64,7 @@ def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
 
 
 def test_what_nobody_has_labelled_may_be_sky_too(scene):
-    fitting = begin(scene, steps=1, losses=Losses(sky_fill=0.0))
+    fitting = begin(scene, steps=1, losses=Losses(sky_prior=0.0))
     fitting.pixels.label = torch.full((fitting.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
     fitting.pixels.label[0] = SKY
     fitting = Fitting(fitting.pixels, 20, fitting.extent, fitting.settings)
@@ -165,7 +165,7 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
             minutes=None,
             steps=steps,
             samples_per_step=2**15,
-            losses=Losses(points=0.0, ground=weight),
+            losses=Losses(sparse_depth=0.0, ground_height=weight),
         )
         fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(known))
         fitting.run(lambda _: None)
@@ -204,7 +204,7 @@ def test_classes_and_normals_move_no_matter(scene, monkeypatch):
     monkeypatch.setattr(losses, "colour_error", lambda linear, _: 0.0 * linear.sum(-1))
     nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
     for bend, moves in ((0.0, False), (1.0, True)):
-        weights = Losses(**{**nothing, "classes": 1.0, "normals": 1.0, "bend": bend})
+        weights = Losses(**{**nothing, "classes": 1.0, "normals": 1.0, "normal_consistency": bend})
         fitting = with_labels(scene, np.asarray, losses=weights)
         field = fitting.field
         before = {name: value.clone() for name, value in field.named_parameters()}
@@ -259,9 +259,9 @@ def test_the_sky_goes_on_where_no_photo_looked(scene, label, monkeypatch):
     up[:, 2] = 2 * up[:, 2].abs() + 1.0
     up = torch.nn.functional.normalize(up, dim=-1)
     off = {}
-    for weight in (Losses.sky_fill, 0.0):
+    for weight in (Losses.sky_prior, 0.0):
         kept = np.asarray if label else lambda ids: np.full_like(ids, 255)
-        fitting = with_labels(scene, kept, losses=Losses(sky_fill=weight))
+        fitting = with_labels(scene, kept, losses=Losses(sky_prior=weight))
         field = fitting.field
         with torch.no_grad():
             if label:
@@ -279,13 +279,13 @@ def test_the_sky_goes_on_where_no_photo_looked(scene, label, monkeypatch):
             shown = field.sky_colour(up, field.mean_embedding.expand(500, -1))
         ratio = shown.mean(-1) / seen
         off[weight] = float(((ratio < 0.5) | (ratio > 2.0)).float().mean())
-    assert off[Losses.sky_fill] < 0.5 * off[0.0], off
+    assert off[Losses.sky_prior] < 0.5 * off[0.0], off
 
 
 def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
     full = with_labels(scene, np.asarray)
     assert full.field.occupancy.barred.any() and full.knows_sky
-    assert not with_labels(scene, np.asarray, carve=False).field.occupancy.barred.any()
+    assert not with_labels(scene, np.asarray, free_space=False).field.occupancy.barred.any()
     bare = with_labels(scene, np.asarray, sky_labels=False)
     assert not bare.knows_sky and bare.pixels.witness is None
     assert not (bare.pixels.label == SKY).any() and (full.pixels.label == SKY).any()
@@ -293,7 +293,7 @@ def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
     monkeypatch.setattr(fit, "scale_gradient", lambda x, factor: factors.append(factor) or x)
     for crowded in (3.0, 0.0):
         factors.clear()
-        fitting = with_labels(scene, np.asarray, crowded=crowded)
+        fitting = with_labels(scene, np.asarray, near_camera_gradient_scaling=crowded)
         fitting.step(fitting.pixels.draw(1024, fitting.generator))
         # The first ones are those of density: 1 / chance, and less near the cameras.
         assert (factors[0].min() < 1) == (crowded > 0)

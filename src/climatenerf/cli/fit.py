@@ -18,7 +18,7 @@ from climatenerf.scene.alignment.known_length import (
 )
 from climatenerf.scene.alignment.scale import scale_summary, scale_warnings
 from climatenerf.training.folder import check_folder, check_resumable
-from climatenerf.training.settings import FitSettings, Losses, settings_of
+from climatenerf.training.settings import RENAMED_LOSSES, FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
 
@@ -49,8 +49,9 @@ class Fit:
     shelters from snow. Default: gpu with --device cuda, else cpu."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Weight of a loss, such as sky=0, which switches it off; may be given again for others. They
-    are: distortion, opacity, solid, sky, sky_fill, flat, points, ground, monocular, classes,
-    normals, bend, transient (docs/physics.md)."""
+    are: distortion, opacity_entropy, below_horizon_opacity, sky, sky_prior, planarity,
+    sparse_depth, ground_height, monocular_depth, classes, normals, normal_consistency, transient
+    (docs/physics.md)."""
     refine_poses: bool = False
     """Correct the cameras while fitting."""
     camera_height: OptionalLength = None
@@ -267,10 +268,12 @@ def fit_settings(options: Fit) -> FitSettings:
         options.preset or ("gpu" if options.device == "cuda" else "cpu"), options.device
     )
     weights = parse_losses(options.loss)
-    if weights.get("bend") and weights.get("normals") == 0:
-        raise UserError("--loss bend needs predicted normals; leave --loss normals=0 out")
+    if weights.get("normal_consistency") and weights.get("normals") == 0:
+        raise UserError(
+            "--loss normal_consistency needs predicted normals; leave --loss normals=0 out"
+        )
     if options.mono_depth == "none":
-        weights["monocular"] = 0.0
+        weights["monocular_depth"] = 0.0
     return replace(
         settings,
         losses=replace(settings.losses, **weights),
@@ -291,6 +294,7 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
     weights = {}
     for text in given:
         name, _, number = text.partition("=")
+        name = RENAMED_LOSSES.get(name, name)
         try:
             weight = float(number)
         except ValueError:

@@ -35,7 +35,7 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
 from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
-from climatenerf.training.folder import OPTIMISER
+from climatenerf.training.folder import OPTIMISER, check_config
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 from climatenerf.training.trainer import Report
@@ -74,11 +74,11 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         losses=Losses(**nothing),
         appearance=False,
         sky_labels=False,
-        carve=False,
-        match=False,
-        crowded=0.0,
-        cautious=False,
-        thin=1e-3,
+        free_space=False,
+        multiview_stereo=False,
+        near_camera_gradient_scaling=0.0,
+        warm_up=False,
+        pruning_threshold=1e-3,
         decay=0.0,
     )
     return {
@@ -86,9 +86,9 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         "no appearance": dataclasses.replace(full, appearance=False),
         "no distortion": without(distortion=0.0),
         "no normals": without(normals=0.0),
-        "no flatness": without(flat=0.0),
+        "no flatness": without(planarity=0.0),
         "no sky": dataclasses.replace(full, sky_labels=False),
-        "no depth": without(points=0.0, ground=0.0, monocular=0.0),
+        "no depth": without(sparse_depth=0.0, ground_height=0.0, monocular_depth=0.0),
         "full": full,
     }
 
@@ -194,7 +194,7 @@ def fit_row(
     wanted = json.loads(json.dumps(dataclasses.asdict(settings)))
     begun = (run / "config.json").is_file() and (run / OPTIMISER).is_file()
     if begun:
-        config = read_json(run / "config.json", "the run's configuration")
+        config = check_config(run)
         if config.get("settings") != wanted or config.get("downscale") != downscale:
             raise UserError(
                 f"{run} was fitted with other settings; choose another folder with -o, or remove it"

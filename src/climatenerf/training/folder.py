@@ -7,7 +7,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.storage import check_schema, read_json
 from climatenerf.field.presets import PRESETS
 from climatenerf.scene.scene import Scene
-from climatenerf.training.settings import FitSettings
+from climatenerf.training.settings import FitSettings, with_present_names
 
 SCHEMA_VERSION = 1  # of config.json
 OPTIMISER = "optimiser.safetensors"
@@ -35,9 +35,15 @@ def check_folder(scene: Scene, run: Path, resume: bool) -> None:
 
 
 def check_config(run: Path) -> dict:
-    """The run's configuration; refuses one from a newer version."""
+    """Return the run's configuration, its settings by their present names.
+
+    Raises:
+        UserError: the file cannot be read, or a newer version wrote it.
+    """
     config = read_json(run / "config.json", "the run's configuration")
     check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
+    if isinstance(config.get("settings"), dict):
+        config["settings"] = with_present_names(config["settings"])
     return config
 
 

@@ -39,7 +39,7 @@ def distortion_loss(
     return dispatch.distortion(weights, (start + end) / 2, end - start, offsets).mean()
 
 
-def depth_loss(
+def sparse_depth_loss(
     weights: Float[Tensor, "s"],
     left: Float[Tensor, "n"],
     t: Float[Tensor, "s"],
@@ -56,7 +56,7 @@ def depth_loss(
     return (off.sum() + (left * (2.0 - goal)).sum()) / depth.shape[0]
 
 
-def ground_loss(
+def ground_height_loss(
     weights: Float[Tensor, "k"], t: Float[Tensor, "k"], goal: Float[Tensor, "k"], rays: int
 ) -> Float[Tensor, ""]:
     """Mean over rays of their matter's distance from the ground at `goal`, as in `depth_loss`.
@@ -68,13 +68,15 @@ def ground_loss(
     return (weights * off).sum() / rays
 
 
-def opacity_loss(transmittance: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+def opacity_entropy_loss(transmittance: Float[Tensor, "n"]) -> Float[Tensor, ""]:
     """Mean of -o·log o of the rays' opacity o: rays see matter or sky, not half of each."""
     opacity = (1.0 - transmittance).clamp(1e-6, 1.0)  # log 0
     return -(opacity * opacity.log()).mean()
 
 
-def solid_loss(transmittance: Float[Tensor, "n"], below: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
+def below_horizon_loss(
+    transmittance: Float[Tensor, "n"], below: Bool[Tensor, "n"]
+) -> Float[Tensor, ""]:
     """Mean squared transmittance of the rays that point below the horizon.
 
     They end on something. Its expectation is that of a random colour behind them (variance 1/12
@@ -97,7 +99,7 @@ def far_sky_loss(distance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Fl
     return ((-distance).exp() * is_sky).mean()
 
 
-def bending(z: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
+def second_difference(z: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
     """Relative second difference of 1/z over pixels in a line: middle, left, right.
 
     The inverse z-depth of a plane is affine in pixel coordinates, so planes bend by 0 however
@@ -107,9 +109,9 @@ def bending(z: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
     return middle / left + middle / right - 2.0
 
 
-def flat_loss(z: Float[Tensor, "m 3"], counts: Float[Tensor, "m"]) -> Float[Tensor, ""]:
+def planarity_loss(z: Float[Tensor, "m 3"], counts: Float[Tensor, "m"]) -> Float[Tensor, ""]:
     """Mean of e² / (e² + `CREASE`²), e the bending (Geman & McClure): edges of depth go free."""
-    squared = bending(z).square()
+    squared = second_difference(z).square()
     return (counts * squared / (squared + CREASE**2)).mean()
 
 

@@ -178,7 +178,7 @@ def begin(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
     extent = find_extent(poses, scene.points_world())
     points = shown_points(scene, pixels)
     matched = None
-    if settings.match and settings.losses.points:
+    if settings.multiview_stereo and settings.losses.sparse_depth:
         known = pixels if settings.sky_labels else pixels.without_sky()
         matched = match_photos(known, points, (extent.near, extent.unit), settings.seed)
     return Fitting(pixels, len(poses), extent, settings, points, matched)

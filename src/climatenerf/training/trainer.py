@@ -77,7 +77,7 @@ class Fitting:
         """Begins with an untrained field (its size: the preset's); some of `matched` are wrong."""
         torch.manual_seed(settings.seed)
         self.points = points
-        self.first_near = FIRST_NEAR * extent.unit if settings.cautious else 0.0
+        self.first_near = FIRST_NEAR * extent.unit if settings.warm_up else 0.0
         if points is not None:  # a street that was driven along lies nearer than that
             nearest = float(np.quantile(to_numpy(points.depth), 0.02))
             self.first_near = min(self.first_near, nearest / 2)
@@ -94,7 +94,7 @@ class Fitting:
             self.pixels = pixels = pixels.without_sky()
         self.knows_sky = pixels.knows_sky
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
-        view_shares = VIEW_SHARES if settings.cautious else (1.0, 1.0)
+        view_shares = VIEW_SHARES if settings.warm_up else (1.0, 1.0)
         self.fill = fill_sky(pixels, self.generator)
         self.carving = Carving(self.field, pixels, points, settings)
         if matched is not None and self.carving.ground is not None:
@@ -162,7 +162,7 @@ class Fitting:
         while self.progress < 1:
             start = time.perf_counter()
             self.update_occupancy()
-            wants_triples = self.settings.losses.flat and self.stage > REFINE_AT
+            wants_triples = self.settings.losses.planarity and self.stage > REFINE_AT
             triples = int(TRIPLE_SHARE * self.rays) if wants_triples else 0
             edges = EDGE_SHARE if self.stage > EDGES_AT else 0.0
             batch = self.pixels.draw(self.rays, self.generator, triples, edges)
@@ -190,8 +190,8 @@ class Fitting:
     def compile_kernels(self) -> None:
         """Runs every kernel once on a few rays, so that compiling is not taken for fitting."""
         images = self.field.embeddings.shape[0]
-        losses_ = replace(self.settings.losses, ground=0.0)
-        quick = replace(self.settings, carve=False, losses=losses_)
+        losses_ = replace(self.settings.losses, ground_height=0.0)
+        quick = replace(self.settings, free_space=False, losses=losses_)
         small = replace(self.field.size, geometry_log2_rows=10, appearance_log2_rows=10)
         twin = Fitting(self.pixels, images, self.extent, quick, self.points, size=small)
         twin.step(twin.pixels.draw(16, twin.generator))
@@ -224,8 +224,12 @@ class Fitting:
         # is learned first. Gradients scaled with the distance squared, as the rays' spread, undo
         # that (Philip & Deschaintre 2023, Eq. 5).
         spread = torch.ones_like(chance)
-        if settings.crowded:
-            spread = (samples.t[kept] / (settings.crowded * field.near)).square().clamp_max(1.0)
+        if settings.near_camera_gradient_scaling:
+            spread = (
+                (samples.t[kept] / (settings.near_camera_gradient_scaling * field.near))
+                .square()
+                .clamp_max(1.0)
+            )
         own = field.density_with_gradient(u) * dt[kept]
         tau = tau.index_copy(0, kept, scale_gradient(own, spread / chance))
         weights, left = dispatch.render_weights(tau, samples.offsets)
@@ -240,20 +244,20 @@ class Fitting:
         loss = loss + self.surface_loss(
             batch, u[seen], ray, share[seen].detach(), samples, kept[seen]
         )
-        if settings.losses.sky_fill:
+        if settings.losses.sky_prior:
             d, colour, unseen = self.fill.draw(SKY_LOOKS, self.generator)
             shown = field.sky_colour(d, field.mean_embedding.detach().expand(SKY_LOOKS, -1))
             apart = losses.colour_error(shown, encode_srgb(colour)) * unseen
-            loss = loss + settings.losses.sky_fill * apart.mean()
+            loss = loss + settings.losses.sky_prior * apart.mean()
         if settings.refine_poses:
             loss = loss + self.poses.loss()
 
         used = samples.offsets[-1]
-        if settings.losses.points and self.measured:
+        if settings.losses.sparse_depth and self.measured:
             some = max(n // POINT_SHARE, 16)
             drawn = [each.draw(some, self.generator) for each in self.measured]
             loss_of_depth, more = self.depth_loss(joined(drawn))
-            weight = len(drawn) * settings.losses.points  # of each kind as if it were alone
+            weight = len(drawn) * settings.losses.sparse_depth  # of each kind as if it were alone
             loss, used = loss + weight * loss_of_depth, used + more
 
         self.net_adam.zero_grad()
@@ -315,12 +319,14 @@ class Fitting:
         loss = left.sum() * 0.0
         if weigh.distortion:
             loss = loss + weigh.distortion * losses.distortion_loss(weights, t, dt, samples.offsets)
-        if weigh.opacity:
-            loss = loss + weigh.opacity * losses.opacity_loss(left)
-        if weigh.solid:
+        if weigh.opacity_entropy:
+            loss = loss + weigh.opacity_entropy * losses.opacity_entropy_loss(left)
+        if weigh.below_horizon_opacity:
             below = (batch.rays_d[:, 2] < HORIZON) & (batch.label != SKY)
             grown = min(1.0, max(0.0, self.stage / REFINE_AT - 0.5))
-            loss = loss + grown * weigh.solid * losses.solid_loss(left, below)
+            loss = loss + grown * weigh.below_horizon_opacity * losses.below_horizon_loss(
+                left, below
+            )
         distance = dispatch.accumulate(weights, t[:, None], samples.offsets)[:, 0]
         mean_distance = distance / (1 - left).clamp_min(1e-3)  # nothing there: 0/0
         if weigh.sky and self.knows_sky:
@@ -331,21 +337,21 @@ class Fitting:
                 # Leaves against the sky come first, clean edges last: too early, crowns are lost.
                 grown = min(1.0, max(SKY_AT_FIRST, 2 * self.stage - 0.5))
                 loss = loss + grown * weigh.sky * losses.sky_loss(weights[which] * empty, n)
-        if weigh.ground and self.carving.ground is not None:
-            loss = loss + weigh.ground * self.ground_loss(batch, samples, weights, t)
+        if weigh.ground_height and self.carving.ground is not None:
+            loss = loss + weigh.ground_height * self.ground_loss(batch, samples, weights, t)
         solid = left.detach() < 0.5
         z = (mean_distance * batch.cosine).clamp_min(1e-3)  # of rays without matter: not counted
         m = batch.in_line.shape[0]
-        if weigh.flat and m:
+        if weigh.planarity and m:
             rows = triples(n, m)
             label = batch.label[rows]
             alike = (label == label[0]).all(0) & (label[0] != VEGETATION) & (label[0] != SKY)
             counts = (batch.in_line & alike & solid[rows].all(0)).float()
             counts = torch.where(label[0] == UNKNOWN, UNSURE_FLAT, 1.0) * counts
-            loss = loss + weigh.flat * losses.flat_loss(z[rows].T, counts)
-        if weigh.monocular and batch.relative is not None and self.stage > REFINE_AT:
+            loss = loss + weigh.planarity * losses.planarity_loss(z[rows].T, counts)
+        if weigh.monocular_depth and batch.relative is not None and self.stage > REFINE_AT:
             counts = solid & (batch.label != SKY) & torch.isfinite(batch.relative)
-            loss = loss + weigh.monocular * self.relative.loss(
+            loss = loss + weigh.monocular_depth * self.relative.loss(
                 1 / z, batch.relative, batch.image, counts
             )
         return loss
@@ -359,7 +365,7 @@ class Fitting:
     ) -> Float[Tensor, ""]:
         """How far matter on rays labelled ground is from the ground that points show.
 
-        `weights` and `t` (grid units) are the samples'; the result is `losses.ground_loss`'s.
+        `weights` and `t` (grid units) are the samples'; the result: `losses.ground_height_loss`.
         """
         ray = samples.ray_index()
         heavy = weights.detach() > GROUND_WEIGHT
@@ -373,7 +379,7 @@ class Fitting:
         far, goal, pulled = self.carving.far_from_ground(q, d, t[some], self.rooms, classed)
         some, pull = some[far], SURE_PULL if classed else 1.0
         own = weights[some] * pulled
-        return pull * losses.ground_loss(own, t[some], goal, batch.rays_o.shape[0])
+        return pull * losses.ground_height_loss(own, t[some], goal, batch.rays_o.shape[0])
 
     def sky_samples(
         self, batch: Batch, samples: Samples, weights: Float[Tensor, "s"]
@@ -399,7 +405,7 @@ class Fitting:
         `u`, `ray` and `share` are their places in the unit cube, rays and detached weights.
         """
         weigh = self.settings.losses
-        if not (weigh.classes or weigh.normals or weigh.bend):
+        if not (weigh.classes or weigh.normals or weigh.normal_consistency):
             return u.sum() * 0.0
         n = max(batch.rays_o.shape[0] // SURFACE_SHARE, 1)
         some = self.rooms.below("surface", ray, n)
@@ -407,7 +413,7 @@ class Fitting:
         of = ray[some]
         own = share[some] * (of < n)
         q = goal = None
-        if (weigh.normals or weigh.bend) and self.stage > REFINE_AT:
+        if (weigh.normals or weigh.normal_consistency) and self.stage > REFINE_AT:
             at = samples.t[index[some], None]
             q = self.field.to_grid(batch.rays_o.detach()[of] + at * batch.rays_d.detach()[of])
             if weigh.normals:
@@ -418,10 +424,10 @@ class Fitting:
         if weigh.classes and self.pixels.label is not None and self.learns_classes:
             target = self.solid_of[batch.label[:n].long()]
             loss = loss + weigh.classes * losses.class_loss(logits, target, target != UNKNOWN)
-        if weigh.bend and q is not None:
+        if weigh.normal_consistency and q is not None:
             step = BEND_STEP * samples.dt[index[some]] / self.field.unit
             bent, shown = self.field.sloped_normal(q, step), unit(raw[:, :3].detach(), 1e-6)
-            loss = loss + weigh.bend * losses.normal_loss(own, bent, shown, n)
+            loss = loss + weigh.normal_consistency * losses.normal_loss(own, bent, shown, n)
         return loss
 
     def march(
@@ -451,7 +457,7 @@ class Fitting:
         return samples
 
     def depth_loss(self, measured: PointRays) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
-        """`losses.depth_loss` of rays to sparse points (in grid units); and the samples used."""
+        """`losses.sparse_depth_loss` of rays to sparse points; and the samples used."""
         field = self.field
         if self.settings.refine_poses:
             rays = (measured.rays_o, measured.rays_d, measured.image)
@@ -462,7 +468,7 @@ class Fitting:
         u = field.sample_positions(measured.rays_o, measured.rays_d, samples)
         tau = field.density_with_gradient(u) * (samples.dt / field.unit)
         weights, left = dispatch.render_weights(tau, samples.offsets)
-        loss = losses.depth_loss(
+        loss = losses.sparse_depth_loss(
             weights, left, samples.t / field.unit, measured.depth / field.unit, samples.ray_index()
         )
         return loss, samples.offsets[-1]
@@ -477,7 +483,7 @@ class Fitting:
         Once surfaces are found, what is thin are veils, above all between leaves and the sky.
         """
         grown = min(1.0, max(0.0, (self.stage - THIN_FROM) / (FINE_AT - THIN_FROM)))
-        goal = MIN_TAU * (self.settings.thin / MIN_TAU) ** grown
+        goal = MIN_TAU * (self.settings.pruning_threshold / MIN_TAU) ** grown
         denser = 2 * self.field.thin
         if goal <= self.field.thin:
             return

@@ -83,7 +83,9 @@ def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tow
     clear = size * 3**0.5 / 2 + found.ground.tolerance * field.unit
     air = (ring > 2) & (ring < 4) & (x[:, 2] < 0.9)
     assert barred[air & (x[:, 2] > clear)].float().mean() > 0.3
-    unseen = carving(losses=type(FitSettings().losses)(ground=0.0)).field.occupancy.barred.view(-1)
+    unseen = carving(
+        losses=type(FitSettings().losses)(ground_height=0.0)
+    ).field.occupancy.barred.view(-1)
     assert not (barred & ~unseen)[air & (x[:, 2] < clear - 0.02)].any()
     assert (barred & ~unseen)[air].any()
     touches = in_matter(x) & (x[:, 2] > -size / 2) & (ring < 5)
@@ -96,7 +98,7 @@ def test_matter_with_points_is_kept_though_every_view_takes_it_for_sky():
     def err(maps):
         return [np.where(m == 2, 10, m).astype(np.uint8) for m in maps]
 
-    found = carving(err, losses=type(FitSettings().losses)(ground=0.0))
+    found = carving(err, losses=type(FitSettings().losses)(ground_height=0.0))
     field, barred = found.field, found.field.occupancy.barred.view(-1)
     assert found.points is not None
     ends = field.to_grid(found.points.ends)
@@ -113,7 +115,7 @@ def test_matter_with_points_is_kept_though_every_view_takes_it_for_sky():
 
 
 def test_what_is_much_nearer_to_a_camera_than_its_points_is_empty():
-    found = carving(losses=type(FitSettings().losses)(ground=0.0))
+    found = carving(losses=type(FitSettings().losses)(ground_height=0.0))
     field, occupancy = found.field, found.field.occupancy
     assert found.points is not None
     middle, size = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
@@ -208,7 +210,7 @@ def test_the_air_beside_the_tower_costs_and_the_tower_does_not():
     costs = asked(found, x, d, t)
     assert found.ground is not None and costs[x[:, 1].abs() > 1.0].all()
     assert not costs[in_matter(x)].any()
-    bare = carving(losses=type(FitSettings().losses)(ground=0.0))
+    bare = carving(losses=type(FitSettings().losses)(ground_height=0.0))
     assert bare.ground is None and not asked(bare, x, d, t).any()
 
 

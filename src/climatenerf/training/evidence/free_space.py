@@ -36,9 +36,9 @@ class Carving:
         settings: FitSettings,
     ):
         self.field, self.pixels, self.points = field, pixels, points
-        self.carves, self.moves = settings.carve, settings.refine_poses
+        self.carves, self.moves = settings.free_space, settings.refine_poses
         self.solid = to_device(SOLID)
-        self.knows_ground = settings.losses.ground > 0 and points is not None
+        self.knows_ground = settings.losses.ground_height > 0 and points is not None
         self.find_ground()
         self.bar()
 
