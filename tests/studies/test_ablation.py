@@ -72,7 +72,7 @@ def test_each_row_leaves_out_just_what_it_says():
         "no normals": {"normals"},
         "no flatness": {"planarity"},
         "no sky": {"sky_labels"},
-        "no depth": {"points", "ground", "monocular"},
+        "no depth": {"sparse_depth", "ground_height", "monocular_depth"},
         "full": set(),
     }
     plain = rows["plain NGP"]

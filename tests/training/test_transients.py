@@ -12,7 +12,7 @@ RATE = MASK_SHARES[1] * FitSettings().net_rate
 def train(error_at, images=4, steps=600):
     """Masks of images whose squared error at (image, place) is given."""
     torch.manual_seed(0)
-    masks = TransientMasks(images)
+    masks = TransientMasks(images, torch.Generator().manual_seed(0))
     adam = torch.optim.Adam(masks.parameters(), lr=RATE)
     for _ in range(steps):
         image, place = torch.randint(images, (1024,)), torch.rand(1024, 2)
@@ -85,8 +85,8 @@ def test_colours_learn_from_their_error_and_masks_from_what_is_unexplained():
 
 def test_features_are_bilinear_and_each_images_own():
     """Against bilinear lookups in the image alone, at its borders and inside, of many images."""
-    masks = TransientMasks(300)
     generator = torch.Generator().manual_seed(0)
+    masks = TransientMasks(300, generator)
     image = torch.randint(0, 300, (500,), generator=generator)
     place = torch.rand(500, 2, generator=generator)
     place[:100, 1], place[100:200, 1], place[200:250, 0] = 0.0, 1.0, 1.0

@@ -33,12 +33,19 @@ def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels
     return torch.tensor([int(coarsest * math.exp(growth * i) + 1e-6) for i in range(levels)])
 
 
-def _layers(*widths: int) -> nn.ParameterList:
+def _uniform(
+    shape: tuple[int, ...], bound: float, generator: torch.Generator | None
+) -> nn.Parameter:
+    """A parameter drawn from (-bound, bound) on the CPU, so that a seed means the same anywhere."""
+    drawn = torch.empty(shape, device="cpu").uniform_(-bound, bound, generator=generator)
+    return nn.Parameter(drawn.to(torch.get_default_device()))
+
+
+def _layers(generator: torch.Generator | None, *widths: int) -> nn.ParameterList:
     """Weights [in, out] and biases [out] in turn; He initialisation."""
     parameters = []
     for i, o in zip(widths[:-1], widths[1:], strict=True):
-        bound = math.sqrt(6.0 / i)
-        parameters += [nn.Parameter(torch.empty(i, o).uniform_(-bound, bound))]
+        parameters += [_uniform((i, o), math.sqrt(6.0 / i), generator)]
         parameters += [nn.Parameter(torch.zeros(o))]
     return nn.ParameterList(parameters)
 
@@ -65,6 +72,7 @@ class Field(nn.Module):
         centre: Float[np.ndarray, "3"],
         unit: float,
         near: float = 0.0,
+        generator: torch.Generator | None = None,
     ):
         """Makes an untrained field.
 
@@ -74,6 +82,7 @@ class Field(nn.Module):
             centre: middle of the scene, world metres.
             unit: metres per grid unit.
             near: no matter is believed nearer to a camera than this, m.
+            generator: source of the initial values, on the CPU; None: PyTorch's global one.
         """
         super().__init__()
         self.size = size
@@ -97,30 +106,26 @@ class Field(nn.Module):
         self.register_buffer(
             "sky_resolutions", _resolutions(size.coarsest, size.sky_finest, size.sky_levels)
         )
-        self.geometry_grid = nn.Parameter(
-            torch.empty(size.geometry_levels, 2**size.geometry_log2_rows, 2).uniform_(-1e-4, 1e-4)
+        self.geometry_grid = _uniform(
+            (size.geometry_levels, 2**size.geometry_log2_rows, 2), 1e-4, generator
         )
-        self.appearance_grid = nn.Parameter(
-            torch.empty(size.appearance_levels, 2**size.appearance_log2_rows, 2).uniform_(
-                -1e-4, 1e-4
-            )
+        self.appearance_grid = _uniform(
+            (size.appearance_levels, 2**size.appearance_log2_rows, 2), 1e-4, generator
         )
-        self.geometry_net = _layers(2 * size.geometry_levels, size.geometry_hidden, 1)
+        self.geometry_net = _layers(generator, 2 * size.geometry_levels, size.geometry_hidden, 1)
         # Thin haze everywhere to begin with: dense enough to learn from, thin enough to prune.
         nn.init.constant_(self.geometry_net[-1], -1.5)
-        self.colour_net = _layers(2 * size.appearance_levels, size.colour_hidden, 3)
-        self.view_net = _layers(16 + size.embedding, size.colour_hidden)
+        self.colour_net = _layers(generator, 2 * size.appearance_levels, size.colour_hidden, 3)
+        self.view_net = _layers(generator, 16 + size.embedding, size.colour_hidden)
         nn.init.zeros_(self.view_net[0][:16])  # colours alike from all sides to begin with
-        self.surface_grid = nn.Parameter(
-            torch.empty(size.surface_levels, 2**size.surface_log2_rows, 2).uniform_(-1e-4, 1e-4)
+        self.surface_grid = _uniform(
+            (size.surface_levels, 2**size.surface_log2_rows, 2), 1e-4, generator
         )
         inputs = 2 * (size.surface_levels or size.appearance_levels)
-        self.surface_net = _layers(inputs, size.surface_hidden, 3 + len(SOLID))
-        self.sky_grid = nn.Parameter(
-            torch.empty(size.sky_levels, 2**size.sky_log2_rows, 2).uniform_(-1e-4, 1e-4)
-        )
+        self.surface_net = _layers(generator, inputs, size.surface_hidden, 3 + len(SOLID))
+        self.sky_grid = _uniform((size.sky_levels, 2**size.sky_log2_rows, 2), 1e-4, generator)
         inputs = 16 + 2 * size.sky_levels + size.embedding
-        self.sky_net = _layers(inputs, size.sky_hidden, size.sky_hidden, 3)
+        self.sky_net = _layers(generator, inputs, size.sky_hidden, size.sky_hidden, 3)
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
         # Whether normals and classes were learned: an untrained head says nothing.
         self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))

@@ -75,7 +75,7 @@ class Fitting:
         size: FieldSize | None = None,
     ):
         """Begins with an untrained field (its size: the preset's); some of `matched` are wrong."""
-        torch.manual_seed(settings.seed)
+        initial = torch.Generator(device="cpu").manual_seed(settings.seed)
         self.points = points
         self.first_near = FIRST_NEAR * extent.unit if settings.warm_up else 0.0
         if points is not None:  # a street that was driven along lies nearer than that
@@ -85,8 +85,8 @@ class Fitting:
         self.extent = extent
         self.settings = settings
         size = size or PRESETS[settings.preset]
-        self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near)
-        self.masks, self.poses = TransientMasks(images), PoseCorrections(images)
+        self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near, initial)
+        self.masks, self.poses = TransientMasks(images, initial), PoseCorrections(images)
         self.relative = RelativeDepth(images)
         self.rooms = Rooms(torch.get_default_device().type == "cuda")
         self.generator = torch.Generator().manual_seed(settings.seed)

@@ -32,15 +32,18 @@ STILL_CELLS = 24  # unless points lie on it in a cell of so many along a photo's
 class TransientMasks(nn.Module):
     """A small network over a pyramid of features of each image's own."""
 
-    def __init__(self, images: int):
+    def __init__(self, images: int, generator: torch.Generator | None = None):
+        """Initialise the masks of `images` images; generator: on the CPU; None: the global one."""
         super().__init__()
-        self.levels = nn.ParameterList(
+        self.levels = nn.ParameterList()
+        for side in CELLS:
             # The image is a row of its own, so images never leak into each other.
-            [nn.Parameter(1e-2 * torch.randn(images, side, side, FEATURES)) for side in CELLS]
-        )
-        last = nn.Linear(HIDDEN, 1)
+            shape = (images, side, side, FEATURES)
+            drawn = torch.randn(shape, generator=generator, device="cpu")
+            self.levels.append(nn.Parameter((1e-2 * drawn).to(torch.get_default_device())))
+        last = _linear(HIDDEN, 1, generator)
         nn.init.constant_(last.bias, math.log(FAINT / (1 - FAINT)))  # all is believed at first
-        self.net = nn.Sequential(nn.Linear(FEATURES * len(CELLS), HIDDEN), nn.ReLU(), last)
+        self.net = nn.Sequential(_linear(FEATURES * len(CELLS), HIDDEN, generator), nn.ReLU(), last)
 
     def forward(self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
         """M of pixels: 1 where a photo shows what is not of the scene.
@@ -87,6 +90,19 @@ class TransientMasks(nn.Module):
             )
             found.append(looked[0, :, 0].T)
         return torch.cat(found, dim=-1)
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
+    """A layer with PyTorch's default initialisation, drawn from a given generator."""
+    layer = nn.Linear(inputs, outputs)
+    weight = torch.empty(outputs, inputs, device="cpu")
+    nn.init.kaiming_uniform_(weight, a=math.sqrt(5), generator=generator)
+    bound = 1 / math.sqrt(inputs)
+    bias = torch.empty(outputs, device="cpu").uniform_(-bound, bound, generator=generator)
+    with torch.no_grad():
+        layer.weight.copy_(weight)
+        layer.bias.copy_(bias)
+    return layer
 
 
 def can_move(label: UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
