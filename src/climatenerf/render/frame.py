@@ -17,7 +17,7 @@ from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
 from climatenerf.render.volume import camera_rays
-from climatenerf.weather.flood.optics import pixel_roll
+from climatenerf.weather.flood.optics import pixel_rotation
 from climatenerf.weather.world import FieldLike, World
 
 
@@ -66,7 +66,7 @@ def traced_rays(
     row, column = torch.meshgrid(
         torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
     )
-    roll = pixel_roll(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
+    roll = pixel_rotation(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
     return rays_o, rays_d, angle, roll
 
 

@@ -51,7 +51,7 @@ def trace(
         rays_o: origins, m.
         rays_d: unit directions.
         pixel_angle: angle a pixel spans, rad.
-        roll: turn of each ray's glossy reflection, rad; see `flood.pixel_roll`.
+        roll: turn of each ray's glossy reflection, rad; see `flood.optics.pixel_rotation`.
     """
     parts = []
     size = rays_at_once(rays_o)
@@ -416,7 +416,7 @@ def _other_side(
         dry, path = matter / opacity[:, None], length / opacity
         light = water_physics.light_cosine(water.flood, water.sun_elevation)
         passed = water_physics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
-        behind[down] = water_physics.bed_radiance(dry, water.irradiance, water.flood.ior)
+        behind[down] = water_physics.bottom_radiance(dry, water.irradiance, water.flood.ior)
         through[down] = passed * (1 - left)[:, None]
     through[below] = 1.0
     up = (below & (direction[:, 2] > 0)).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""Flood water: where rays meet it and go, and that no light is made or lost."""
+"""Optics of flood water: intersection, ray directions, radiance and energy conservation."""
 
 import math
 
@@ -14,13 +14,14 @@ PUDDLE = Flood(level=0.0)
 
 
 def rays(n: int, seed: int = 0, below: bool = False) -> torch.Tensor:
-    """Directions that meet the plane from above (or from below), horizon to straight."""
+    """Random directions towards the plane from above, or from below."""
     d = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     d[:, 2] = d[:, 2].abs() * (1 if below else -1)
     return d / d.norm(dim=-1, keepdim=True)
 
 
-def no(d: torch.Tensor) -> torch.Tensor:
+def above_water(d: torch.Tensor) -> torch.Tensor:
+    """The argument `below` for rays that are all above water."""
     return torch.zeros(len(d), dtype=torch.bool)
 
 
@@ -32,42 +33,42 @@ def at_angle(degrees: float) -> torch.Tensor:
 UP = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
 
 
-# --- where ------------------------------------------------------------------------------------
+# --- intersection -----------------------------------------------------------------------------
 
 
-def test_plane_distance():
+def test_distance_to_the_water_plane():
     o = torch.tensor([[0.0, 0.0, 3.0], [0, 0, 3], [0, 0, -1], [0, 0, -1], [0, 0, 3], [0, 0, 1]])
     d = torch.tensor(
         [[0.0, 0.0, -1.0], [0, 0, 1], [0, 0, 1], [0, 0, -1], [1, 0, 0], [0.6, 0, -0.8]]
     )
     t = water.plane_distance(o, d, 1.0)
     assert t[:5].tolist() == [2, math.inf, 2, math.inf, math.inf]
-    assert t[5] == math.inf  # an eye in the plane itself
+    assert t[5] == math.inf  # a ray that starts in the plane
     d.requires_grad_()
     t = water.plane_distance(o, d, 1.0)
     t[torch.isfinite(t)].sum().backward()
     assert torch.isfinite(d.grad).all()
 
 
-def test_footprint():
+def test_footprint_is_the_geometric_mean_of_width_and_length():
     t, pixel = torch.tensor([10.0, 10.0]).double(), 2e-3
     d = torch.cat([at_angle(0), at_angle(60)])
     seen = water.footprint(t, d, pixel)
     assert seen.tolist() == pytest.approx([0.02, math.sqrt(0.02 * 0.04)])
 
 
-def test_coverage_is_the_share_of_the_pixel():
-    """Slope meeting level water: counted sub-pixel by sub-pixel, and by the formula."""
+def test_coverage_equals_the_counted_fraction_of_the_pixel():
+    """Sloping ground meets level water; the reference counts 400 sub-pixels."""
     slope = math.tan(math.radians(8))  # ground rises along +x and meets the water at x = 10
     normal = torch.tensor([-slope, 0.0, 1.0], dtype=torch.float64)
     normal = normal / normal.norm()
     pixel = 2e-3
-    centre = math.atan2(10, 1.6)  # eye 1.6 m above the water
+    centre = math.atan2(10, 1.6)  # camera 1.6 m above the water
 
     angles = centre + pixel * torch.linspace(-1.2, 1.2, 25, dtype=torch.float64)
     d = torch.stack([torch.sin(angles), 0 * angles, -torch.cos(angles)], dim=-1)
     t_plane = -1.6 / d[:, 2]
-    # The ground is z = slope (x - 10) over the water, so the eye is 1.6 + 10 slope above it.
+    # The ground is z = slope (x - 10) over the water, so the camera is 1.6 + 10 slope above it.
     t_ground = -(1.6 + 10 * slope) * normal[2] / (d @ normal)
     seen = water.shore_coverage(t_plane, t_ground, d, pixel, normal.expand(25, 3))
     fine = angles[:, None] + pixel * (torch.arange(400, dtype=torch.float64) - 199.5) / 400
@@ -75,7 +76,7 @@ def test_coverage_is_the_share_of_the_pixel():
     assert (seen - counted).abs().max() < 0.02
 
 
-def test_coverage_limits_and_nesting():
+def test_coverage_increases_with_the_level():
     d = rays(300)
     t_ground = 1 + 30 * torch.rand(300, generator=torch.Generator().manual_seed(1)).double()
     t_ground[:20] = torch.inf
@@ -95,21 +96,21 @@ def test_coverage_limits_and_nesting():
     assert (sky == 1).all()
 
 
-def test_coverage_is_continuous_and_its_gradient_finite():
+def test_coverage_is_continuous_with_finite_gradients():
     d = at_angle(80).expand(2001, 3)
     t_ground = torch.linspace(9.9, 10.1, 2001, dtype=torch.float64, requires_grad=True)
     t_plane = torch.full((2001,), 10.0, dtype=torch.float64, requires_grad=True)
-    for normal in (None, UP.expand(2001, 3)):  # ground level with the water is the singular case
+    for normal in (None, UP.expand(2001, 3)):  # ground parallel to the water is singular
         seen = water.shore_coverage(t_plane, t_ground, d, 2e-3, normal)
         assert seen.diff().max() < 0.06 and (seen.diff() >= 0).all()
         seen.sum().backward()
         assert torch.isfinite(t_ground.grad).all() and torch.isfinite(t_plane.grad).all()
 
 
-# --- whither ----------------------------------------------------------------------------------
+# --- directions -------------------------------------------------------------------------------
 
 
-def test_snell():
+def test_refraction_obeys_snells_law():
     for degrees in (0, 30, 60, 89):
         out, total = water.refract(at_angle(degrees), UP, IOR, torch.tensor([False]))
         assert not total.item()
@@ -117,13 +118,13 @@ def test_snell():
         assert out[0].tolist() == pytest.approx([sine, 0, -math.sqrt(1 - sine**2)], abs=1e-6)
 
 
-def test_refraction_is_reversible_and_total_beyond_the_critical_angle():
+def test_refraction_is_reversible_up_to_the_critical_angle():
     d = rays(500)
     normal = water.normal_of(0.02 * torch.randn(500, 2, dtype=torch.float64))
-    down, total = water.refract(d, normal, IOR, no(d))
+    down, total = water.refract(d, normal, IOR, above_water(d))
     usable = (d * normal).sum(-1) < 0
     assert not total[usable].any()
-    back, total = water.refract(-down, normal, IOR, ~no(d))
+    back, total = water.refract(-down, normal, IOR, ~above_water(d))
     assert not total[usable].any()
     torch.testing.assert_close(back[usable], -d[usable], atol=1e-5, rtol=0)
     critical = math.degrees(math.asin(1 / IOR))
@@ -132,20 +133,20 @@ def test_refraction_is_reversible_and_total_beyond_the_critical_angle():
         assert total.item() is expected
 
 
-def test_apparent_depth_near_the_nadir():
+def test_apparent_depth_near_the_nadir_is_depth_over_ior():
     d = at_angle(2)
     out, _ = water.refract(d, UP, IOR, torch.tensor([False]))
-    offset = 2.0 / -out[0, 2] * out[0, 0]  # on a bed 2 m down
+    offset = 2.0 / -out[0, 2] * out[0, 0]  # on the bottom, 2 m down
     apparent = offset / math.tan(math.radians(2))
     assert apparent.item() == pytest.approx(2.0 / IOR, rel=0.01)
 
 
-def test_sigma_points_have_the_lobes_moments():
-    """Mean along the axis, variance 1/lambda each way, whatever the roll; angle sqrt(3/lambda)."""
+def test_sigma_points_match_mean_and_variance_of_the_lobe():
+    """Variance 1/lambda on both axes at any sample rotation; angle sqrt(3/lambda)."""
     axis = -rays(50)
     spread = torch.full((50,), 1e-3, dtype=torch.float64)
-    for roll in (None, torch.linspace(0, 1.5, 50, dtype=torch.float64)):
-        d, weights = water.glossy_rays(axis, spread, spread, no(axis), roll)
+    for rotation in (None, torch.linspace(0, 1.5, 50, dtype=torch.float64)):
+        d, weights = water.glossy_rays(axis, spread, spread, above_water(axis), rotation)
         assert weights.tolist() == pytest.approx([1 / 3] + 4 * [1 / 6])
         torch.testing.assert_close(d.norm(dim=-1), torch.ones(50, 5, dtype=torch.float64))
         high = axis[:, 2] > 0.1  # not clipped
@@ -156,8 +157,8 @@ def test_sigma_points_have_the_lobes_moments():
         assert eigen.numpy() == pytest.approx(1e-3, rel=2e-3)
 
 
-def test_lobe_against_reflections_off_random_facets():
-    """Variances of the reflected direction, in the plane of incidence and across it."""
+def test_lobe_equals_reflections_off_random_facets():
+    """Mean and variance of the reflected direction, per component."""
     deviation, n = 0.03, 200_000
     generator = torch.Generator().manual_seed(0)
     slope = deviation * torch.randn(n, 2, generator=generator, dtype=torch.float64)
@@ -169,118 +170,125 @@ def test_lobe_against_reflections_off_random_facets():
         variance = torch.tensor([deviation**2], dtype=torch.float64)
         flat = torch.zeros(1, 2, dtype=torch.float64)
         sharp = Flood(level=0.0, gloss=1e9)
-        seen, weights, _ = water.reflection(d, flat, variance, sharp, no(d))
+        seen, weights, _ = water.reflection(d, flat, variance, sharp, above_water(d))
         for component in range(3):
             mean = (weight * true[:, component]).sum() / weight.sum()
             spread = (weight * (true[:, component] - mean) ** 2).sum() / weight.sum()
-            own = (weights * seen[0, :, component]).sum()
-            own_spread = (weights * (seen[0, :, component] - own) ** 2).sum()
-            assert own.item() == pytest.approx(mean.item(), abs=2e-3)
-            assert own_spread.item() == pytest.approx(spread.item(), rel=0.06, abs=2e-5)
+            actual = (weights * seen[0, :, component]).sum()
+            actual_spread = (weights * (seen[0, :, component] - actual) ** 2).sum()
+            assert actual.item() == pytest.approx(mean.item(), abs=2e-3)
+            assert actual_spread.item() == pytest.approx(spread.item(), rel=0.06, abs=2e-5)
 
 
-def test_reflected_rays_stay_on_their_side():
+def test_reflected_rays_stay_on_their_side_of_the_water():
     for below in (False, True):
         d = rays(400, below=below)
         slope = 0.3 * torch.randn(400, 2, dtype=torch.float64)
         variance = 0.05 * torch.rand(400, dtype=torch.float64)
         under = torch.full((400,), below)
-        seen, _, share = water.reflection(d, slope, variance, PUDDLE, under)
+        seen, _, reflectance = water.reflection(d, slope, variance, PUDDLE, under)
         assert (seen[..., 2] <= 0).all() if below else (seen[..., 2] >= 0).all()
         torch.testing.assert_close(seen.norm(dim=-1), torch.ones(400, 5, dtype=torch.float64))
-        assert ((share >= 0) & (share <= 1)).all()
+        assert ((reflectance >= 0) & (reflectance <= 1)).all()
 
 
-def test_still_sharp_water_is_a_mirror():
+def test_flat_water_of_high_gloss_is_a_mirror():
     d = rays(100)
     flat = torch.zeros(100, 2, dtype=torch.float64)
     still = torch.zeros(100, dtype=torch.float64)
-    seen, _, share = water.reflection(d, flat, still, Flood(level=0.0, gloss=1e9), no(d))
+    seen, _, reflectance = water.reflection(
+        d, flat, still, Flood(level=0.0, gloss=1e9), above_water(d)
+    )
     expected = d * torch.tensor([1, 1, -1])
     assert (seen - expected[:, None]).norm(dim=-1).max() < 6e-5
-    torch.testing.assert_close(share, fresnel.reflectance(-d[:, 2], IOR))
+    torch.testing.assert_close(reflectance, fresnel.reflectance(-d[:, 2], IOR))
 
 
-def test_neighbouring_pixels_roll_differently():
+def test_neighbouring_pixels_get_different_rotations():
     grid = torch.stack(torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij"), -1)
-    roll = water.pixel_roll(grid.reshape(-1, 2)).reshape(64, 64)
-    assert ((roll >= 0) & (roll < math.pi / 2)).all()
-    assert (roll[1:] - roll[:-1]).abs().min() > 0.05
-    assert roll.mean().item() == pytest.approx(math.pi / 4, rel=0.02)
+    rotation = water.pixel_rotation(grid.reshape(-1, 2)).reshape(64, 64)
+    assert ((rotation >= 0) & (rotation < math.pi / 2)).all()
+    assert (rotation[1:] - rotation[:-1]).abs().min() > 0.05
+    assert rotation.mean().item() == pytest.approx(math.pi / 4, rel=0.02)
 
 
-# --- what comes back --------------------------------------------------------------------------
+# --- radiance ---------------------------------------------------------------------------------
 
 
-def test_wet_bed_against_path_traced_figures():
-    """RenderOutput from the nadir under an even sky: .076 .202 .453 for dry albedos .1 .3 .6."""
+def test_wet_bottom_equals_path_traced_radiance():
+    """At the nadir under a uniform sky: .076 .202 .453 for dry albedos .1 .3 .6."""
     sky = torch.tensor([math.pi] * 3)
     for albedo, expected in ((0.1, 0.076), (0.3, 0.202), (0.6, 0.453)):
-        bed = water.bed_radiance(torch.full((1, 3), albedo), sky, IOR)
-        share = fresnel.reflectance(torch.ones(1), IOR)
-        seen = water.shade(torch.ones(1, 3), share, bed, torch.ones(1, 3), torch.zeros(3))
+        bottom = water.bottom_radiance(torch.full((1, 3), albedo), sky, IOR)
+        reflectance = fresnel.reflectance(torch.ones(1), IOR)
+        seen = water.shade(torch.ones(1, 3), reflectance, bottom, torch.ones(1, 3), torch.zeros(3))
         assert seen[0, 0].item() == pytest.approx(expected, abs=0.002)
 
 
-def test_white_bed_stays_white_and_black_scenes_stay_finite():
-    white = water.bed_radiance(torch.ones(1, 3), torch.tensor([math.pi] * 3), IOR)
+def test_white_bottom_stays_white_and_black_stays_finite():
+    white = water.bottom_radiance(torch.ones(1, 3), torch.tensor([math.pi] * 3), IOR)
     torch.testing.assert_close(white, torch.ones(1, 3), atol=1e-6, rtol=0)
-    dark = water.bed_radiance(torch.zeros(1, 3), torch.zeros(3), IOR)
+    dark = water.bottom_radiance(torch.zeros(1, 3), torch.zeros(3), IOR)
     assert torch.equal(dark, torch.zeros(1, 3))
-    wet = water.bed_radiance(torch.rand(50, 3), torch.tensor([math.pi] * 3), IOR)
+    wet = water.bottom_radiance(torch.rand(50, 3), torch.tensor([math.pi] * 3), IOR)
     assert (wet <= 1).all()
 
 
 @pytest.mark.parametrize("below", [False, True])
 def test_white_furnace(below):
-    """Radiance 1 everywhere, white bed, clear water, waves on: 1 at every pixel."""
+    """Radiance 1 everywhere, white bottom, clear water, waves on: 1 at every pixel."""
     d = rays(2000, below=below).float()
     under = torch.full((2000,), below)
     frame = waves.at_time(waves.make_waves(PUDDLE, 0, 64), 0.4)
     x = 10 * torch.rand(2000, 2)
     slope, removed = waves.slopes(frame, x, torch.rand(2000))
-    seen, weights, share = water.reflection(d, slope, removed, PUDDLE, under)
+    seen, weights, reflectance = water.reflection(d, slope, removed, PUDDLE, under)
     reflected = (weights[:, None] * torch.ones_like(seen)).sum(1)
     white = torch.tensor([math.pi] * 3)
-    behind = torch.ones(2000, 3) if below else water.bed_radiance(torch.ones(2000, 3), white, IOR)
+    background = (
+        torch.ones(2000, 3) if below else water.bottom_radiance(torch.ones(2000, 3), white, IOR)
+    )
     path = 5 * torch.rand(2000)
-    through = water.water_transmittance(torch.zeros(3), path, 0.8 * path, 0.83)
-    result = water.shade(reflected, share, behind, through, water.body_colour(PUDDLE, white))
+    transmittance = water.water_transmittance(torch.zeros(3), path, 0.8 * path, 0.83)
+    result = water.shade(
+        reflected, reflectance, background, transmittance, water.body_colour(PUDDLE, white)
+    )
     assert (result - 1).abs().max() < 1e-3
 
 
-def test_attenuation_is_recovered():
+def test_transmittance_recovers_the_attenuation():
     beta = torch.tensor([0.4, 1.1, 2.5])
     depth = torch.linspace(0.1, 3, 50)
     path = depth / 0.9
     seen = water.water_transmittance(beta, path, depth, 0.83)
     recovered = -torch.log(seen) / (path + depth / 0.83)[:, None]
     torch.testing.assert_close(recovered, beta.expand(50, 3), rtol=0.01, atol=0)
-    endless = torch.tensor([torch.inf])
-    assert water.water_transmittance(torch.zeros(3), endless, endless, 0.83).tolist() == [[1, 1, 1]]
-    assert water.water_transmittance(beta, endless, endless, 0.83).tolist() == [[0, 0, 0]]
+    infinite = torch.tensor([torch.inf])
+    for attenuation, expected in ((torch.zeros(3), 1), (beta, 0)):
+        seen = water.water_transmittance(attenuation, infinite, infinite, 0.83)
+        assert seen.tolist() == [[expected] * 3]
 
 
-def test_clarity_means_what_it_says():
-    """A white disc at the clarity keeps 2 % of its contrast, down and up, over the channels."""
+def test_clarity_is_the_depth_of_two_percent_contrast():
+    """A white disc at the depth `clarity` keeps 2 % of its contrast, mean over channels."""
     beta = torch.tensor(water.attenuation(Flood(clarity=0.3)))
     assert math.exp(-2 * 0.3 * beta.mean().item()) == pytest.approx(0.02, rel=0.1)
-    assert beta[0] < beta[1] < beta[2]  # mud is brown
+    assert beta[0] < beta[1] < beta[2]  # muddy water is brown
     clear = water.attenuation(Flood(clarity=100.0))
     assert clear[0] > clear[1] > clear[2]  # deep clear water is blue
     assert water.attenuation(Flood(attenuation=(1, 2, 3))) == (1, 2, 3)
 
 
-def test_body_is_lit_by_the_scene():
+def test_body_colour_is_proportional_to_irradiance():
     noon = water.body_colour(PUDDLE, torch.tensor([math.pi] * 3))
     assert noon.tolist() == pytest.approx([0.2029, 0.1373, 0.0836], abs=1e-3)  # sRGB decoded
     torch.testing.assert_close(water.body_colour(PUDDLE, torch.tensor([0.1] * 3)), noon / 31.416)
 
 
-def test_light_cosine():
+def test_light_cosine_of_sun_and_uniform_sky():
     assert water.light_cosine(PUDDLE, math.radians(90)) == pytest.approx(1)
     assert water.light_cosine(PUDDLE, math.radians(30)) == pytest.approx(0.760, abs=1e-3)
-    # Mean of 1/cos in the water, over diffuse light that has entered it.
+    # Mean of 1/cos under water over refracted diffuse light.
     mu = (torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000
     weight = 2 * mu * (1 - fresnel.reflectance(mu, IOR))
     inside = torch.sqrt(1 - (1 - mu**2) / IOR**2)
@@ -295,8 +303,8 @@ def test_gradients_are_finite_everywhere():
         ray = d.clone().requires_grad_()
         slope = (deviation * torch.randn(len(d), 2)).requires_grad_()
         variance = torch.full((len(d),), deviation**2, requires_grad=True)
-        seen, _, share = water.reflection(ray, slope, variance, PUDDLE, under)
+        seen, _, reflectance = water.reflection(ray, slope, variance, PUDDLE, under)
         out, _ = water.refract(ray, water.normal_of(slope), IOR, under)
-        (seen[..., :2].sum() + seen[..., 2].sum() + share.sum() + out.sum()).backward()
-        for value in (seen, share, out, ray.grad, slope.grad, variance.grad):
+        (seen[..., :2].sum() + seen[..., 2].sum() + reflectance.sum() + out.sum()).backward()
+        for value in (seen, reflectance, out, ray.grad, slope.grad, variance.grad):
             assert torch.isfinite(value).all()

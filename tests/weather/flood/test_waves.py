@@ -1,4 +1,4 @@
-"""Waves: the spectrum's integrals, the animated field's statistics, and the filtered lookups."""
+"""Waves: integrals of the spectrum, statistics of the animated surface, filtered lookups."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ SEA = Flood(level=0.0, wind_speed=10.0, fetch=1e5, depth=200.0)
 
 @pytest.fixture(autouse=True, scope="module")
 def one_thread():
-    """Thousands of small FFTs: handing each to several threads costs more than it saves."""
+    """Run on one thread: thousands of small FFTs are slower on several."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -24,7 +24,7 @@ def one_thread():
 
 
 def single_tile(flood: Flood, seed: int, peaks: float = 16, n: int = 64):
-    """A tile of so many peak waves, and the band it carries."""
+    """A tile whose side is `peaks` peak wavelengths, and its band of wavenumbers."""
     length = peaks * 2 * math.pi / spectrum.peak_wavenumber(flood)
     band = [0.0, 0.9 * math.pi * n / length]
     generator = torch.Generator().manual_seed(seed)
@@ -38,19 +38,19 @@ def as_waves(tile: waves.WaveTile, scale: float = 1.0) -> waves.Waves:
 # --- spectrum ---------------------------------------------------------------------------------
 
 
-def test_dispersion():
+def test_dispersion_limits_and_slowest_wave():
     k = np.array([0.01, 1.0])
     assert spectrum.dispersion(k, 1e4) == pytest.approx(np.sqrt(9.81 * k), rel=1e-4)  # deep
     shallow = spectrum.dispersion(np.array([0.01]), 0.5)
     assert shallow == pytest.approx(0.01 * math.sqrt(9.81 * 0.5), rel=1e-4)
-    # Capillary-gravity waves are slowest at 1.7 cm, at 23 cm/s.
+    # The slowest gravity-capillary wave has a length of 1.7 cm and a speed of 23 cm/s.
     fine = np.geomspace(50, 2000, 2000)
     speed = spectrum.dispersion(fine, 10.0) / fine
     assert speed.min() == pytest.approx(0.232, rel=0.01)
     assert 2 * math.pi / fine[speed.argmin()] == pytest.approx(0.0172, rel=0.02)
 
 
-def test_group_velocity_is_the_derivative():
+def test_group_velocity_is_the_derivative_of_dispersion():
     k = np.geomspace(0.05, 1000, 50)
     for depth in (0.05, 1.0, 100.0):
         step = 1e-5 * k
@@ -58,7 +58,7 @@ def test_group_velocity_is_the_derivative():
         assert spectrum.group_velocity(k, depth) == pytest.approx(slope / (2 * step), rel=1e-6)
 
 
-def test_tma_known_values():
+def test_tma_spectrum_at_the_peak():
     wind, fetch = 10.0, 1e5
     peak = spectrum.peak_frequency(wind, fetch)
     assert peak == pytest.approx(22 * (9.81**2 / 1e6) ** (1 / 3))
@@ -75,35 +75,35 @@ def test_tma_known_values():
 def test_spreading_is_normalised_and_points_downwind():
     angle = (np.arange(4000) + 0.5) / 4000 * 2 * math.pi - math.pi
     for ratio in (0.3, 0.8, 1.0, 1.5, 3.0, 30.0):
-        share = spectrum.spreading(np.full_like(angle, ratio), angle)
-        assert share.mean() * 2 * math.pi == pytest.approx(1, abs=1e-4)
-        assert abs(angle[share.argmax()]) < 0.01
+        density = spectrum.spreading(np.full_like(angle, ratio), angle)
+        assert density.mean() * 2 * math.pi == pytest.approx(1, abs=1e-4)
+        assert abs(angle[density.argmax()]) < 0.01
 
 
 @pytest.mark.parametrize(("wind", "tolerance"), [(5.0, 0.15), (10.0, 0.35)])
 def test_open_sea_is_near_cox_and_munk(wind, tolerance):
-    """Developed sea, cut at 370 rad/m where capillary waves begin; short of storms."""
+    """Developed sea, cut off at 370 rad/m where capillary waves begin; moderate wind."""
     sea = replace(SEA, wind_speed=wind)
     k = spectrum.log_axis(sea)
     energy = spectrum.wavenumber_spectrum(k, sea, spectrum.MAX_CUTOFF)
     slope = np.trapezoid(k**3 * energy, np.log(k))
     assert slope == pytest.approx(spectrum.cox_munk(wind), rel=tolerance)
-    # What the tiles lack is handed on as unresolved variance.
-    drawn = waves.make_waves(sea, 0, 64)
-    total = drawn.mean_square_slope + 2 * drawn.unresolved
+    # Slope variance that no tile resolves counts as unresolved.
+    sampled = waves.make_waves(sea, 0, 64)
+    total = sampled.mean_square_slope + 2 * sampled.unresolved
     assert total == pytest.approx(spectrum.cox_munk(wind))
 
 
 def test_significant_height_of_the_open_sea():
-    """10 m/s over 100 km: 2.1 m (the height that JONSWAP's fetch law, 0.0016 F^0.5, gives)."""
-    drawn = waves.make_waves(SEA, 0, 64)
+    """10 m/s over 100 km: 2.1 m, near JONSWAP's fetch law 0.0016 F^0.5."""
+    sampled = waves.make_waves(SEA, 0, 64)
     law = 0.0016 * math.sqrt(9.81 * 1e5 / 100) * 100 / 9.81
-    assert drawn.significant_height == pytest.approx(law, rel=0.35)
-    assert drawn.significant_height == pytest.approx(2.14, abs=0.02)
+    assert sampled.significant_height == pytest.approx(law, rel=0.35)
+    assert sampled.significant_height == pytest.approx(2.14, abs=0.02)
 
 
 @pytest.mark.parametrize("wind", [0.5, 2.0, 6.0])
-def test_short_fetch_holds_no_more_slope_than_cox_and_munk(wind):
+def test_slope_variance_at_short_fetch_equals_cox_and_munk(wind):
     flood = Flood(level=0.0, wind_speed=wind)
     sea = waves.make_waves(flood, 0, n=64)
     total = sea.mean_square_slope + 2 * sea.unresolved
@@ -111,17 +111,17 @@ def test_short_fetch_holds_no_more_slope_than_cox_and_munk(wind):
     assert sea.unresolved < 0.02 * total
 
 
-def test_default_is_a_gentle_ripple():
+def test_default_waves_are_ripples_of_centimetres():
     sea = waves.make_waves(STREET, 0)
     assert 0.004 < sea.significant_height < 0.02  # metres
     assert 0.05 < math.sqrt(sea.mean_square_slope / 2) < 0.1
 
 
-# --- field ------------------------------------------------------------------------------------
+# --- surface ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("flood", [STREET, SEA, Flood(wind_speed=5.0, fetch=300.0, depth=0.2)])
-def test_variance_of_height_and_slope_is_the_spectrums(flood):
+def test_variance_of_height_and_slope_equals_the_spectrum_integral(flood):
     height, slope = [], []
     for seed in range(64):
         tile, band = single_tile(flood, seed)
@@ -150,9 +150,9 @@ def test_slopes_are_the_gradient_of_the_height():
         tile.omega,
         torch.where(tile.k.norm(dim=-1) < 10 * tile.k[0, 1, 0], tile.forward, 0),
         torch.where(tile.k.norm(dim=-1) < 10 * tile.k[0, 1, 0], tile.backward, 0),
-        tile.total,
-        tile.kept,
-        tile.shared,
+        tile.slope_variance,
+        tile.level_variance,
+        tile.level_covariance,
     )
     h = waves.heights(as_waves(smooth), 0, 0.4)
     maps = waves.at_time(as_waves(smooth), 0.4).pyramids[0][: 128 * 128].reshape(128, 128)
@@ -164,7 +164,7 @@ def test_slopes_are_the_gradient_of_the_height():
 
 
 @pytest.mark.parametrize("index", [(0, 16), (5, 20), (-9, 14)])
-def test_time_series_lies_on_the_dispersion_curve(index):
+def test_waves_oscillate_at_the_dispersion_frequency(index):
     tile, _ = single_tile(STREET, 1)
     period, steps = 10.0, 256
     series = [
@@ -172,15 +172,15 @@ def test_time_series_lies_on_the_dispersion_curve(index):
         for i in range(steps)
     ]
     power = np.abs(np.fft.fft(np.array(series) * np.hanning(steps))) ** 2
-    seen = abs(np.fft.fftfreq(steps, period / steps)[power.argmax()]) * 2 * math.pi
+    actual = abs(np.fft.fftfreq(steps, period / steps)[power.argmax()]) * 2 * math.pi
     k = 2 * math.pi / tile.length * math.hypot(*index)
     expected = spectrum.dispersion(np.array([k]), STREET.depth)[0]
-    assert seen == pytest.approx(expected, abs=2 * math.pi / period)
+    assert actual == pytest.approx(expected, abs=2 * math.pi / period)
 
 
 @pytest.mark.parametrize(("degrees", "downwind"), [(0, (0, -1)), (90, (-1, 0)), (180, (0, 1))])
-def test_waves_run_with_the_wind(degrees, downwind):
-    """Wind from +y drives waves to -y: the height's best match a moment later is downwind."""
+def test_waves_travel_downwind(degrees, downwind):
+    """Wind from +y drives waves to -y: the cross-correlation peak moves downwind."""
     tile, _ = single_tile(Flood(wind_direction=math.radians(degrees)), 0)
     before, after = (waves.heights(as_waves(tile), 0, t) for t in (0.0, 0.06))
     match = torch.fft.ifft2(torch.fft.fft2(before).conj() * torch.fft.fft2(after)).real
@@ -189,18 +189,18 @@ def test_waves_run_with_the_wind(degrees, downwind):
     assert moved @ downwind > 0.8 * np.linalg.norm(moved) > 0
 
 
-def test_seed_and_time():
+def test_seed_reproduces_and_time_animates():
     x = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 10
     narrow = torch.full((500,), 0.01)
 
-    def seen(seed, time):
+    def slope(seed, time):
         return waves.slopes(waves.at_time(waves.make_waves(STREET, seed, 64), time), x, narrow)[0]
 
-    assert torch.equal(seen(5, 1.0), seen(5, 1.0))
-    apart = (seen(5, 1.0) - seen(6, 1.0)).pow(2).mean()
-    close = (seen(5, 1.0) - seen(5, 1.001)).pow(2).mean()
-    assert close < 1e-2 * apart
-    assert (seen(5, 1.0) - seen(5, 1.5)).pow(2).mean() > 0.1 * apart
+    assert torch.equal(slope(5, 1.0), slope(5, 1.0))
+    between_seeds = (slope(5, 1.0) - slope(6, 1.0)).pow(2).mean()
+    after_a_millisecond = (slope(5, 1.0) - slope(5, 1.001)).pow(2).mean()
+    assert after_a_millisecond < 1e-2 * between_seeds
+    assert (slope(5, 1.0) - slope(5, 1.5)).pow(2).mean() > 0.1 * between_seeds
 
 
 def test_no_wind_is_perfectly_flat():
@@ -210,7 +210,7 @@ def test_no_wind_is_perfectly_flat():
     assert sea.significant_height == 0
 
 
-def test_scale_stretches_waves_at_unchanged_slope():
+def test_wave_scale_keeps_the_slope():
     small = waves.make_waves(STREET, 0, 64)
     large = waves.make_waves(Flood(wave_scale=3.0), 0, 64)
     assert large.significant_height == pytest.approx(3 * small.significant_height)
@@ -224,7 +224,7 @@ def test_scale_stretches_waves_at_unchanged_slope():
 # --- lookups ----------------------------------------------------------------------------------
 
 
-def test_tile_repeats_and_lookup_hits_its_texels():
+def test_lookup_is_periodic_and_exact_at_texels():
     tile, _ = single_tile(STREET, 2)
     frame = waves.at_time(as_waves(tile), 0.2)
     maps = torch.view_as_real(frame.pyramids[0][: 64 * 64].reshape(64, 64))
@@ -244,13 +244,13 @@ def test_tile_repeats_and_lookup_hits_its_texels():
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
-def test_levels_against_a_direct_blur(level):
-    """Each level is the slope map blurred by a Gaussian of half its texel, texel by texel."""
+def test_levels_equal_a_direct_blur(level):
+    """Each level is the slope map convolved with a Gaussian of half its texel."""
     tile, _ = single_tile(STREET, 2)
     pyramid = waves.at_time(as_waves(tile), 0.2).pyramids[0]
     size = 64 >> level
     start = sum((64 >> i) ** 2 for i in range(level))
-    seen = pyramid[start : start + size**2].reshape(size, size)
+    actual = pyramid[start : start + size**2].reshape(size, size)
     step = torch.arange(64)
     distance = torch.minimum(step, 64 - step).float() / (1 << level)
     kernel = torch.exp(-(distance**2) / (2 * 0.5**2))
@@ -258,8 +258,8 @@ def test_levels_against_a_direct_blur(level):
     circulant = torch.stack([kernel.roll(i) for i in range(64)]).to(torch.complex64)
     blurred = circulant @ pyramid[: 64 * 64].reshape(64, 64) @ circulant
     expected = blurred[:: 1 << level, :: 1 << level]
-    # Cropping in frequency removes what the Gaussian leaves beyond the level's Nyquist index.
-    assert (seen - expected).abs().pow(2).mean() < 0.02 * pyramid[: 64 * 64].abs().pow(2).mean()
+    # Cropping in frequency also removes the Gaussian's tail beyond the level's Nyquist frequency.
+    assert (actual - expected).abs().pow(2).mean() < 0.02 * pyramid[: 64 * 64].abs().pow(2).mean()
 
 
 @pytest.mark.parametrize("flood", [STREET, Flood(wind_speed=6.0, fetch=300.0)])
@@ -270,14 +270,14 @@ def test_filtering_conserves_slope_variance(flood):
     for seed in range(4):
         sea = waves.make_waves(flood, seed, 128)
         frame = waves.at_time(sea, 0.5)
-        total += sea.unresolved + sum(t.total for t in sea.tiles)
+        total += sea.unresolved + sum(t.slope_variance for t in sea.tiles)
         for width in sums:
             slope, removed = waves.slopes(frame, x, torch.full((len(x),), width))
             assert (removed >= 0).all()
             sums[width] += slope.pow(2).mean().item() + removed.mean().item()
             last = removed.mean().item()
     assert list(sums.values()) == pytest.approx([total] * len(sums), rel=0.04)
-    assert last == pytest.approx(total / 4, rel=0.2)  # a pixel of 100 m sees no wave at all
+    assert last == pytest.approx(total / 4, rel=0.2)  # at 100 m all waves are filtered out
 
 
 def test_removed_variance_grows_with_the_footprint():
@@ -290,7 +290,7 @@ def test_removed_variance_grows_with_the_footprint():
 @pytest.mark.parametrize("wind", [1e-4, 0.01, 0.1, 40.0])
 @pytest.mark.parametrize("fetch", [1.0, 1e6])
 @pytest.mark.parametrize("depth", [0.01, 1000.0])
-def test_finite_over_the_whole_range(wind, fetch, depth):
+def test_slopes_are_finite_over_the_parameter_range(wind, fetch, depth):
     flood = Flood(wind_speed=wind, fetch=fetch, depth=depth, wave_scale=0.1)
     sea = waves.make_waves(flood, 0, 32)
     x = torch.tensor([[0.0, 0.0], [1e5, -1e5], [-1e-9, -0.0]])

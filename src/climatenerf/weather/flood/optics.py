@@ -1,8 +1,9 @@
-"""Flood water: where rays meet it, where they go on, and what comes back.
+"""Optics of flood water: ray-plane intersection, reflection, refraction and attenuation.
 
-Directions are unit length, z is up, `below` marks rays whose eye is in the water. Radiance is
-*basic* radiance, L/n^2, which a flat interface only splits into R and 1 - R: so white surroundings
-stay white on both sides. Normals point up; slopes are (dz/dx, dz/dy).
+World frame, metres, z up. Directions are unit vectors. `below` is True for rays whose origin is
+under water. Radiance is *basic* radiance, L/n^2: a flat interface only splits it into the fractions
+R and 1 - R, so white surroundings stay white on both sides. Normals point up; slopes are
+(dz/dx, dz/dy). Shapes: n rays, last axis the components.
 """
 
 import math
@@ -14,34 +15,43 @@ from torch import Tensor
 from climatenerf.weather.flood.fresnel import diffuse_reflectances, slope_averaged
 from climatenerf.weather.parameters import Flood, linear_colour
 
-# Koschmieder for the path down and up: a white disc at the clarity keeps 2 % of its contrast.
+# Koschmieder's law for the path down and up: a white disc at the depth `clarity` keeps 2 % of its
+# contrast.
 _CLARITY = -math.log(0.02) / 2
-# Suspended clay and dissolved matter take more blue than red, on average 1.
+# Relative absorption of red, green and blue by suspended clay and dissolved matter; mean 1.
 _MUD = (0.75, 0.95, 1.3)
-# Pure water itself, 1/m (Pope and Fry 1997, mean of each sRGB primary's band).
+# Absorption of pure water, 1/m (Pope and Fry 1997, mean over the band of each sRGB primary).
 _PURE = (0.3, 0.06, 0.01)
-_WIDEST = math.pi / 3  # sigma points farther out would lie behind the reflection
+_MAX_SIGMA_ANGLE = math.pi / 3  # rad; wider sigma points would point away from the lobe
 
 
 def plane_distance(
     rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], z: float
 ) -> Float[Tensor, "n"]:
-    """Ray length to the level plane at height `z`, from either side; +inf where it is missed."""
+    """Return the ray length in m to the horizontal plane at height `z` (m), from either side.
+
+    The result is +inf for rays that miss the plane or start in it.
+    """
     dz = rays_d[:, 2]
-    flat = dz.abs() < 1e-9  # no 0/0 for level rays, nor in their gradient
-    t = (z - rays_o[:, 2]) / torch.where(flat, torch.ones_like(dz), dz)
-    return torch.where(flat | (t <= 0), torch.full_like(t, torch.inf), t)
+    horizontal = dz.abs() < 1e-9  # no 0/0 for horizontal rays, nor in their gradient
+    t = (z - rays_o[:, 2]) / torch.where(horizontal, torch.ones_like(dz), dz)
+    return torch.where(horizontal | (t <= 0), torch.full_like(t, torch.inf), t)
 
 
 def footprint(
     t: Float[Tensor, "n"], rays_d: Float[Tensor, "n 3"], pixel_angle: Float[Tensor, "n"] | float
 ) -> Float[Tensor, "n"]:
-    """Width in m that a pixel has on the water: geometric mean of its width and its length.
+    """Return the size in m of a pixel on the water: geometric mean of its width and its length.
 
-    At grazing a pixel is long and narrow; its width alone would let the waves along it alias, its
-    length alone would blur away the ones across it.
+    At grazing angles a pixel's footprint is long and narrow. Its width alone would alias waves
+    along the footprint; its length alone would blur away waves across it.
+
+    Args:
+        t: ray length to the water, m.
+        rays_d: unit ray directions.
+        pixel_angle: angle that a pixel spans, rad.
     """
-    return t * pixel_angle / torch.sqrt(rays_d[:, 2].abs().clamp(min=1e-4))  # level rays: x/0
+    return t * pixel_angle / torch.sqrt(rays_d[:, 2].abs().clamp(min=1e-4))  # horizontal ray: x/0
 
 
 def shore_coverage(
@@ -51,62 +61,76 @@ def shore_coverage(
     pixel_angle: Float[Tensor, "n"] | float,
     ground_normal: Float[Tensor, "n 3"] | None = None,
 ) -> Float[Tensor, "n"]:
-    """Share of a pixel that water covers: 1/2 at the waterline, 0 and 1 half a pixel from it.
+    """Return the fraction of each pixel that water covers.
 
-    The distance to the waterline is (t_ground - t_plane) over its change from pixel to pixel, which
-    follows from the two planes. It rises with the level for any ray, so flooded sets are nested.
+    It is 1/2 at the waterline, and 0 or 1 at half a pixel or more from it.
+    The distance to the waterline in pixels is (t_ground - t_plane) over its change per pixel, which
+    follows from the two planes. It increases with the water level for every ray, so a higher level
+    floods a superset of pixels.
 
     Args:
-        t_plane: ray length to the water plane, m; +inf where it is missed.
+        t_plane: ray length to the water plane, m; +inf for rays that miss it.
         t_ground: ray length to the solid surface, m; +inf for sky.
-        rays_d: ray directions.
+        rays_d: unit ray directions.
         pixel_angle: angle that a pixel spans, rad.
-        ground_normal: unit normal of that surface; None: it faces the eye.
+        ground_normal: unit normal of that surface; None: it faces the ray.
 
     Returns:
         Coverage in [0, 1].
     """
-    ends = torch.isfinite(t_plane) & torch.isfinite(t_ground)
-    tg = torch.where(ends, t_ground, torch.ones_like(t_ground))
-    tp = torch.where(ends, t_plane, torch.zeros_like(t_plane))
+    finite = torch.isfinite(t_plane) & torch.isfinite(t_ground)
+    tg = torch.where(finite, t_ground, torch.ones_like(t_ground))
+    tp = torch.where(finite, t_plane, torch.zeros_like(t_plane))
     up = torch.zeros_like(rays_d)
     up[:, 2] = 1
-    change = _slant(rays_d, up)
+    change = _relative_length_gradient(rays_d, up)
     if ground_normal is not None:
-        change = change - _slant(rays_d, ground_normal)
-    # The floor, a tenth of a head-on pixel, is for ground level with the water: 0/0.
+        change = change - _relative_length_gradient(rays_d, ground_normal)
+    # The floor, a tenth of a pixel seen head-on, is for ground parallel to the water: 0/0.
     per_pixel = (change.norm(dim=-1)).clamp(min=0.1) * tg * pixel_angle
     soft = (0.5 + (tg - tp) / per_pixel.clamp(min=1e-9)).clamp(0, 1)
-    return torch.where(ends, soft, torch.isfinite(t_plane).to(soft.dtype))
+    return torch.where(finite, soft, torch.isfinite(t_plane).to(soft.dtype))
 
 
-def _slant(d: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Change of a plane's ray length per angle, over that length: the normal across the ray."""
+def _relative_length_gradient(
+    d: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Return (1/t) dt/d(angle) of the ray length t to a plane, 1/rad, as a vector across the ray.
+
+    It is minus the normal's component across the ray over its component along the ray; the sign
+    cancels in `shore_coverage`, which takes the norm.
+    """
     along = (d * normal).sum(-1, keepdim=True)
-    # A plane seen edge on changes without bound; 1e-3 keeps it finite.
+    # For a plane seen edge-on the gradient is unbounded; 1e-3 keeps it finite.
     safe = torch.where(along < 0, along.clamp(max=-1e-3), along.clamp(min=1e-3))
     return (normal - along * d) / safe
 
 
 def normal_of(slope: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-    """Upward unit normal of a surface with the given slope."""
+    """Return the upward unit normal of a surface with the slope (dz/dx, dz/dy)."""
     raw = torch.cat([-slope, torch.ones_like(slope[:, :1])], dim=-1)
     return raw / raw.norm(dim=-1, keepdim=True)
 
 
 def mirror(d: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Direction of the reflected ray."""
+    """Return the direction of the mirrored ray."""
     return d - 2 * (d * normal).sum(-1, keepdim=True) * normal
 
 
 def refract(
     d: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"], ior: float, below: Bool[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Snell's law into the water, or out of it for eyes below.
+    """Refract rays by Snell's law into the water, or out of it for rays from below.
+
+    Args:
+        d: unit ray directions.
+        normal: upward unit normals.
+        ior: refractive index of the water (air is 1).
+        below: True for rays that arrive from under water.
 
     Returns:
-        Unit direction on the other side, and whether the ray is totally reflected instead (then
-        the direction runs along the surface and carries nothing).
+        Unit direction on the other side; and True where the ray is totally reflected (then the
+        direction runs along the surface and transmits no light).
     """
     facing = torch.where(below[:, None], -normal, normal)
     eta = torch.where(below, torch.full_like(d[:, 0], ior), torch.full_like(d[:, 0], 1 / ior))
@@ -118,11 +142,12 @@ def refract(
     return out / out.norm(dim=-1, keepdim=True), cos2_t <= 0
 
 
-def pixel_roll(pixel: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """An angle in [0, pi/2) for each pixel that differs from its neighbours' (Jimenez 2014).
+def pixel_rotation(pixel: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    """Return an angle in [0, pi/2) per pixel: interleaved gradient noise (Jimenez 2014).
 
-    Turning the glossy rays by it trades the five ghost images of a fixed set for fine grain, which
-    supersampling averages away. It depends on the pixel alone, so on no chunk or thread.
+    Neighbouring pixels get different angles. Rotating the glossy sample set by this angle replaces
+    the five ghost images of a fixed set by fine grain, which supersampling averages away. The angle
+    depends on the pixel coordinates (column, row) alone, not on chunks or threads.
     """
     x, y = pixel[:, 0].double(), pixel[:, 1].double()
     noise = (52.9829189 * (0.06711056 * x + 0.00583715 * y).frac()).frac()
@@ -131,53 +156,58 @@ def pixel_roll(pixel: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
 
 def glossy_rays(
     reflected: Float[Tensor, "n 3"],
-    tall: Float[Tensor, "n"],
-    wide: Float[Tensor, "n"],
+    vertical_variance: Float[Tensor, "n"],
+    horizontal_variance: Float[Tensor, "n"],
     below: Bool[Tensor, "n"],
-    roll: Float[Tensor, "n"] | None = None,
+    sample_rotation: Float[Tensor, "n"] | None = None,
 ) -> tuple[Float[Tensor, "n 5 3"], Float[Tensor, "5"]]:
-    """Sigma-point set of the reflection's lobe: five rays that stand for all of it.
+    """Return the sigma points of the reflection lobe: five rays with the lobe's mean and variance.
 
-    With `tall` = `wide` = 1/lambda these are the specification's: the lobe's axis and four rays
+    If both variances are 1/lambda, the set is the lobe's axis and four rays at the angle
     sqrt(3/lambda) from it.
 
     Args:
-        reflected: axis of the lobe.
-        tall: variance of the lobe within the vertical plane, rad^2.
-        wide: variance across it, rad^2.
-        below: eyes in the water; their rays are kept at or below the horizon, others above it.
-        roll: turn of the four rays about the axis, rad; the set's variances do not depend on it.
+        reflected: axis of the lobe, unit vectors.
+        vertical_variance: variance of the lobe within the vertical plane, rad^2.
+        horizontal_variance: variance across that plane, rad^2.
+        below: True under water; these rays are clipped to the horizon from below, others from
+            above.
+        sample_rotation: rotation of the four rays about the axis, rad; None: 0. The variances of
+            the set do not depend on it.
 
     Returns:
-        Directions (the axis first) and their weights, 1/3 and four times 1/6.
+        Unit directions (the axis first) and their weights, 1/3 and four times 1/6.
     """
-    zeros = torch.zeros_like(tall)
+    zeros = torch.zeros_like(vertical_variance)
     across = torch.stack([-reflected[:, 1], reflected[:, 0], zeros], dim=-1)
     length = across.norm(dim=-1, keepdim=True)
     east = torch.tensor([1.0, 0, 0], dtype=across.dtype, device=across.device)
-    across = torch.where(length > 1e-6, across / length.clamp(min=1e-6), east)  # straight up: any
+    across = torch.where(length > 1e-6, across / length.clamp(min=1e-6), east)  # vertical axis: any
     within = torch.linalg.cross(reflected, across)
-    roll = zeros if roll is None else roll
-    up, side = _sigma_angle(tall)[:, None] * within, _sigma_angle(wide)[:, None] * across
+    rotation = zeros if sample_rotation is None else sample_rotation
+    up = _sigma_angle(vertical_variance)[:, None] * within
+    side = _sigma_angle(horizontal_variance)[:, None] * across
     rays = [reflected]
     for quarter in range(4):
-        turn = (roll + quarter * math.pi / 2)[:, None]
-        offset = torch.cos(turn) * up + torch.sin(turn) * side
+        phase = (rotation + quarter * math.pi / 2)[:, None]
+        offset = torch.cos(phase) * up + torch.sin(phase) * side
         angle = offset.norm(dim=-1, keepdim=True)  # > 0, see _sigma_angle
         rays.append(torch.cos(angle) * reflected + torch.sin(angle) / angle * offset)
-    weights = torch.tensor([1 / 3] + 4 * [1 / 6], dtype=tall.dtype, device=tall.device)
+    weights = zeros.new_tensor([1 / 3] + 4 * [1 / 6])
     return _clip_to_horizon(torch.stack(rays, dim=1), below[:, None]), weights
 
 
-def _sigma_angle(spread: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    return torch.sqrt((3 * spread).clamp(min=1e-20)).clamp(max=_WIDEST)  # sqrt'(0) is infinite
+def _sigma_angle(variance: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Return the angle of the sigma points from the axis, sqrt(3 variance), rad, > 0."""
+    # The floor keeps the gradient of the square root finite at 0.
+    return torch.sqrt((3 * variance).clamp(min=1e-20)).clamp(max=_MAX_SIGMA_ANGLE)
 
 
 def _clip_to_horizon(d: Float[Tensor, "*n 3"], below: Bool[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
-    """Turn rays that cross the water plane to run along it."""
+    """Project rays that point through the water plane onto it."""
     z = torch.where(below, d[..., 2].clamp(max=0), d[..., 2].clamp(min=0))
     flat = torch.cat([d[..., :2], z[..., None]], dim=-1)
-    return flat / flat.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # straight down: nothing left
+    return flat / flat.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # vertical ray: 0/0
 
 
 def reflection(
@@ -186,40 +216,45 @@ def reflection(
     variance: Float[Tensor, "n"],
     flood: Flood,
     below: Bool[Tensor, "n"],
-    roll: Float[Tensor, "n"] | None = None,
+    sample_rotation: Float[Tensor, "n"] | None = None,
 ) -> tuple[Float[Tensor, "n 5 3"], Float[Tensor, "5"], Float[Tensor, "n"]]:
-    """All that a hit on the water needs for its reflection.
+    """Return the reflected rays of each hit on the water, their weights and the mean reflectance.
 
-    A facet's tilt by sigma turns the reflection by 2 sigma within the plane of incidence and by
-    2 sigma cos across it. At the nadir both give 1/lambda = 1/lambda_0 + 4 sigma^2; at grazing the
-    lobe is tall and narrow, which is why lights on water draw streaks.
+    Tilting a facet by sigma rotates the reflection by 2 sigma within the plane of incidence and by
+    2 sigma cos across it. At the nadir both give 1/lambda = 1/lambda_0 + 4 sigma^2. At grazing
+    angles the lobe is tall and narrow: reflections of lights are streaks.
 
     Args:
-        rays_d: rays that arrive at the surface.
-        slope: resolved slope there.
-        variance: slope variance per axis that is not resolved.
+        rays_d: unit directions of the rays that arrive at the surface.
+        slope: resolved slope (dz/dx, dz/dy) at the hit.
+        variance: unresolved slope variance per axis.
         flood: gloss and refractive index.
-        below: eyes in the water.
-        roll: see `glossy_rays`.
+        below: True for rays that arrive from under water.
+        sample_rotation: see `glossy_rays`.
 
     Returns:
-        Five directions, their weights, and the mean reflectance R, all for the facets that the
-        eye can see.
+        Five unit directions, their weights (sum 1), and the mean reflectance R, all for the facets
+        visible along the ray.
     """
     side = torch.where(below, -torch.ones_like(variance), torch.ones_like(variance))
     cos = -(rays_d * normal_of(slope)).sum(-1) * side
-    share, tilt, seen = slope_averaged(cos, variance, flood.ior, below)
-    flat = rays_d[:, :2]
-    away = flat / flat.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # 0/0 at the nadir
-    # Facets that lean towards an eye above rise away from it.
+    reflectance, tilt, visible_variance = slope_averaged(cos, variance, flood.ior, below)
+    horizontal = rays_d[:, :2]
+    away = horizontal / horizontal.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # 0/0 at the nadir
+    # A facet tilted towards a viewer above the water rises away from the viewer.
     normal = normal_of(slope + (tilt * side)[:, None] * away)
     cos = (-(rays_d * normal).sum(-1) * side).clamp(0, 1)
-    tall, wide = 1 / flood.gloss + 4 * seen, 1 / flood.gloss + 4 * variance * cos**2
-    return *glossy_rays(mirror(rays_d, normal), tall, wide, below, roll), share
+    vertical_variance = 1 / flood.gloss + 4 * visible_variance
+    horizontal_variance = 1 / flood.gloss + 4 * variance * cos**2
+    axis = mirror(rays_d, normal)
+    rays, weights = glossy_rays(
+        axis, vertical_variance, horizontal_variance, below, sample_rotation
+    )
+    return rays, weights, reflectance
 
 
 def attenuation(flood: Flood) -> tuple[float, float, float]:
-    """Attenuation beta of red, green and blue in 1/m; muddy water takes blue first."""
+    """Return the attenuation beta of red, green and blue in 1/m; mud absorbs blue most."""
     if flood.attenuation is not None:
         return flood.attenuation
     mud = _CLARITY / flood.clarity
@@ -228,9 +263,15 @@ def attenuation(flood: Flood) -> tuple[float, float, float]:
 
 
 def light_cosine(flood: Flood, sun_elevation: float | None) -> float:
-    """Cosine in water of the light's angle: the sun's by Snell's law, or that of an even sky."""
+    """Return the cosine of the light's angle to the vertical under water.
+
+    Args:
+        flood: refractive index.
+        sun_elevation: elevation of the sun, rad, refracted by Snell's law; None or at most 0: light
+            of a uniform sky.
+    """
     if sun_elevation is None or sun_elevation <= 0:
-        return 0.83  # mean of 1/cos over refracted diffuse light is 1.2
+        return 0.83  # the mean of 1/cos over refracted diffuse light is 1.2
     return math.sqrt(1 - (math.cos(sun_elevation) / flood.ior) ** 2)
 
 
@@ -240,57 +281,71 @@ def water_transmittance(
     depth: Float[Tensor, "n"],
     light_cos: float,
 ) -> Float[Tensor, "n 3"]:
-    """t_c = exp(-beta_c (D + d/cos)): light down through depth d, and along the view path D; m."""
-    total = (path + depth.clamp(min=0) / light_cos).clamp(0, 1e6)  # 0 times an endless path is NaN
+    """Return t_c = exp(-beta_c (D + d/cos)) for the way of light down to a point and to the viewer.
+
+    Args:
+        beta: attenuation of each channel, 1/m.
+        path: length D of the view path under water, m; may be +inf.
+        depth: vertical depth d of the point, m.
+        light_cos: cosine of the light's angle under water, see `light_cosine`.
+    """
+    total = (path + depth.clamp(min=0) / light_cos).clamp(0, 1e6)  # 0 * inf would be NaN
     return torch.exp(-beta * total[:, None])
 
 
-def bed_radiance(
+def bottom_radiance(
     dry: Float[Tensor, "n 3"],
     irradiance: Float[Tensor, "3"],
     ior: float,
     entering: float | None = None,
 ) -> Float[Tensor, "n 3"]:
-    """Radiance L_bed of ground under clear water, from the same ground's dry radiance.
+    """Return the radiance of the bottom under clear water from the radiance of the dry ground.
 
-    L_t (1 - r_e)/(n^2 (1 - rho r_i)): less light gets in, part of what the bed returns is turned
-    back inside, and it spreads over n^2 when it leaves. The albedo rho = pi L_t/E is held to
-    [0, 1]. With rho = 1 the factor is exactly 1, since 1 - r_e = n^2 (1 - r_i).
+    L_bottom = L_t (1 - r_e)/(n^2 (1 - rho r_i)): 1 - r_e of the light enters, the surface reflects
+    the fraction r_i of the light from the bottom back down, and the rest spreads over n^2 when it
+    leaves. The albedo rho = pi L_t/E is clamped to [0, 1]. For rho = 1 the factor is exactly 1,
+    since 1 - r_e = n^2 (1 - r_i).
 
     Args:
-        dry: linear radiance of the dry ground, L_t.
-        irradiance: E on level ground, linear.
+        dry: linear radiance L_t of the dry ground.
+        irradiance: E on horizontal ground, linear, per channel.
         ior: refractive index of the water.
-        entering: share of the light that enters the water; None: diffuse light, 1 - r_e; for the
-            sun 1 - R of its angle.
+        entering: fraction of the light that enters the water; None: 1 - r_e, for diffuse light. For
+            sunlight it is 1 - R at the sun's angle.
     """
     r_e, r_i = diffuse_reflectances(ior)
     albedo = (math.pi * dry / irradiance.clamp(min=1e-6)).clamp(0, 1)  # a black scene: 0/0
-    share = 1 - r_e if entering is None else entering
-    return dry * share / (ior**2 * (1 - albedo * r_i))
+    entering = 1 - r_e if entering is None else entering
+    return dry * entering / (ior**2 * (1 - albedo * r_i))
 
 
 def body_colour(flood: Flood, irradiance: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """c_w: radiance of deep water, its colour lit like a white sheet by the scene."""
+    """Return the radiance c_w of deep water: its colour times that of a lit white diffuser.
+
+    Args:
+        flood: colour of the water.
+        irradiance: E on horizontal ground, linear, per channel.
+    """
     return irradiance.new_tensor(linear_colour(flood.colour)) * irradiance / math.pi
 
 
 def shade(
     reflected: Float[Tensor, "n 3"],
-    share: Float[Tensor, "n"],
-    behind: Float[Tensor, "n 3"],
-    through: Float[Tensor, "n 3"],
+    reflectance: Float[Tensor, "n"],
+    background: Float[Tensor, "n 3"],
+    transmittance: Float[Tensor, "n 3"],
     body: Float[Tensor, "3"],
 ) -> Float[Tensor, "n 3"]:
-    """c = R L_r + (1 - R)(L_bed t_c + (1 - t_c) c_w).
+    """Return c = R L_r + (1 - R)(L_b t_c + (1 - t_c) c_w), linear radiance.
 
     Args:
-        reflected: weighted sum of the glossy rays' radiance, L_r.
-        share: mean reflectance R.
-        behind: radiance on the other side: the bed's, or for eyes below what the refracted ray
-            sees in the air.
-        through: transmittance t_c of the water before it; ones for eyes below.
-        body: c_w.
+        reflected: weighted sum L_r of the glossy rays' radiance.
+        reflectance: mean reflectance R.
+        background: radiance L_b on the other side: the bottom's, or under water the radiance in air
+            along the refracted ray.
+        transmittance: transmittance t_c of the water in front of it; ones under water.
+        body: c_w, see `body_colour`.
     """
-    share = share[:, None]
-    return share * reflected + (1 - share) * (behind * through + (1 - through) * body)
+    reflectance = reflectance[:, None]
+    transmitted = background * transmittance + (1 - transmittance) * body
+    return reflectance * reflected + (1 - reflectance) * transmitted

@@ -1,12 +1,13 @@
-"""The spectrum of wind waves: how much height and slope each wavenumber holds.
+"""Spectrum of wind waves: variance of height and slope as a function of wavenumber.
 
-TMA: JONSWAP (fetch-limited wind sea) times Kitaigorodskii's depth factor times the Donelan-Banner
-spreading, as gathered by Horvath, "Empirical directional wave spectra for computer graphics"
-(2015). numpy in float64; k is a wavenumber in rad/m, omega an angular frequency in rad/s.
+TMA spectrum: JONSWAP (fetch-limited wind sea) times Kitaigorodskii's depth factor times the
+Donelan-Banner spreading, as collected by Horvath, "Empirical directional wave spectra for computer
+graphics" (2015). numpy, float64; k is a wavenumber in rad/m, omega an angular frequency in rad/s.
 
-JONSWAP's omega^-5 tail holds unbounded slope, and at street fetches more than seas show. So the
-spectrum is rolled off by exp(-(k/k_c)^2), with the cutoff k_c <= 370 rad/m (where capillary waves
-begin) chosen so that the mean-square slope does not exceed what Cox and Munk measured (1954).
+The slope variance of JONSWAP's omega^-5 tail is unbounded, and at the short fetch of a street it
+exceeds measurements at sea. So the spectrum is multiplied by exp(-(k/k_c)^2). The cutoff
+k_c <= 370 rad/m (where capillary waves begin) is chosen so that the mean-square slope does not
+exceed that of Cox and Munk (1954).
 """
 
 import math
@@ -18,17 +19,20 @@ from climatenerf.weather.parameters import Flood
 
 GRAVITY = 9.81  # m/s^2
 TENSION = 0.074 / 1000  # surface tension over density, m^3/s^2
-MAX_CUTOFF = 370.0  # rad/m; waves of 1.7 cm, the slowest ones: beyond, JONSWAP means nothing
-LOWEST = 0.36  # of the peak's wavenumber; below, JONSWAP holds exp(-9.6) of its peak
+MAX_CUTOFF = 370.0  # rad/m; waves of 1.7 cm, the slowest: JONSWAP does not hold for shorter waves
+MIN_PEAK_RATIO = 0.36  # lowest wavenumber over the peak's; JONSWAP is exp(-9.6) of its peak there
 
 
 def dispersion(k: Float[np.ndarray, "*n"], depth: float) -> Float[np.ndarray, "*n"]:
-    """omega of k: omega^2 = (g k + (tau/rho) k^3) tanh(k d); gravity and surface tension."""
+    """Return omega(k) of gravity-capillary waves in water of `depth` d metres, rad/s.
+
+    omega^2 = (g k + (tau/rho) k^3) tanh(k d).
+    """
     return np.sqrt((GRAVITY * k + TENSION * k**3) * np.tanh(k * depth))
 
 
 def group_velocity(k: Float[np.ndarray, "*n"], depth: float) -> Float[np.ndarray, "*n"]:
-    """d omega / d k in m/s, k > 0."""
+    """Return d omega / d k in m/s, for k > 0 and water of `depth` metres."""
     tanh = np.tanh(k * depth)
     slope = (GRAVITY + 3 * TENSION * k**2) * tanh
     slope += (GRAVITY * k + TENSION * k**3) * depth * (1 - tanh**2)
@@ -36,14 +40,26 @@ def group_velocity(k: Float[np.ndarray, "*n"], depth: float) -> Float[np.ndarray
 
 
 def peak_frequency(wind_speed: float, fetch: float) -> float:
-    """omega_p = 22 (g^2 / (U F))^(1/3) of JONSWAP."""
+    """Return the peak frequency of JONSWAP, omega_p = 22 (g^2 / (U F))^(1/3), in rad/s.
+
+    Args:
+        wind_speed: U, 10 m above the water, m/s, > 0.
+        fetch: F, m.
+    """
     return 22 * (GRAVITY**2 / (wind_speed * fetch)) ** (1 / 3)
 
 
 def tma(
     omega: Float[np.ndarray, "*n"], wind_speed: float, fetch: float, depth: float
 ) -> Float[np.ndarray, "*n"]:
-    """TMA frequency spectrum S(omega) in m^2 s: JONSWAP times Kitaigorodskii's depth factor."""
+    """Return the TMA frequency spectrum S(omega) in m^2 s: JONSWAP times Kitaigorodskii's factor.
+
+    Args:
+        omega: angular frequency, rad/s, >= 0.
+        wind_speed: 10 m above the water, m/s, > 0.
+        fetch: length of open water upwind, m.
+        depth: water depth, m.
+    """
     peak = peak_frequency(wind_speed, fetch)
     alpha = 0.076 * (wind_speed**2 / (fetch * GRAVITY)) ** 0.22
     s = np.where(omega <= peak, 0.07, 0.09)
@@ -58,7 +74,12 @@ def tma(
 def spreading(
     omega_over_peak: Float[np.ndarray, "*n"], angle: Float[np.ndarray, "*n"]
 ) -> Float[np.ndarray, "*n"]:
-    """Donelan-Banner share of energy per radian; `angle` in [-pi, pi] from downwind; sums to 1."""
+    """Return the Donelan-Banner spreading: fraction of the energy per radian; its integral is 1.
+
+    Args:
+        omega_over_peak: frequency over the peak frequency.
+        angle: direction of the wave relative to downwind, rad, in [-pi, pi].
+    """
     r = np.maximum(omega_over_peak, 0.56)
     high = 10 ** (-0.4 + 0.8393 * np.exp(-0.567 * np.log(r**2)))
     beta = np.where(r < 0.95, 2.61 * r**1.3, np.where(r < 1.6, 2.28 * r**-1.3, high))
@@ -66,21 +87,33 @@ def spreading(
 
 
 def cox_munk(wind_speed: float) -> float:
-    """Mean-square slope of the sea, both axes: .003 + .00512 U; the .003 fades below 1 m/s."""
+    """Return the mean-square slope of the sea, both axes together: .003 + .00512 U.
+
+    The constant .003 is scaled down linearly below 1 m/s, so that there are no waves without wind.
+    """
     return 0.003 * min(wind_speed, 1.0) + 0.00512 * wind_speed
 
 
 def wavenumber_spectrum(
     k: Float[np.ndarray, "*n"], flood: Flood, cutoff: float
 ) -> Float[np.ndarray, "*n"]:
-    """Variance of height per unit of |k|, over all directions, in m^3, rolled off at `cutoff`."""
+    """Return the variance of height per unit of |k|, summed over directions, in m^3.
+
+    Args:
+        k: wavenumber, rad/m.
+        flood: wind speed, fetch and depth.
+        cutoff: k_c of the factor exp(-(k/k_c)^2), rad/m.
+    """
     k = np.maximum(k, 1e-9)  # group velocity is 0/0 at k = 0
     energy = tma(dispersion(k, flood.depth), flood.wind_speed, flood.fetch, flood.depth)
     return energy * group_velocity(k, flood.depth) * np.exp(-((k / cutoff) ** 2))
 
 
 def cutoff_wavenumber(flood: Flood) -> float:
-    """k_c at which the mean-square slope reaches Cox and Munk's, at most MAX_CUTOFF; rad/m."""
+    """Return the cutoff k_c at which the mean-square slope equals Cox and Munk's, in rad/m.
+
+    The result is at most MAX_CUTOFF. Bisection on a logarithmic axis.
+    """
     k, low, high = log_axis(flood), 1e-3, MAX_CUTOFF
     target = cox_munk(flood.wind_speed)
 
@@ -96,13 +129,13 @@ def cutoff_wavenumber(flood: Flood) -> float:
 
 
 def peak_wavenumber(flood: Flood) -> float:
-    """Wavenumber of the spectrum's peak, rad/m."""
+    """Return the wavenumber of the spectrum's peak, rad/m."""
     k = np.geomspace(1e-5, 1e5, 4000)
     omega = dispersion(k, flood.depth)
     return float(np.interp(peak_frequency(flood.wind_speed, flood.fetch), omega, k))
 
 
 def log_axis(flood: Flood) -> Float[np.ndarray, "n"]:
-    """Wavenumbers, evenly spaced in their logarithm, that hold all the spectrum's energy; rad/m."""
-    low = min(LOWEST * peak_wavenumber(flood), MAX_CUTOFF)
+    """Return log-spaced wavenumbers that cover all the energy of the spectrum, rad/m."""
+    low = min(MIN_PEAK_RATIO * peak_wavenumber(flood), MAX_CUTOFF)
     return np.geomspace(low, 4 * MAX_CUTOFF, 2000)

@@ -1,9 +1,10 @@
-"""Wind waves: a seeded, periodic, animated slope field that knows its own statistics.
+"""Wind waves: a seeded, periodic, animated slope field with known slope statistics.
 
-The surface is a sum of plane waves (Fournier and Reeves 1986; Tessendorf) with the spectrum of
-`weather.spectrum`, made by FFT on periodic tiles, each of which carries one band of wavenumbers.
-Slope maps are filtered with distance, and the slope variance that a lookup does not show is
-returned with it, so that the reflection's lobe and the Fresnel term can take it over.
+The surface is a sum of plane waves (Fournier and Reeves 1986; Tessendorf 2001) with the spectrum of
+`weather.flood.spectrum`. An FFT evaluates it on periodic tiles; each tile carries one band of
+wavenumbers. Slope maps are prefiltered in a mip pyramid. A lookup returns the filtered slope and
+the slope variance that the filter removed; the reflection lobe and the Fresnel term include this
+variance.
 """
 
 import math
@@ -16,8 +17,8 @@ from torch import Tensor
 
 from climatenerf.core.device import to_device
 from climatenerf.weather.flood.spectrum import (
-    LOWEST,
     MAX_CUTOFF,
+    MIN_PEAK_RATIO,
     cox_munk,
     cutoff_wavenumber,
     dispersion,
@@ -29,10 +30,10 @@ from climatenerf.weather.flood.spectrum import (
 )
 from climatenerf.weather.parameters import Flood
 
-_CYCLES = 8  # longest wave of a tile, in waves per tile
-_RATIO = 5  # length of a tile over that of the next finer one
+_CYCLES = 8  # periods of a tile's longest wave along its side
+_RATIO = 5  # side of a tile over that of the next finer one
 _MAX_TILES = 4
-_SAMPLES = 8  # of the finest tile per wave of the cutoff: bilinear slopes then look smooth
+_SAMPLES = 8  # points per wave at the cutoff, on the finest tile: bilinear slopes look smooth
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,12 @@ class WaveTile:
     Attributes:
         length: side of the tile, m.
         k: wave vectors (x, y), rad/m.
-        omega: frequency of each wave, rad/s.
+        omega: angular frequency of each wave, rad/s.
         forward: amplitude of exp(i(k.x - omega t)), m.
         backward: amplitude of exp(i(k.x + omega t)), m; makes the surface real.
-        total: slope variance per axis of all waves, mean over time.
-        kept: what of it level l of the mip pyramid still shows.
-        shared: covariance per axis of levels l and l + 1.
+        slope_variance: slope variance per axis of all waves, mean over time.
+        level_variance: slope variance per axis at each level of the mip pyramid.
+        level_covariance: covariance per axis of levels l and l + 1.
     """
 
     length: float
@@ -55,22 +56,22 @@ class WaveTile:
     omega: Float[Tensor, "n n"]
     forward: Complex[Tensor, "n n"]
     backward: Complex[Tensor, "n n"]
-    total: float
-    kept: Float[Tensor, "levels"]
-    shared: Float[Tensor, "levels"]
+    slope_variance: float
+    level_variance: Float[Tensor, "levels"]
+    level_covariance: Float[Tensor, "levels"]
 
 
 @dataclass(frozen=True)
 class Waves:
-    """A wind sea; without tiles it is flat.
+    """A wind sea; flat if it has no tiles.
 
     Attributes:
         tiles: bands of the spectrum, coarse to fine.
-        unresolved: slope variance per axis of waves finer than all tiles.
-        scale: lengths are this many times, durations sqrt of it times as large as the spectrum's.
+        unresolved: slope variance per axis of waves shorter than any tile resolves.
+        scale: factor on all lengths of the spectrum; durations scale with its square root (Froude).
         significant_height: 4 sqrt(m0) of the resolved waves, scale included, m.
         mean_square_slope: of the resolved waves, both axes together.
-        cutoff: k_c, rad/m before scaling.
+        cutoff: k_c before scaling, rad/m.
     """
 
     tiles: tuple[WaveTile, ...]
@@ -83,33 +84,33 @@ class Waves:
 
 @dataclass(frozen=True)
 class WaveFrame:
-    """Waves at one moment: for each tile its pyramid of slope maps, flattened level after level."""
+    """Waves at one moment: the mip pyramid of slope maps of each tile, its levels concatenated."""
 
     waves: Waves
     pyramids: tuple[Complex[Tensor, "texels"], ...]
 
 
 def make_waves(flood: Flood, seed: int, n: int = 256) -> Waves:
-    """Draw the waves of a flood.
+    """Sample the random amplitudes of a flood's waves.
 
     Args:
         flood: wind, fetch, depth and scale.
-        seed: of the amplitudes; the same seed gives the same waves.
+        seed: random seed of the amplitudes.
         n: points along each side of a tile, a power of two.
 
     Returns:
-        The waves; flat when there is no wind, or too little for any wave longer than a centimetre.
+        The waves; flat without wind, or if the wind is too weak for waves longer than a centimetre.
     """
     if flood.wind_speed < 1e-3:
         return Waves(())
-    lowest = LOWEST * peak_wavenumber(flood)
+    lowest = MIN_PEAK_RATIO * peak_wavenumber(flood)
     cutoff = cutoff_wavenumber(flood)
     if lowest > 2 * MAX_CUTOFF:
         return Waves(())
-    # Finest tile: `_SAMPLES` points per wave of the cutoff, if the tiles reach that far from the
-    # peak.
-    reach = lowest * (n / _SAMPLES / _CYCLES) * _RATIO ** (_MAX_TILES - 1)
-    finest = min(cutoff, reach)
+    # The finest tile has `_SAMPLES` points per wave at the cutoff, unless `_MAX_TILES` tiles cannot
+    # span the band from the lowest wavenumber to the cutoff.
+    highest = lowest * (n / _SAMPLES / _CYCLES) * _RATIO ** (_MAX_TILES - 1)
+    finest = min(cutoff, highest)
     lengths = [n / _SAMPLES * 2 * math.pi / finest]
     while 2 * math.pi * _CYCLES / lengths[0] > lowest * 1.001 and len(lengths) < _MAX_TILES:
         lengths.insert(0, lengths[0] * _RATIO)
@@ -137,17 +138,26 @@ def make_tile(
     generator: torch.Generator,
     n: int = 256,
 ) -> WaveTile:
-    """Draw the waves with |k| in `band` (rad/m, half open) on a tile of `length` metres."""
+    """Sample the waves of one band of wavenumbers on a periodic tile.
+
+    Args:
+        flood: wind, fetch and depth.
+        length: side of the tile, m.
+        band: lowest and highest |k|, rad/m, half open.
+        cutoff: cutoff k_c of the spectrum, rad/m.
+        generator: CPU generator of the amplitudes.
+        n: points along each side, a power of two.
+    """
     index = np.fft.fftfreq(n) * n
     kx, ky = np.meshgrid(2 * math.pi * index / length, 2 * math.pi * index / length)
     k = np.hypot(kx, ky)
     omega = dispersion(k, flood.depth)
-    # The wind blows from its compass direction; waves run with it.
+    # `wind_direction` is where the wind comes from; waves travel downwind.
     heading = math.atan2(-math.cos(flood.wind_direction), -math.sin(flood.wind_direction))
     angle = np.angle(np.exp(1j * (np.arctan2(ky, kx) - heading)))
-    share = spreading(omega / peak_frequency(flood.wind_speed, flood.fetch), angle)
-    energy = wavenumber_spectrum(k, flood, cutoff) * share / np.maximum(k, 1e-9)
-    # Waves at the Nyquist index have no mirror image, so a real surface cannot hold them.
+    per_radian = spreading(omega / peak_frequency(flood.wind_speed, flood.fetch), angle)
+    energy = wavenumber_spectrum(k, flood, cutoff) * per_radian / np.maximum(k, 1e-9)  # k = 0: 0/0
+    # The Nyquist frequency has no conjugate partner, so a real surface cannot contain it.
     inside = (k >= band[0]) & (k < band[1]) & (k > 0)
     inside &= (np.abs(index) < n // 2)[:, None] & (np.abs(index) < n // 2)
     deviation = np.sqrt(np.where(inside, energy, 0) / 2) * 2 * math.pi / length
@@ -156,7 +166,7 @@ def make_tile(
     backward = forward.flip(0, 1).roll((1, 1), (0, 1)).conj().resolve_conj()
     power = (forward.abs() ** 2 + backward.abs() ** 2).numpy()  # mean over time of |h(k, t)|^2
     slope_power = k**2 * power / 2
-    kept, shared = _level_variances(slope_power, kx, ky, length)
+    level_variance, level_covariance = _level_variances(slope_power, kx, ky, length)
     return WaveTile(
         length,
         to_device(np.stack([kx, ky], axis=-1)).float(),
@@ -164,8 +174,8 @@ def make_tile(
         forward.to(torch.get_default_device(), torch.complex64),
         backward.to(torch.get_default_device(), torch.complex64),
         float(slope_power.sum()),
-        to_device(kept).float(),
-        to_device(shared).float(),
+        to_device(level_variance).float(),
+        to_device(level_covariance).float(),
     )
 
 
@@ -175,67 +185,70 @@ def _level_variances(
     ky: Float[np.ndarray, "n n"],
     length: float,
 ) -> tuple[Float[np.ndarray, "levels"], Float[np.ndarray, "levels"]]:
-    """Slope variance that each level shows, and its covariance with the next; per axis.
+    """Return the slope variance per axis of each level, and its covariance with the next level.
 
-    Includes what bilinear interpolation takes: (2 + cos)/3 per axis of the variance of a wave, and
-    sinc^2 of its amplitude where two levels are mixed.
+    Both include the attenuation by bilinear interpolation: (2 + cos)/3 per axis of a wave's
+    variance, and sinc^2 of its amplitude where two levels are blended.
     """
     n = len(slope_power)
     levels = int(math.log2(n)) + 1
-    kept, coherent = np.zeros(levels), []
+    variance, coherent = np.zeros(levels), []
     for level in range(levels):
         texel = length / (n >> level)
         inside = np.maximum(abs(kx), abs(ky)) < math.pi / texel * (1 - 1e-9)
         blur = np.where(inside, _blur(kx**2 + ky**2, texel, level), 0)
-        lost = (2 + np.cos(kx * texel)) * (2 + np.cos(ky * texel)) / 9
-        kept[level] = (slope_power * blur**2 * lost).sum()
+        bilinear = (2 + np.cos(kx * texel)) * (2 + np.cos(ky * texel)) / 9
+        variance[level] = (slope_power * blur**2 * bilinear).sum()
         phase = texel / (2 * math.pi)
         coherent.append(blur * (np.sinc(kx * phase) * np.sinc(ky * phase)) ** 2)
     pairs = zip(coherent, [*coherent[1:], 0 * kx], strict=True)
-    return kept, np.array([(slope_power * a * b).sum() for a, b in pairs])
+    return variance, np.array([(slope_power * a * b).sum() for a, b in pairs])
 
 
 def _blur(k2: np.ndarray, texel: float, level: int) -> np.ndarray:
-    """Transfer of the Gaussian, half a texel in deviation, that makes a level; none at level 0."""
+    """Return the transfer function of a level's Gaussian (deviation half a texel); 1 at level 0."""
     return np.exp(-k2 * (0.5 * texel) ** 2 / 2) if level else np.ones_like(k2)
 
 
 def at_time(waves: Waves, time: float) -> WaveFrame:
-    """Slope maps of all tiles at `time` seconds: once a frame, before any lookup."""
-    time = time / math.sqrt(waves.scale)  # Froude: waves s times as long take sqrt(s) times as long
+    """Compute the slope maps of all tiles at `time` seconds; once per frame, before any lookup."""
+    time = time / math.sqrt(waves.scale)  # Froude: s times the length, sqrt(s) times the period
     return WaveFrame(waves, tuple(_pyramid(tile, time) for tile in waves.tiles))
 
 
 def amplitudes(tile: WaveTile, time: float) -> Complex[Tensor, "n n"]:
-    """Amplitude of every wave of the tile at `time` seconds (unscaled), m; Hermitian."""
-    phase = tile.omega * time  # float64: stays exact for hours
-    turn = torch.polar(torch.ones_like(phase), phase).to(tile.forward.dtype)
-    return tile.forward * turn.conj() + tile.backward * turn
+    """Return the amplitude of every wave of the tile at `time` seconds (unscaled), m; Hermitian."""
+    phase = tile.omega * time  # float64: accurate for hours
+    rotation = torch.polar(torch.ones_like(phase), phase).to(tile.forward.dtype)
+    return tile.forward * rotation.conj() + tile.backward * rotation
 
 
 def heights(waves: Waves, index: int, time: float) -> Float[Tensor, "n n"]:
-    """Heights of tile `index` in m at `time` seconds, rows along +y, sides `length * scale` m."""
+    """Return the heights of tile `index` at `time` seconds, m.
+
+    Rows run along +y, columns along +x; the sides are `length * scale` metres.
+    """
     spectrum = amplitudes(waves.tiles[index], time / math.sqrt(waves.scale))
     return torch.fft.ifft2(spectrum, norm="forward").real * waves.scale
 
 
 def _pyramid(tile: WaveTile, time: float) -> Complex[Tensor, "texels"]:
-    """Slope maps, x slope + i y slope, from N x N down to 1 x 1, flattened."""
-    # Both slopes are real, so one complex FFT makes both: i kx h + i (i ky h).
+    """Return the slope maps, x slope + i y slope, from N x N down to 1 x 1, concatenated."""
+    # Both slopes are real, so one complex FFT computes both: i kx h + i (i ky h).
     spectrum = amplitudes(tile, time) * torch.complex(-tile.k[..., 1], tile.k[..., 0])
     k2 = (tile.k**2).sum(-1)
     n, maps = len(spectrum), []
-    for level in range(len(tile.kept)):
+    for level in range(len(tile.level_variance)):
         size = n >> level
         half = size // 2
-        if half < 2:  # the only wave left is the mean, and the mean slope is 0
+        if half < 2:  # only the mean remains, and the mean slope is 0
             maps.append(spectrum.new_zeros(size * size))
             continue
         rows = torch.cat([torch.arange(half), torch.arange(n - half, n)]).to(spectrum.device)
         part = spectrum[rows][:, rows]
         if level:
             part = part * torch.exp(-k2[rows][:, rows] * (0.5 * tile.length / size) ** 2 / 2)
-        part[half], part[:, half] = 0, 0  # the Nyquist index has no mirror image
+        part[half], part[:, half] = 0, 0  # the Nyquist frequency has no conjugate partner
         maps.append(torch.fft.ifft2(part, norm="forward").flatten())
     return torch.cat(maps)
 
@@ -243,21 +256,21 @@ def _pyramid(tile: WaveTile, time: float) -> Complex[Tensor, "texels"]:
 def slopes(
     frame: WaveFrame, x: Float[Tensor, "n 2"], footprint: Float[Tensor, "n"]
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Slope of the water at points, filtered to the size of a pixel.
+    """Return the slope of the water at points, filtered to the size of a pixel.
 
     Args:
         frame: the waves at one moment.
         x: horizontal world position, m.
-        footprint: width of the pixel on the water, m, >= 0.
+        footprint: size of the pixel on the water, m, >= 0; see `optics.footprint`.
 
     Returns:
-        Slope (dz/dx, dz/dy), and the slope variance per axis that it leaves out: what filtering
-        removed and what no tile resolves, >= 0.
+        Slope (dz/dx, dz/dy); and the slope variance per axis that it lacks, >= 0: the variance
+        removed by filtering plus that of waves that no tile resolves.
     """
     slope = torch.zeros_like(x)
     removed = torch.full_like(footprint, frame.waves.unresolved)
     for tile, pyramid in zip(frame.waves.tiles, frame.pyramids, strict=True):
-        top = len(tile.kept) - 1
+        top = len(tile.level_variance) - 1
         texel = tile.length * frame.waves.scale / (1 << top)
         exact = torch.log2((footprint / texel).clamp(1, 1 << top))
         level = exact.floor().long().clamp(max=top - 1)
@@ -266,24 +279,24 @@ def slopes(
         fine = _bilinear(pyramid, u, level, top)
         coarse = _bilinear(pyramid, u, level + 1, top)
         slope = slope + torch.lerp(fine, coarse, mix[:, None])
-        kept, shared = tile.kept, tile.shared
-        shown = (1 - mix) ** 2 * kept[level] + mix**2 * kept[level + 1]
-        shown = shown + 2 * mix * (1 - mix) * shared[level]
-        removed = removed + (tile.total - shown).clamp(min=0)
+        variance, covariance = tile.level_variance, tile.level_covariance
+        filtered = (1 - mix) ** 2 * variance[level] + mix**2 * variance[level + 1]
+        filtered = filtered + 2 * mix * (1 - mix) * covariance[level]
+        removed = removed + (tile.slope_variance - filtered).clamp(min=0)
     return slope, removed
 
 
 def _bilinear(
     pyramid: Complex[Tensor, "texels"], u: Float[Tensor, "n 2"], level: Int64[Tensor, "n"], top: int
 ) -> Float[Tensor, "n 2"]:
-    """Interpolate a level at `u` (tiles of side 1, repeating)."""
+    """Interpolate one level of a pyramid at `u`, in units of the tile's side; periodic."""
     size = torch.bitwise_left_shift(torch.ones_like(level), top - level)
-    # Texels before a level: 4^top + ... down to the level before it.
+    # Texels of all finer levels: 4^top + ... + 4 size^2.
     start = ((4 << (2 * top)) - 4 * size**2) // 3
     position = (u - u.floor()) * size[:, None]
     corner = position.floor()
     fx, fy = (position - corner).unbind(-1)
-    i, j = (corner.long() % size[:, None]).unbind(-1)  # u just below 0 may round up to size
+    i, j = (corner.long() % size[:, None]).unbind(-1)  # u just below 0 may round to size
     i1, j1 = (i + 1) % size, (j + 1) % size
     maps = torch.view_as_real(pyramid)
     row, row1 = start + j * size, start + j1 * size

@@ -1,9 +1,9 @@
-"""Smog: an absorbing medium with its own colour, exact along any segment (paper 3.2; Beer-Lambert).
+"""Optical depth and transmittance of smog: a homogeneous or exponentially stratified medium.
 
-Vocabulary: sigma is the extinction in 1/m, tau the optical depth (no unit), T = exp(-tau) the
-transmittance. The medium is homogeneous, or falls off with height above `base_z`:
-sigma(z) = sigma0 exp(-(z - base_z)/H), and sigma0 below it. Nothing is sampled, so empty space
-costs nothing and there is no step size.
+ClimateNeRF section 3.2; Beer-Lambert law. Notation: sigma is the extinction in 1/m, tau the
+dimensionless optical depth and T = exp(-tau) the transmittance. The extinction is constant, or
+decreases with height above `base_z`: sigma(z) = sigma0 exp(-(z - base_z)/H) above it, sigma0 below
+it. All integrals are closed forms: there is no step size, and empty space costs nothing.
 """
 
 import math
@@ -15,19 +15,20 @@ from torch import Tensor
 
 from climatenerf.weather.parameters import Smog, linear_colour
 
-# Slopes below this count as level: 1/dz^2, in the gradient of a division by dz, still fits float32.
+# Rays with a smaller |dz| count as horizontal. The gradient of a division by dz contains 1/dz^2,
+# which still fits float32 at this bound.
 _HORIZONTAL = 1e-12
 
 
 @dataclass(frozen=True)
 class Medium:
-    """What fills the air, in world units.
+    """A participating medium that fills the air, in world units.
 
     Attributes:
         sigma: extinction at and below `base_z`, 1/m, >= 0.
-        falloff: height over which sigma falls by e, m, > 0; None: homogeneous.
-        base_z: world height at which the fall-off begins, m.
-        colour: linear radiance of the infinitely thick medium.
+        falloff: scale height H over which sigma falls by a factor e, m, > 0; None: homogeneous.
+        base_z: world height above which the extinction decreases, m.
+        colour: linear radiance of an infinitely thick medium.
     """
 
     sigma: float
@@ -37,18 +38,19 @@ class Medium:
 
 
 def sigma_from_visibility(visibility: float, contrast: float = 0.05) -> float:
-    """Extinction at which contrast falls to `contrast` over `visibility` metres.
+    """Return the extinction in 1/m at which contrast falls to `contrast` over `visibility` metres.
 
-    5 % is the meteorological optical range (2.996/V), 2 % is Koschmieder's (3.912/V).
+    A contrast of 0.05 defines the meteorological optical range (2.996/V), 0.02 Koschmieder's
+    visibility (3.912/V).
     """
     return -math.log(contrast) / visibility
 
 
 def medium(smog: Smog, ground_z: float) -> Medium | None:
-    """The medium a user asked for; None without smog.
+    """Build the medium from the user's parameters; None without smog.
 
     Args:
-        smog: the user's parameters, heights relative to the ground datum.
+        smog: parameters, with heights relative to the ground datum.
         ground_z: world height of the ground datum, m.
     """
     if smog.sigma is not None:
@@ -66,61 +68,68 @@ def optical_depth(
     rays_d: Float[Tensor, "*n 3"],
     t: Float[Tensor, "*n"],
 ) -> Float[Tensor, "*n"]:
-    """Optical depth from the origin of each ray to ray length `t`, in closed form.
+    """Return the optical depth from the origin of each ray to ray length `t`, in closed form.
 
     Args:
         air: the medium.
-        rays_o: origins, world metres.
-        rays_d: unit directions.
-        t: ray length in m, >= 0, may be +inf (the sky).
+        rays_o: ray origins, world frame, m.
+        rays_d: unit ray directions, world frame.
+        t: ray length, m, >= 0; may be +inf (the sky).
 
     Returns:
         tau >= 0; +inf where an infinite ray never leaves the medium. Values and gradients are
-        finite for finite `t`, horizontal rays included.
+        finite for finite `t`, including horizontal rays.
     """
     if air.sigma == 0:
-        return torch.zeros_like(t)  # 0 times an infinite ray would be NaN
+        return torch.zeros_like(t)  # 0 times an infinite ray length would be NaN
     if air.falloff is None:
         return air.sigma * t
     u0 = rays_o[..., 2] - air.base_z  # height above the base, m
     dz = rays_d[..., 2]
-    endless = torch.isinf(t)
-    finite = _equivalent_length(u0, dz, torch.where(endless, torch.ones_like(t), t), air.falloff)
-    length = torch.where(endless, _endless_length(u0, dz, air.falloff), finite)
+    infinite = torch.isinf(t)
+    bounded_t = torch.where(infinite, torch.ones_like(t), t)
+    finite = _equivalent_length(u0, dz, bounded_t, air.falloff)
+    length = torch.where(infinite, _infinite_equivalent_length(u0, dz, air.falloff), finite)
     return air.sigma * length
 
 
 def _equivalent_length(
     u0: Float[Tensor, "*n"], dz: Float[Tensor, "*n"], t: Float[Tensor, "*n"], falloff: float
 ) -> Float[Tensor, "*n"]:
-    """Integral of exp(-max(u, 0)/H) along u = u0 + s dz, s in [0, t], t finite."""
+    """Integrate exp(-max(u, 0)/H) along u = u0 + s dz, s in [0, t], for finite t.
+
+    The result is the ray length in m that gives the same optical depth at constant sigma0.
+    """
     u1 = u0 + dz * t
-    # Dividing only where the ray crosses the base keeps 0/0 out of the backward pass.
+    # The division happens only where the ray crosses the base: 0/0 would spoil the gradients.
     crosses = ((u0 > 0) != (u1 > 0)) & (dz.abs() > _HORIZONTAL)
     s = -u0 / torch.where(crosses, dz, torch.ones_like(dz))
     above = torch.where(crosses, torch.where(dz > 0, t - s, s), torch.where(u0 > 0, t, 0 * t))
     above = torch.minimum(torch.maximum(above, 0 * t), t)  # rounding
-    # Counted from the lower end, so that no exponential overflows. minimum() halves the gradient
-    # of a tie, which is exactly right for a horizontal ray.
+    # The integral starts at the lower end, so that no exponential overflows. At a tie minimum()
+    # halves the gradient, which is exactly right for a horizontal ray.
     lower = torch.where(crosses, 0 * u0, torch.minimum(u0, u1)).clamp(min=0)
     return t - above + torch.exp(-lower / falloff) * _decaying_length(above, dz.abs() / falloff)
 
 
 def _decaying_length(length: Float[Tensor, "*n"], rate: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Integral of exp(-rate s) over [0, length]; `rate` >= 0 may be 0."""
+    """Integrate exp(-rate s) over [0, length]; `rate` >= 0, in 1/m, may be 0."""
     x = rate * length
     small = x < 1e-2
-    # (1 - exp(-x))/x = 1 - x/2 + x^2/6 - ...; the first term left out is below 1e-15 here.
+    # (1 - exp(-x))/x = 1 - x/2 + x^2/6 - ...; the first omitted term is below 1e-15 here.
     xs = torch.where(small, x, 0 * x)
     series = 1 - xs / 2 * (1 - xs / 3 * (1 - xs / 4 * (1 - xs / 5 * (1 - xs / 6))))
     safe = torch.where(small, torch.ones_like(rate), rate)  # no 0/0 in the branch not taken
     return torch.where(small, length * series, -torch.expm1(-x) / safe)
 
 
-def _endless_length(
+def _infinite_equivalent_length(
     u0: Float[Tensor, "*n"], dz: Float[Tensor, "*n"], falloff: float
 ) -> Float[Tensor, "*n"]:
-    """The same integral to infinity: (depth below the base + H exp(-u0/H)) / sin(elevation)."""
+    """Return the same integral to infinity: (depth below the base + H exp(-u0/H)) / sin(elevation).
+
+    The result is +inf for rays that do not rise.
+    """
     rises = dz > _HORIZONTAL
     slope = torch.where(rises, dz, torch.ones_like(dz))
     length = ((-u0).clamp(min=0) + falloff * torch.exp(-u0.clamp(min=0) / falloff)) / slope
@@ -133,20 +142,23 @@ def transmittance(
     rays_d: Float[Tensor, "*n 3"],
     t: Float[Tensor, "*n"],
 ) -> Float[Tensor, "*n"]:
-    """T = exp(-tau) from the origin of each ray to ray length `t`, in [0, 1]."""
+    """Return T = exp(-tau) in [0, 1] from the origin of each ray to ray length `t`.
+
+    Args and units: see `optical_depth`.
+    """
     return torch.exp(-optical_depth(air, rays_o, rays_d, t))
 
 
 def apply(
     air: Medium, colour: Float[Tensor, "*n 3"], transmitted: Float[Tensor, "*n"]
 ) -> Float[Tensor, "*n 3"]:
-    """T L + (1 - T) c: what is left of the radiance `colour`, and the medium's own.
+    """Return T L + (1 - T) c: the attenuated radiance plus the radiance of the medium.
 
     Args:
-        air: the medium.
-        colour: linear radiance at the far end.
-        transmitted: transmittance between there and the eye.
+        air: the medium, with its linear radiance c.
+        colour: linear radiance L at the far end of the segment.
+        transmitted: transmittance T of the segment, in [0, 1].
     """
-    own = torch.tensor(air.colour, dtype=colour.dtype, device=colour.device)
+    air_colour = torch.tensor(air.colour, dtype=colour.dtype, device=colour.device)
     weight = transmitted[..., None]
-    return weight * colour + (1 - weight) * own
+    return weight * colour + (1 - weight) * air_colour
