@@ -85,7 +85,7 @@ def frames(
 def growth(run: Path, sizes: list[str], view: str, repeats: int) -> dict[str, Any]:
     """Seconds of a clean frame in several sizes, and the exponent of pixels that fits them best."""
     field, scene = load_field(run), load_scene(run)
-    world = World(field, field.near)
+    world = World(field)
     rows = []
     for size in sizes:
         path = camera_path(view, scene, 1, parse_size(size))

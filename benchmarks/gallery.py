@@ -70,7 +70,7 @@ def surfaces(run: Path, columns: int) -> Rows:
     for view in (views[i] for i in chosen):
         camera = scene.cameras[view.camera]
         small = camera.resized(320, round(camera.height * 320 / camera.width))
-        world = World(field, field.near)
+        world = World(field)
         picture, layers = render_frame(world, small, scene.c2w_world(view), 2, True, True)
         photo = Image.fromarray(load_image(view, scene)).resize((small.width, small.height))
         shown = [np.asarray(photo), picture, depth_picture(layers["depth"])]
@@ -98,8 +98,7 @@ def passers_by(run: Path, columns: int) -> Rows:
             mask = masks(torch.full((len(place),), int(i)), torch.from_numpy(place)) > MASKED
         marked = photo.copy()
         marked[mask.view(photo.shape[:2]).numpy()] = (220, 20, 60)
-        field.shown = field.embeddings[[int(i)]].detach()
-        world = World(field, field.near)
+        world = World(field, appearance=field.embeddings[[int(i)]].detach())
         picture, _ = render_frame(world, scene.cameras[view.camera], scene.c2w_world(view))
         for row, each in zip(rows, (photo, marked, picture), strict=True):
             row[1].append(each)

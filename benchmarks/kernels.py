@@ -122,7 +122,9 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
             rays = n // SAMPLES_PER_RAY
             start, end = torch.zeros(rays), torch.full((rays,), SAMPLES_PER_RAY / 256 + 1e-6)
             d = torch.nn.functional.normalize(q[:rays], dim=-1)
-            samples = field.march(torch.zeros(rays, 3), d, start, end, stop=1e-30, thin=0.0)
+            samples = field.march(
+                torch.zeros(rays, 3), d, start, end, stop=1e-30, pruning_threshold=0.0
+            )
             assert samples.t.shape[0] in range(n, n + rays + 1)
             return samples.sigma
         cells = torch.ones(1, 4, 4, 4, dtype=torch.uint8)

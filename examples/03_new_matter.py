@@ -50,10 +50,10 @@ class Ash:
 run = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/example")
 field, scene = load_field(run), load_scene(run)
 path = camera_path("still:0020", scene, frames=1, size=(192, 108))
-light = scene_irradiance(field, field.near, scene) / math.pi
+light = scene_irradiance(field, scene) / math.pi
 fall = Snow(depth=0.04, slope=math.radians(33))  # ash slides off earlier than snow
 layer = bake_snow(field.observed_only(), fall, path.c2w[:, :3, 3], light.numpy())
-world = World(field, field.near, matter=None if layer is None else Ash(layer, light))
+world = World(field, matter=None if layer is None else Ash(layer, light))
 picture, layers = render_frame(world, path.cameras[0], path.c2w[0])
 write_png(run / "ash.png", picture, SIMULATED)
 print(f"ash on {layers['mask_snow'].mean():.0%} of {run / 'ash.png'}")

@@ -63,7 +63,7 @@ class TwoLayers:
 
     near = 0.1
 
-    def march(self, rays_o, rays_d, near, far, step, thin=None):
+    def march(self, rays_o, rays_d, near, far, step, pruning_threshold=None):
         n = rays_o.shape[0]
         sigma = torch.tensor([[math.log(2.0), 1e3], [0.1, 0.1]])[torch.arange(n) % 2]
         t = torch.tensor([1.0, 5.0]).repeat(n)

@@ -16,6 +16,7 @@ from support.random_field import random_field
 
 from climatenerf.field import hash_field as field_module
 from climatenerf.field.activations import plain_radiance
+from climatenerf.field.protocol import FUSED
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.cpu import kernels as cpu
 from climatenerf.render import volume as view_module
@@ -289,9 +290,9 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
     by(cpu, monkeypatch)
-    field.shown = field.embeddings[[1]].detach()
-    assert field.composited_at_once(o, d, near, 4.0, stop) is None
-    real = composited(field, o, d, near, 4.0, stop, thin)
+    photo = field.embeddings[[1]].detach()
+    assert FUSED not in field.capabilities
+    real = composited(field, o, d, near, 4.0, stop, thin, photo)
     assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.4).sum() > 3, (
         "some see matter, one does not"
     )
@@ -301,7 +302,8 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     field = field.to(DEVICE)
     field.occupancy.packed = None  # as the other kernels read it
     with torch.device(DEVICE):
-        found = composited(field, o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop, thin)
+        given = o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop, thin, photo.to(DEVICE)
+        found = composited(field, *given)
     assert not marched, "one launch"
     for ours, theirs in zip(found, real, strict=True):
         # Where a step ends on a cell's face, rounding may put it on either side.

@@ -192,9 +192,9 @@ def test_a_bed_s_rays_leave_out_next_to_nothing(monkeypatch):
     """They begin at the water, with short steps, of which each is thin; the eye's do not."""
     asked, march = [], AnalyticField.march
 
-    def noting(self, *rays, stop=1e-3, thin=None):
-        asked.append(thin)
-        return march(self, *rays, stop=stop, thin=thin)
+    def noting(self, *rays, stop=1e-3, pruning_threshold=None):
+        asked.append(pruning_threshold)
+        return march(self, *rays, stop=stop, pruning_threshold=pruning_threshold)
 
     monkeypatch.setattr(AnalyticField, "march", noting)
     linear(World(street()))
@@ -293,7 +293,7 @@ def test_all_weathers_at_once_compose():
     level = 0.3
     snow = snowed(0.15)
     air = medium(Smog(visibility=60.0), 0.0)
-    world = World(street(), 0.0, air, snow.above(level), flooded(level))
+    world = World(street(), None, air, snow.above(level), flooded(level))
     seen = linear(world)
     assert seen.mask_water.max() > 0.99 and seen.mask_snow.max() > 0.99
     assert (seen.snow_thickness[seen.mask_water > 0.99] == 0).all()
@@ -410,8 +410,8 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
     places = (field.centre + torch.tensor([0.0, 0.0, 1.5]))[None].numpy().astype(np.float64)
     air, ground = medium(Smog(visibility=60.0), 0.0), float(field.centre[2])
     snow = bake_snow(field, Snow(depth=0.1), places, np.full(3, 0.6))
-    snowy = World(field, 0.1, air, snow)
-    wet = World(field, 0.1, air, None, flooded(ground + 0.3))
+    snowy = World(field, None, air, snow)
+    wet = World(field, None, air, None, flooded(ground + 0.3))
     o = (field.centre + torch.tensor([0.0, -1.0, 1.5])).expand(600, 3).contiguous()
     d = directions(600)
     d[:, 2] = -d[:, 2].abs()
@@ -433,7 +433,7 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
 def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):
     from climatenerf.render import volume as module
 
-    world = World(street(), 0.0, medium(Smog(visibility=60.0), 0.0), None, flooded(0.3))
+    world = World(street(), None, medium(Smog(visibility=60.0), 0.0), None, flooded(0.3))
     whole = linear(world).rgb
     monkeypatch.setattr(module, "RAYS_AT_ONCE", 777)
     threads = torch.get_num_threads()
@@ -493,14 +493,14 @@ def test_what_meets_no_weather_takes_a_short_way_to_the_same(monkeypatch, water)
     o = (field.centre + torch.tensor([0.0, 0.0, 1.5])).repeat(300, 1)
     o[:40, 2] -= 3.0  # all of them meet water at once
     angle = torch.full((300,), 0.01)
-    short = trace(World(field, 0.1, water=water), o, d, angle)
+    short = trace(World(field, None, water=water), o, d, angle)
     if water is None:
         assert sum(map(len, taken)) == 300
     else:
         rise = (d[40:, 2] >= 0).sum()
         assert len(taken[0]) == rise and sum(map(len, taken)) > rise + 100, "and what is mirrored"
     taken.clear()
-    long = trace(World(field, 0.1, matter=Nothing(), water=water), o, d, angle)
+    long = trace(World(field, None, matter=Nothing(), water=water), o, d, angle)
     assert not taken
     assert torch.isfinite(long.depth).float().mean() > 0.1
     for each in dataclasses.fields(short):

@@ -1,6 +1,7 @@
 """Light is found from what photos show: sky above, ground in their pixels, and nothing else."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +28,9 @@ def looking(pitch: float) -> np.ndarray:
 def irradiance(tmp_path, ground: float, pitch: float = -0.3) -> np.ndarray:
     field = AnalyticField([HalfSpace((0.0, 0.0, 1.0), 0.0, (ground,) * 3)])
     views = tuple(View(f"{i}.png", tmp_path / f"{i}.png", 0, looking(pitch)) for i in range(3))
-    return scene_irradiance(field, 0.1, Scene(tmp_path, "test", (CAMERA,), views)).numpy()
+    return scene_irradiance(
+        replace(field, near=0.1), Scene(tmp_path, "test", (CAMERA,), views)
+    ).numpy()
 
 
 def test_dark_ground_leaves_the_light_to_the_sky(tmp_path):

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from climatenerf.core.samples import Samples
+from climatenerf.field.protocol import DENSITY
 
 _OPAQUE = 8.0  # optical depth after which a solid is not followed further: exp(-8) < 1e-3
 _PIECES = 4  # samples that follow a solid down to that depth
@@ -84,6 +85,9 @@ class AnalyticField:
         default=((-10.0, -10.0, -2.0), (10.0, 10.0, 6.0))
     )
 
+    near: float = 0.0
+    capabilities: frozenset[str] = frozenset({DENSITY})
+
     @property
     def bounds(self) -> tuple[Tensor, Tensor]:
         lower, upper = torch.tensor(self.box, dtype=torch.float32)
@@ -98,11 +102,11 @@ class AnalyticField:
         step_scale: float = 1.0,
         *,
         stop: float = 1e-3,
-        thin: float | None = None,
+        pruning_threshold: float | None = None,
     ) -> Samples:
         """Samples from where each ray enters a solid (inside `bounds`) until it is opaque.
 
-        All of them count, whatever `thin` is: nothing here is a veil.
+        All of them count, whatever `pruning_threshold` is: nothing here is a veil.
         """
         lower, upper = self.bounds
         limits = Box(tuple(lower.tolist()), tuple(upper.tolist())).interval(rays_o, rays_d)
@@ -136,7 +140,15 @@ class AnalyticField:
         inside = ((x >= lower) & (x <= upper)).all(-1) & (self._distances(x).amin(-1) <= 0)
         return torch.where(inside, self.extinction, 0.0).to(x)
 
-    def colour(self, x: Tensor, d: Tensor, ray: Tensor | None = None) -> Tensor:
+    def colour(
+        self,
+        x: Tensor,
+        d: Tensor,
+        ray: Tensor | None = None,
+        *,
+        ids: Tensor | None = None,
+        appearance: Tensor | None = None,
+    ) -> Tensor:
         """Colour of the nearest solid, whatever the direction."""
         nearest = self._distances(x).abs().argmin(-1)
         colours = x.new_tensor([solid.colour for solid in self.solids])
@@ -145,7 +157,7 @@ class AnalyticField:
         black = (sides > 0) & (cells.remainder(2) == 1)
         return torch.where(black, 0.0, colours[nearest])
 
-    def sky(self, d: Tensor) -> Tensor:
+    def sky(self, d: Tensor, appearance: Tensor | None = None) -> Tensor:
         """From the horizon's colour to the zenith's, linear in the sine of the elevation."""
         share = d[:, 2:].clamp(0, 1)
         return (1 - share) * d.new_tensor(self.horizon) + share * d.new_tensor(self.zenith)

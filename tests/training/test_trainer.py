@@ -308,8 +308,8 @@ def exposures_learned(field, scene):
     for index, view in enumerate(scene.of_split("train")):
         pose, light = scene.c2w_world(view), []
         for appearance in (field.embeddings[[index]].detach(), None):
-            field.shown = appearance
-            light.append(decode_srgb(torch.from_numpy(render_view(field, CAMERA, pose))).mean())
+            picture = render_view(field, CAMERA, pose, appearance)
+            light.append(decode_srgb(torch.from_numpy(picture)).mean())
         ratios.append(float(light[0] / light[1]))
     return np.array(ratios)
 

@@ -126,7 +126,7 @@ def render_run(
     check_config(options.run)
     scene = load_scene(options.run)
     shown = appearance_of(options.appearance, scene)
-    field.shown = None if shown is None else field.embeddings[[shown]].detach()
+    appearance = None if shown is None else field.embeddings[[shown]].detach()
     if not field.knows_classes:
         if "label" in options.layers:
             raise UserError(
@@ -142,7 +142,7 @@ def render_run(
     fps = check_fps(path.fps or options.fps)
     check_amount(path.size, options.supersample)
     check_place(options.out, len(path), options.preview)
-    stage = prepare_stage(field, scene, weather, path, fps)
+    stage = prepare_stage(field, scene, weather, path, fps, appearance)
     movie = render_movie(
         stage,
         path,
@@ -234,7 +234,9 @@ def is_simulated(path: Path) -> bool:
         return False
 
 
-def prepare_stage(field, scene, weather: KeyframedWeather, path: "CameraPath", fps: float):
+def prepare_stage(
+    field, scene, weather: KeyframedWeather, path: "CameraPath", fps: float, appearance=None
+):
     """Light, waves and snowfall, with a progress bar."""
     from climatenerf.render.session import prepare
 
@@ -244,7 +246,7 @@ def prepare_stage(field, scene, weather: KeyframedWeather, path: "CameraPath", f
         def told(what: str, share: float) -> None:
             bar.update(share, {"now": what})
 
-        stage = prepare(field, scene, weather, path.c2w[:, :3, 3], times, told)
+        stage = prepare(field, scene, weather, path.c2w[:, :3, 3], times, told, appearance)
         bar.update(1.0, {"now": "ready"})
     return stage
 

@@ -25,6 +25,8 @@ class Samples:
     """Extent along the ray, m."""
     sigma: Float[Tensor, "s"]
     """Extinction, 1/m."""
+    ids: Int[Tensor, "s"] | None = None
+    """The primitive that each sample belongs to, for fields made of primitives."""
 
     def ray_index(self) -> Int[Tensor, "s"]:
         """The ray each sample belongs to."""

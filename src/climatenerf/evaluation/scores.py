@@ -156,7 +156,7 @@ def dry_view(place: Place, truth: Truth) -> Dry:
 
 def dry_from(place: Place, camera: Camera, c2w: Float[np.ndarray, "4 4"]) -> Dry:
     """Our clean view from any camera."""
-    world = World(place.fitted, place.fitted.near)
+    world = World(place.fitted)
     linear, layers = see_frame(world, camera, c2w, normals=True)
     rays_d = world_rays(camera, c2w)
     return Dry(linear.double().numpy(), layers["depth"], layers["normal"], rays_d, c2w, camera)
@@ -234,7 +234,7 @@ def open_sky(place: Place) -> float:
     rays_o[:, 2] += LIFTED
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(found), 3).contiguous()
     start, end = torch.zeros(len(found)), torch.full((len(found),), 1e9)
-    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP, thin=MIN_TAU)
+    samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP, pruning_threshold=MIN_TAU)
     _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
     return float(left.mean())
 

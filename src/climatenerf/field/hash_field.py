@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from climatenerf.core.classes import SOLID
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples
 from climatenerf.core.vectors import unit as unit_vector
-from climatenerf.field import activations
+from climatenerf.field import activations, protocol
 from climatenerf.field import spherical_harmonics as directions
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
@@ -60,7 +60,6 @@ class Field(nn.Module):
     centre: Tensor
     geometry_resolutions: Tensor
     appearance_resolutions: Tensor
-    shown: Float[Tensor, "1 e"] | None
     surface_resolutions: Tensor
     sky_resolutions: Tensor
     learned: Tensor
@@ -129,8 +128,6 @@ class Field(nn.Module):
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
         # Whether normals and classes were learned: an untrained head says nothing.
         self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))
-        # A buffer moves with the field; of the frames, not of the run, so it is not saved.
-        self.register_buffer("shown", None, persistent=False)
         # Coarse to begin with; `Occupancy.refine` halves the cells later.
         self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
 
@@ -151,10 +148,19 @@ class Field(nn.Module):
         """The training images' mean appearance."""
         return self.embeddings.mean(0, keepdim=True)
 
+    def _appearance(self, chosen: Float[Tensor, "1 e"] | None, n: int) -> Float[Tensor, "n e"]:
+        """The chosen appearance, or the training images' mean, for n rays."""
+        return (self.mean_embedding if chosen is None else chosen).expand(n, -1)
+
     @property
-    def shown_embedding(self) -> Float[Tensor, "1 e"]:
-        """The appearance in which frames are rendered: `shown`, or the mean."""
-        return self.mean_embedding if self.shown is None else self.shown
+    def capabilities(self) -> frozenset[str]:
+        """What this field answers beside colours; see `field.protocol`."""
+        learned = {protocol.NORMALS} if self.knows_normals else set()
+        learned |= {protocol.CLASSES} if self.knows_classes else set()
+        # The fused kernel runs on GPUs alone.
+        fused = {protocol.FUSED} if dispatch.takes_whole_rays(self.geometry_grid) else set()
+        always = {protocol.DENSITY, protocol.APPEARANCE, protocol.OBSERVED}
+        return frozenset(always | learned | fused)
 
     @property
     def knows_normals(self) -> bool:
@@ -209,7 +215,7 @@ class Field(nn.Module):
         step_scale: float = 1.0,
         jitter: Float[Tensor, "n"] | None = None,
         stop: float = 1e-3,
-        thin: float | None = None,
+        pruning_threshold: float | None = None,
         room: int | None = None,
     ) -> Samples:
         """Samples of rays where matter is, without gradient.
@@ -222,18 +228,19 @@ class Field(nn.Module):
             step_scale: factor on the step length.
             jitter: share of the first step by which each ray's comb is shifted; default 0.
             stop: transmittance at which a ray ends.
-            thin: optical depth below which a sample counts as empty; default: the field's, which is
-                of the steps of a camera's rays. Rays that begin beside matter have finer ones.
+            pruning_threshold: optical depth below which a sample counts as empty; default: the
+                field's, which suits the steps of camera rays. Rays that begin beside matter have
+                finer steps.
             room: how many samples there are to be, the rest 0; default: as many as it takes.
         """
-        thin = self.thin if thin is None else thin
+        threshold = self.thin if pruning_threshold is None else pruning_threshold
         if jitter is None:
             jitter = torch.zeros_like(t_min)
         offsets, (t, dt, sigma) = dispatch.march(
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, t_max / self.unit, jitter], dim=-1),
             self.occupancy.cells(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale, thin),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale, threshold),
             stop,
             self._net(),
             room,
@@ -241,25 +248,25 @@ class Field(nn.Module):
         return Samples(offsets, t * self.unit, dt * self.unit, sigma / self.unit)
 
     @torch.no_grad()
-    def composited_at_once(
+    def composite(
         self,
         rays_o: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         t_min: Float[Tensor, "n"],
         step_scale: float = 1.0,
         stop: float = 1e-3,
-        thin: float | None = None,
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]] | None:
-        """`render.view.composited` of rays in one launch on a GPU; None elsewhere."""
-        if not dispatch.takes_whole_rays(rays_o, rays_d, self.geometry_grid):
-            return None
-        shared = self._seen_from(rays_d, self.shown_embedding.expand(rays_o.shape[0], -1))
+        pruning_threshold: float | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """`render.volume.composited` of rays in one launch, on a GPU."""
+        shared = self._seen_from(rays_d, self._appearance(appearance, rays_o.shape[0]))
+        threshold = self.thin if pruning_threshold is None else pruning_threshold
         endless, start = torch.full_like(t_min, 1e9), torch.zeros_like(t_min)
         found = dispatch.composite(
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, endless, start], dim=-1),
             self.occupancy.cells(),
-            (STEP_MIN * step_scale, STEP_CONE * step_scale, self.thin if thin is None else thin),
+            (STEP_MIN * step_scale, STEP_CONE * step_scale, threshold),
             (stop, MIN_WEIGHT),
             self._net(),
             ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
@@ -408,6 +415,17 @@ class Field(nn.Module):
         # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
         return unit_vector(raw[:, :3], 1e-6), raw[:, 3:]
 
+    @torch.no_grad()
+    def surface_heads(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        samples: Samples,
+        selected: Int[Tensor, "k"],
+    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
+        """Learned normals and class logits of some samples on rays in world m."""
+        return self.surface_at(self.sample_positions(rays_o, rays_d, samples)[selected])
+
     def sky_colour(
         self, d: Float[Tensor, "n 3"], embedding: Float[Tensor, "n e"]
     ) -> Float[Tensor, "n 3"]:
@@ -424,19 +442,21 @@ class Field(nn.Module):
         x: Float[Tensor, "s 3"],
         d: Float[Tensor, "n 3"],
         ray: Int[Tensor, "s"] | None = None,
+        *,
+        ids: Int[Tensor, "s"] | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
     ) -> Float[Tensor, "s 3"]:
-        """Linear radiance of matter at world positions, in the appearance shown.
+        """Linear radiance at world positions; see `field.protocol.RadianceField.colour`.
 
-        Args:
-            x: positions, m.
-            d: unit directions from the eye, one a position or (with `ray`) one a ray.
-            ray: the row of d for each position.
+        The position alone decides: `ids` is not used.
         """
         u = reference.contract(self.to_grid(x))
         rows = torch.arange(x.shape[0]) if ray is None else ray
-        return self.colour_at(u, rows, d, self.shown_embedding.expand(d.shape[0], -1))
+        return self.colour_at(u, rows, d, self._appearance(appearance, d.shape[0]))
 
     @torch.no_grad()
-    def sky(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear radiance of the sky, in the appearance shown."""
-        return self.sky_colour(d, self.shown_embedding.expand(d.shape[0], -1))
+    def sky(
+        self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None
+    ) -> Float[Tensor, "n 3"]:
+        """Linear radiance of the sky; `appearance` None: the mean of the training images."""
+        return self.sky_colour(d, self._appearance(appearance, d.shape[0]))

@@ -11,14 +11,14 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.field.hash_field import Field
+from climatenerf.field.protocol import CLASSES, NORMALS, RadianceField
 from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
 from climatenerf.render.volume import camera_rays
 from climatenerf.weather.flood.optics import pixel_rotation
-from climatenerf.weather.world import FieldLike, World
+from climatenerf.weather.world import World
 
 
 def render_frame(
@@ -115,17 +115,17 @@ def see_frame(
 
 
 def _surface(
-    field: FieldLike, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
+    field: RadianceField, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
 ) -> tuple[Float[np.ndarray, "h w 3"] | None, UInt8[np.ndarray, "h w"] | None]:
     """Normals and classes that the field has learned for a picture's rays; None what it has not."""
-    if not isinstance(field, Field) or not (field.knows_normals or field.knows_classes):
+    if not field.capabilities & {NORMALS, CLASSES}:
         return None, None
     rays_d = to_device(directions.reshape(-1, 3))
     origin = to_device(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
     normal, label = see_surface(field, origin, rays_d)
     return (
-        to_numpy(normal.view(directions.shape)) if field.knows_normals else None,
-        to_numpy(label.view(directions.shape[:2])) if field.knows_classes else None,
+        to_numpy(normal.view(directions.shape)) if NORMALS in field.capabilities else None,
+        to_numpy(label.view(directions.shape[:2])) if CLASSES in field.capabilities else None,
     )
 
 

@@ -1,4 +1,4 @@
-"""What the fitted scene itself says of its surfaces: predicted normals and classes of pixels."""
+"""Normals and classes of pixels, composited from a field's surface heads."""
 
 import torch
 from jaxtyping import Float, UInt8
@@ -6,19 +6,20 @@ from torch import Tensor
 
 from climatenerf.core.classes import SKY, SOLID
 from climatenerf.core.device import to_device
-from climatenerf.field.hash_field import Field
+from climatenerf.core.samples import MIN_WEIGHT, offsets_of
+from climatenerf.field.protocol import RadianceField
 from climatenerf.ops import dispatch
-from climatenerf.render.volume import rays_at_once, weighed_samples
+from climatenerf.render.volume import RENDER_STEP, rays_at_once
 
 
 @torch.no_grad()
 def see_surface(
-    field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    field: RadianceField, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n 3"], UInt8[Tensor, "n"]]:
     """Composited normals and classes of the dry scene along rays.
 
     Args:
-        field: the fitted field.
+        field: a field with normals or classes among its capabilities.
         rays_o: origins, m.
         rays_d: unit directions.
 
@@ -29,14 +30,20 @@ def see_surface(
     normals, labels = [], []
     size = rays_at_once(rays_o)
     for o, d in zip(rays_o.split(size), rays_d.split(size), strict=True):
-        seen = weighed_samples(field, o, d)
-        normal, logits = field.surface_at(seen.u)
-        solid = seen.left < 0.5
-        mean = dispatch.accumulate(seen.weights, normal, seen.offsets)
+        near, far = torch.full((len(o),), field.near), torch.full((len(o),), 1e9)
+        samples = field.march(o, d, near, far, RENDER_STEP)
+        weights, transmittance = dispatch.render_weights(
+            samples.sigma * samples.dt, samples.offsets
+        )
+        keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
+        weights, offsets = weights[keep], offsets_of(samples.ray_index()[keep], len(o))
+        normal, logits = field.surface_heads(o, d, samples, keep)
+        solid = transmittance < 0.5
+        mean = dispatch.accumulate(weights, normal, offsets)
         mean = torch.nn.functional.normalize(mean, dim=-1) * solid[:, None]
         away = (mean * d).sum(-1, keepdim=True) > 0
         normals.append(torch.where(away, -mean, mean))
-        best = dispatch.accumulate(seen.weights, logits, seen.offsets).argmax(-1)
+        best = dispatch.accumulate(weights, logits, offsets).argmax(-1)
         kind = to_device(SOLID)[best].to(torch.uint8)
         labels.append(torch.where(solid, kind, torch.full_like(kind, SKY)))
     return torch.cat(normals), torch.cat(labels)

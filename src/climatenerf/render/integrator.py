@@ -22,7 +22,6 @@ from climatenerf.weather.smog import medium as smog
 from climatenerf.weather.world import (
     SKY_OPACITY,
     TINY,
-    FieldLike,
     RenderOutput,
     Water,
     World,
@@ -64,7 +63,7 @@ def trace(
                 rays_d[some],
                 pixel_angle[some],
                 None if roll is None else roll[some],
-                torch.full_like(pixel_angle[some], world.near),
+                torch.full_like(pixel_angle[some], world.field.near),
                 bounces=BOUNCES,
             )
         )
@@ -87,13 +86,13 @@ def _trace(
     step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
     if world.air is None and world.matter is None:
         if water is None:
-            return _see_plain(world.field, rays_o, rays_d, t_min, step_scale)
+            return _see_plain(world, rays_o, rays_d, t_min, step_scale)
         # Most reflected rays rise, and see what they would without weather.
         meets = water_physics.plane_distance(rays_o, rays_d, water.level) < torch.inf
         meets = meets | (rays_o[:, 2] < water.level)
         if not bool(meets.all()):
             dry, wet = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
-            parts = [_see_plain(world.field, rays_o[dry], rays_d[dry], t_min[dry], step_scale)]
+            parts = [_see_plain(world, rays_o[dry], rays_d[dry], t_min[dry], step_scale)]
             if wet.numel():
                 given = (rays_o[wet], rays_d[wet], pixel_angle[wet])
                 turn = None if roll is None else roll[wet]
@@ -127,7 +126,7 @@ def _trace(
     # --- Sky ---------------------------------------------------------------------------------
     endless = torch.full((n,), torch.inf)
     skyward = (sky_share > MIN_WEIGHT).nonzero()[:, 0]
-    sky = world.field.sky(rays_d[skyward])
+    sky = world.field.sky(rays_d[skyward], world.appearance)
     sky = _through(world, water, below[skyward], sky, rays_o, rays_d, skyward, endless[skyward])
     rgb = rgb.index_add(0, skyward, sky_share[skyward, None] * sky)
 
@@ -194,13 +193,17 @@ def _trace(
 
 
 def _see_plain(
-    field: FieldLike, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
+    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
 ) -> RenderOutput:
     """What rays see of the scene without weather: as `_trace`, in one go on a GPU."""
     n = t_min.shape[0]
-    rgb, left, far = composited(field, rays_o, rays_d, t_min, step_scale)
+    rgb, left, far = composited(
+        world.field, rays_o, rays_d, t_min, step_scale, appearance=world.appearance
+    )
     skyward = (left > MIN_WEIGHT).nonzero()[:, 0]
-    rgb = rgb.index_add(0, skyward, left[skyward, None] * field.sky(rays_d[skyward]))
+    rgb = rgb.index_add(
+        0, skyward, left[skyward, None] * world.field.sky(rays_d[skyward], world.appearance)
+    )
     depth = far / (1 - left).clamp_min(TINY)
     nothing = torch.zeros(n)
     return RenderOutput(
@@ -230,7 +233,10 @@ def _all_samples(
         key: torch.cat([getattr(field, key), getattr(own, key)])[order]
         for key in ("t", "dt", "sigma")
     }
-    return Samples(offsets, **both), order >= field.t.shape[0]
+    ids = None
+    if field.ids is not None:
+        ids = torch.cat([field.ids, field.ids.new_full(own.t.shape, -1)])[order]
+    return Samples(offsets, **both, ids=ids), order >= field.t.shape[0]
 
 
 def _opaque_from(samples: Samples) -> Float[Tensor, "n"]:
@@ -290,12 +296,16 @@ def _sample_colour(
 ) -> Float[Tensor, "k 3"]:
     """Linear radiance of some samples."""
     x = rays_o[ray[keep]] + samples.t[keep, None] * rays_d[ray[keep]]
+    ids = None if samples.ids is None else samples.ids[keep]
     if world.matter is None:
-        return world.field.colour(x, rays_d, ray[keep])
+        return world.field.colour(x, rays_d, ray[keep], ids=ids, appearance=world.appearance)
     colour = torch.empty(keep.shape[0], 3)
     mine = is_matter[keep]
     colour[mine] = world.matter.colour(x[mine])
-    colour[~mine] = world.field.colour(x[~mine], rays_d, ray[keep][~mine])
+    ids = None if ids is None else ids[~mine]
+    colour[~mine] = world.field.colour(
+        x[~mine], rays_d, ray[keep][~mine], ids=ids, appearance=world.appearance
+    )
     return colour
 
 
@@ -411,7 +421,15 @@ def _other_side(
         o, d = start[down], direction[down]
         zero = torch.zeros(down.shape[0])
         # A bed is seen as it is; its steps are fine.
-        matter, left, length = composited(world.field, o, d, zero, RENDER_STEP, thin=MIN_TAU)
+        matter, left, length = composited(
+            world.field,
+            o,
+            d,
+            zero,
+            RENDER_STEP,
+            pruning_threshold=MIN_TAU,
+            appearance=world.appearance,
+        )
         opacity = (1 - left).clamp_min(TINY)
         dry, path = matter / opacity[:, None], length / opacity
         light = water_physics.light_cosine(water.flood, water.sun_elevation)

@@ -8,10 +8,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.colour import luma
+from climatenerf.field.protocol import RadianceField
 from climatenerf.render.integrator import trace
 from climatenerf.render.volume import camera_rays
 from climatenerf.scene.scene import Scene, View
-from climatenerf.weather.world import FieldLike, World
+from climatenerf.weather.world import World
 
 PLACES = 8
 DIRECTIONS = 256
@@ -20,7 +21,9 @@ GROUND_ALBEDO = 0.12  # to the eye: grass .08, soil and asphalt .1, concrete .3
 
 
 @torch.no_grad()
-def scene_irradiance(field: FieldLike, near: float, scene: Scene) -> Float[Tensor, "3"]:
+def scene_irradiance(
+    field: RadianceField, scene: Scene, appearance: Float[Tensor, "1 e"] | None = None
+) -> Float[Tensor, "3"]:
     """Irradiance E on open level ground, linear, from the fitted light field.
 
     The larger of two estimates, since photos clip the sun and bright sky: the cosine-weighted mean
@@ -30,20 +33,21 @@ def scene_irradiance(field: FieldLike, near: float, scene: Scene) -> Float[Tenso
 
     Args:
         field: the fitted field.
-        near: rays begin here, m.
-        scene: its capture; light from above is looked for at the cameras, and ground only where
-            photos show it.
+        scene: its capture; light from above is gathered at the cameras, and ground is looked for
+            only where photos show it.
+        appearance: exposure and light of a photo; None: the mean of all photos.
     """
     views = scene.of_split("train")
     some = views[:: max(1, len(views) // PLACES)][:PLACES]
     up = _cosine_directions(DIRECTIONS)
     eyes = torch.tensor(np.stack([scene.c2w_world(view)[:3, 3] for view in some])).float()
-    above = _seen(field, near, eyes.repeat_interleave(DIRECTIONS, 0), up.repeat(len(some), 1))
+    world = World(field, appearance=appearance)
+    above = _radiance(world, eyes.repeat_interleave(DIRECTIONS, 0), up.repeat(len(some), 1))
     above = above.mean(0)
     ground_o, ground_d = _photographed_ground(scene, some)
     if not ground_d.shape[0]:
         return math.pi * above / luma(above).clamp_min(1.0)
-    lit = luma(_seen(field, near, ground_o, ground_d)).mean() / GROUND_ALBEDO
+    lit = luma(_radiance(world, ground_o, ground_d)).mean() / GROUND_ALBEDO
     brightness = luma(above)
     # Photos are balanced to the light on what they show, so half of the tint is not the light's.
     colour = 0.5 * (above + brightness)
@@ -51,8 +55,8 @@ def scene_irradiance(field: FieldLike, near: float, scene: Scene) -> Float[Tenso
     return math.pi * colour / luma(colour).clamp_min(1.0)
 
 
-def _seen(field: FieldLike, near: float, o: Tensor, d: Tensor) -> Float[Tensor, "n 3"]:
-    return trace(World(field, near), o, d, torch.full((o.shape[0],), 0.05)).rgb
+def _radiance(world: World, o: Tensor, d: Tensor) -> Float[Tensor, "n 3"]:
+    return trace(world, o, d, torch.full((o.shape[0],), 0.05)).rgb
 
 
 def _photographed_ground(scene: Scene, views: tuple[View, ...]) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from climatenerf.core.device import to_numpy
 from climatenerf.core.errors import UserError
-from climatenerf.field.hash_field import Field
+from climatenerf.field.protocol import RadianceField, observed
 from climatenerf.render.irradiance import scene_irradiance
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import KeyframedWeather
@@ -27,12 +27,14 @@ from climatenerf.weather.world import Water, World
 class Stage:
     """A fitted scene under a weather that may change over time."""
 
-    field: Field
+    field: RadianceField
     scene: Scene
     weather: KeyframedWeather
     irradiance: Float[Tensor, "3"]
     snow: BakedSnow | None
     waves: Waves | None
+    appearance: Float[Tensor, "1 e"] | None = None
+    """Exposure and light of a photo; None: the mean of all photos."""
     _grown: dict[float, BakedSnow] = dataclasses.field(default_factory=dict)
 
     def at(self, time: float) -> World:
@@ -51,7 +53,7 @@ class Stage:
         if matter is not None:
             matter = matter.above(None if water is None else water.level)
         air = medium(weather.smog, self.scene.ground_z)
-        return World(self.field, self.field.near, air, matter, water)
+        return World(self.field, self.appearance, air, matter, water)
 
     def _snow_of(self, snow: Snow) -> BakedSnow | None:
         if self.snow is None or snow.depth is None or snow.depth <= 0:
@@ -73,12 +75,13 @@ def sun_direction(sun: Sun) -> Float[np.ndarray, "3"] | None:
 
 
 def prepare(
-    field: Field,
+    field: RadianceField,
     scene: Scene,
     weather: KeyframedWeather,
     places: Float[np.ndarray, "m 3"],
     times: Float[np.ndarray, "f"],
     progress: Callable[[str, float], None],
+    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Stage:
     """Everything that is done once: light, waves, snowfall.
 
@@ -97,22 +100,23 @@ def prepare(
     _check_levels(scene, moments)
     progress("light", 0.0)
     wants = any(m.flood.level is not None or m.snow.depth is not None for m in moments)
-    irradiance = scene_irradiance(field, field.near, scene) if wants else torch.ones(3)
+    irradiance = scene_irradiance(field, scene, appearance) if wants else torch.ones(3)
     flooded = [m for m in moments if m.flood.level is not None]
     snowy = [m for m in moments if m.snow.depth is not None and m.snow.depth > 0]
     waves = make_waves(flooded[0].flood, flooded[0].seed) if flooded else None
     snow = None
     if snowy:
         snow = bake_snow(
-            field.observed_only(),
+            observed(field),
             snowy[-1].snow,
             places,
             to_numpy(irradiance / math.pi),
             sun_direction(snowy[-1].sun),
             snowy[-1].seed,
             progress=lambda share: progress("snowfall", share),
+            appearance=appearance,
         )
-    return Stage(field, scene, weather, irradiance, snow, waves)
+    return Stage(field, scene, weather, irradiance, snow, waves, appearance)
 
 
 def _check_levels(scene: Scene, moments: list[Weather]) -> None:

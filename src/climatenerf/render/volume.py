@@ -1,19 +1,16 @@
 """The clean view: what cameras see of the field, with nothing added. No gradients."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import MIN_WEIGHT, offsets_of
-from climatenerf.field.hash_field import Field
+from climatenerf.field.protocol import FUSED, RadianceField
 from climatenerf.ops import dispatch
-from climatenerf.weather.world import FieldLike
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
 GPU_RAYS_AT_ONCE = 2**16  # there each launch costs; a wet ray sends five, all traced together
@@ -37,81 +34,74 @@ def rays_at_once(rays: Tensor) -> int:
     return RAYS_AT_ONCE if rays.device.type == "cpu" else GPU_RAYS_AT_ONCE
 
 
-@dataclass(frozen=True)
-class Weighed:
-    """The samples of n rays through the dry scene that weigh enough to be seen."""
-
-    weights: Float[Tensor, "k"]
-    u: Float[Tensor, "k 3"]
-    """Where, in the unit cube."""
-    ray: Int[Tensor, "k"]
-    offsets: Int[Tensor, "n+1"]
-    left: Float[Tensor, "n"]
-    """Transmittance of the rays as a whole."""
-
-
-@torch.no_grad()
-def weighed_samples(
-    field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
-) -> Weighed:
-    """Marches rays (world m) through the dry scene from the nearest distance on."""
-    n = rays_o.shape[0]
-    near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
-    samples = field.march(rays_o, rays_d, near, far, RENDER_STEP)
-    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-    keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
-    ray = samples.ray_index()[keep]
-    u = field.sample_positions(rays_o, rays_d, samples)[keep]
-    return Weighed(weights[keep], u, ray, offsets_of(ray, n), left)
-
-
 @torch.no_grad()
 def composited(
-    field: FieldLike,
+    field: RadianceField,
     rays_o: Float[Tensor, "n 3"],
     rays_d: Float[Tensor, "n 3"],
     t_min: Float[Tensor, "n"],
     step_scale: float = RENDER_STEP,
     stop: float = 1e-3,
-    thin: float | None = None,
+    pruning_threshold: float | None = None,
+    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """What rays see of matter, in the appearance shown; arguments as those of `Field.march`.
+    """March rays through a field and composite its samples, without the sky behind them.
+
+    Args:
+        field: any field.
+        rays_o: origins, m.
+        rays_d: unit directions.
+        t_min: ray length at which each ray begins, m.
+        step_scale: factor on the marching step.
+        stop: transmittance at which a ray ends.
+        pruning_threshold: see `RadianceField.march`.
+        appearance: exposure and light of a photo; None: the mean of all photos.
 
     Returns:
-        Linear radiance, transmittance left, and the weighted sum of the samples' lengths (m).
+        Linear radiance, transmittance, and the weighted sum of the samples' ray lengths (m).
     """
-    if isinstance(field, Field):
-        at_once = field.composited_at_once(rays_o, rays_d, t_min, step_scale, stop, thin)
-        if at_once is not None:
-            return at_once
+    if FUSED in field.capabilities:
+        return field.composite(
+            rays_o, rays_d, t_min, step_scale, stop, pruning_threshold, appearance
+        )
     endless = torch.full_like(t_min, 1e9)
-    samples = field.march(rays_o, rays_d, t_min, endless, step_scale, stop=stop, thin=thin)
+    samples = field.march(
+        rays_o, rays_d, t_min, endless, step_scale, stop=stop, pruning_threshold=pruning_threshold
+    )
     weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
     far = dispatch.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
     keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
     ray = samples.ray_index()[keep]
-    colour = field.colour(rays_o[ray] + samples.t[keep, None] * rays_d[ray], rays_d, ray)
+    x = rays_o[ray] + samples.t[keep, None] * rays_d[ray]
+    ids = None if samples.ids is None else samples.ids[keep]
+    colour = field.colour(x, rays_d, ray, ids=ids, appearance=appearance)
     offsets = offsets_of(ray, t_min.shape[0])
     return dispatch.accumulate(weights[keep], colour, offsets), left, far
 
 
 @torch.no_grad()
 def field_radiance(
-    field: Field, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    field: RadianceField,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Float[Tensor, "n 3"]:
-    """Linear radiance along rays, in the appearance shown."""
+    """Linear radiance along camera rays; `appearance` None: the mean of all photos."""
     out = []
     size = rays_at_once(rays_o)
     for o, d in zip(rays_o.split(size), rays_d.split(size), strict=True):
         near = torch.full((o.shape[0],), field.near)
-        matter, left, _ = composited(field, o, d, near)
-        out.append(matter + left[:, None] * field.sky(d))
+        matter, left, _ = composited(field, o, d, near, appearance=appearance)
+        out.append(matter + left[:, None] * field.sky(d, appearance))
     return torch.cat(out)
 
 
 def render_view(
-    field: Field, camera: Camera, c2w: Float[np.ndarray, "4 4"]
+    field: RadianceField,
+    camera: Camera,
+    c2w: Float[np.ndarray, "4 4"],
+    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """Display picture in [0,1] of the clean scene from one camera (c2w in world metres)."""
-    linear = field_radiance(field, *camera_rays(camera, c2w))
+    linear = field_radiance(field, *camera_rays(camera, c2w), appearance)
     return to_numpy(encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3))

@@ -226,7 +226,6 @@ def evaluate(
     rows = {}
     views = scene.of_split("heldout")
     photos = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
-    before = field.shown
     for index, view in enumerate(views):
         truth = load_image(view, scene, downscale).astype(np.float32) / 255
         usable = load_mask(view, scene, downscale)
@@ -234,8 +233,8 @@ def evaluate(
         if usable.any():
             camera = downscaled_camera(scene.cameras[view.camera], downscale)
             c2w = scene.c2w_world(view)
-            field.shown = nearby_appearance(field, photos, c2w) if nearby else None
-            picture = render_view(field, camera, c2w)
+            appearance = nearby_appearance(field, photos, c2w) if nearby else None
+            picture = render_view(field, camera, c2w, appearance)
             shown, wanted = picture[usable][:, None], truth[usable][:, None]
             rows[view.name] = {
                 "psnr": psnr(shown, wanted),
@@ -243,7 +242,6 @@ def evaluate(
                 "psnr_cc": psnr_cc(shown, wanted),
             }
         evaluated(index + 1, len(views))
-    field.shown = before
     if not rows:
         return {"psnr": None, "ssim": None, "psnr_cc": None, "views": {}}
     means: dict = {"heldout_appearance": "nearby" if nearby else "mean"}

@@ -10,49 +10,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.samples import Samples
+from climatenerf.field.protocol import RadianceField
 from climatenerf.weather.flood.waves import WaveFrame
 from climatenerf.weather.parameters import Flood
 from climatenerf.weather.smog.medium import Medium
-
-
-class FieldLike(Protocol):
-    """What rendering asks of a field. World metres; no gradients."""
-
-    @property
-    def bounds(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Lower and upper corner of the box that holds all density, m."""
-        ...
-
-    def march(
-        self,
-        rays_o: Tensor,
-        rays_d: Tensor,
-        t_min: Tensor,
-        t_max: Tensor,
-        step_scale: float = 1.0,
-        *,
-        stop: float = 1e-3,
-        thin: float | None = None,
-    ) -> Samples:
-        """Samples where matter is, but for those of an optical depth below `thin`.
-
-        A ray ends where so little light is left as `stop`.
-        """
-        ...
-
-    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Extinction, 1/m."""
-        ...
-
-    def colour(
-        self, x: Float[Tensor, "s 3"], d: Float[Tensor, "n 3"], ray: Int[Tensor, "s"] | None = None
-    ) -> Float[Tensor, "s 3"]:
-        """Linear radiance at x along d, or along d[ray]."""
-        ...
-
-    def sky(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear radiance from outside all matter."""
-        ...
 
 
 class Matter(Protocol):
@@ -95,9 +56,9 @@ class Water:
 class World:
     """Everything there is at one moment."""
 
-    field: FieldLike
-    near: float = 0.0
-    """Camera rays begin here, m."""
+    field: RadianceField
+    appearance: Float[Tensor, "1 e"] | None = None
+    """Exposure and light in which the field is rendered; None: the mean of all photos."""
     air: Medium | None = None
     matter: Matter | None = None
     water: Water | None = None

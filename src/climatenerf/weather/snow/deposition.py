@@ -7,7 +7,7 @@ move it by nothing or by little.
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.core.samples import Samples
+from climatenerf.field.protocol import RadianceField
 from climatenerf.weather.parameters import Snow
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid
 from climatenerf.weather.snow.surface_fit import halfway, smooth_ground
@@ -29,25 +29,6 @@ JITTER = 0.05
 _CHUNK = 1 << 14  # rays marched at once
 _STRETCH = 100.0  # spacings; a field's steps may grow along a ray, so rays start anew after this
 _LUMA = (0.2126, 0.7152, 0.0722)  # Rec. 709
-
-
-class SnowField(Protocol):
-    """What the snow asks of a fitted field."""
-
-    @property
-    def bounds(self) -> tuple[Tensor, Tensor]:
-        """Corners of the region that holds anything, m."""
-        ...
-
-    def march(
-        self, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, t_max: Tensor, step_scale: float = 1.0
-    ) -> Samples:
-        """Samples along rays."""
-        ...
-
-    def colour(self, x: Tensor, d: Tensor) -> Tensor:
-        """Linear radiance at points."""
-        ...
 
 
 class Light(NamedTuple):
@@ -86,13 +67,14 @@ def fall_directions(snow: Snow, seed: int) -> Float[np.ndarray, "p 3"]:
 
 
 def find_deposits(
-    field: SnowField,
+    field: RadianceField,
     snow: Snow,
     grid: SnowGrid,
     light: Light,
     cameras: Float[np.ndarray, "m 3"],
     seed: int,
     progress: Callable[[float], None] | None = None,
+    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Deposits:
     """Find where snow lands and how bright it is there.
 
@@ -104,6 +86,7 @@ def find_deposits(
         cameras: camera positions, m: the field is asked for colours as seen from the nearest.
         seed: of the fall direction's spread and the rays' offsets.
         progress: called with the share that is done, 0 to 1.
+        appearance: exposure and light of the field's colours; None: the mean of all photos.
 
     Returns:
         The deposits; none where nothing catches snow.
@@ -127,7 +110,7 @@ def find_deposits(
             done += 1
             shade = np.full(len(hits), np.nan, np.float32)
             if p == 0:
-                shade = _shade(field, snow, hits, grid.spacing_of(k), light, cameras)
+                shade = _shade(field, snow, hits, grid.spacing_of(k), light, cameras, appearance)
             positions.append(hits)
             weights.append(weight)
             shades.append(shade)
@@ -143,7 +126,7 @@ def find_deposits(
 
 
 def _land(
-    field: SnowField,
+    field: RadianceField,
     snow: Snow,
     grid: SnowGrid,
     cascade: int,
@@ -209,7 +192,7 @@ def _outside(
 
 
 def _first_hits(
-    field: SnowField,
+    field: RadianceField,
     rays_o: Float[np.ndarray, "n 3"],
     direction: Float[np.ndarray, "3"],
     length: float,
@@ -244,12 +227,13 @@ def _first_hits(
 
 
 def _shade(
-    field: SnowField,
+    field: RadianceField,
     snow: Snow,
     hits: Float32[np.ndarray, "n 3"],
     spacing: float,
     light: Light,
     cameras: Float[np.ndarray, "m 3"],
+    appearance: Float[Tensor, "1 e"] | None,
 ) -> Float32[np.ndarray, "n"]:
     """Brightness (g + c0)/(1 + c0) (beta_s V_s + V_s0) of snow on the hits, 0 to 1."""
     if not len(hits):
@@ -267,7 +251,7 @@ def _shade(
         away = points - nearest
         # A camera inside the ground's fuzz would give a direction of length 0.
         d = away / away.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        grey = (field.colour(points, d) @ luma / white).clamp(0, 1)
+        grey = (field.colour(points, d, appearance=appearance) @ luma / white).clamp(0, 1)
         shade = (grey + snow.albedo_offset) / (1 + snow.albedo_offset)
         visible = torch.ones(len(points))
         if sun is not None and sun[2] > 0:

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import Samples
+from climatenerf.field.protocol import RadianceField
 from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu.metaballs import THRESHOLD, Lattice
 from climatenerf.weather.parameters import Snow
-from climatenerf.weather.snow.deposition import Light, SnowField, find_deposits
+from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid, choose_grid, grow
 
 
@@ -133,7 +134,7 @@ class BakedSnow:
 
 
 def bake_snow(
-    field: SnowField,
+    field: RadianceField,
     snow: Snow,
     cameras: Float[np.ndarray, "m 3"],
     irradiance_over_pi: Float[np.ndarray, "3"],
@@ -141,6 +142,7 @@ def bake_snow(
     seed: int = 0,
     grid: SnowGrid | None = None,
     progress: Callable[[float], None] | None = None,
+    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> BakedSnow | None:
     """Let snow fall on a scene. World frame: metres, z up.
 
@@ -153,6 +155,7 @@ def bake_snow(
         seed: of the fall direction's spread.
         grid: where snow is simulated and how finely; None: chosen from bounds and cameras.
         progress: called with the share that is done, 0 to 1.
+        appearance: exposure and light of the field's colours; None: the mean of all photos.
 
     Returns:
         The snow; None where the depth asks for none.
@@ -165,7 +168,7 @@ def bake_snow(
         lower, upper = (to_numpy(b).astype(np.float64) for b in field.bounds)
         grid = choose_grid(lower, upper, cameras)
     with torch.no_grad():
-        deposits = find_deposits(field, snow, grid, light, cameras, seed, progress)
+        deposits = find_deposits(field, snow, grid, light, cameras, seed, progress, appearance)
     return BakedSnow(grow(deposits, snow.depth), deposits, snow, light)
 
 
