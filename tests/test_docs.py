@@ -6,12 +6,14 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 import climatenerf
+from climatenerf.training.settings import Losses
 from climatenerf.weather.description import read_weather
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -119,3 +121,12 @@ def test_code_in_pages_exists(page):
         if not files or not all(re.search(rf"\b{word}\b", known) for word in name.split(".")):
             wrong.append(f"{path}:{name}")
     assert not wrong, f"{name_of(page)} names {wrong}"
+
+
+def test_losses_in_pages_exist():
+    names = {each.name for each in fields(Losses)}
+    for page in PAGES:
+        used = set(re.findall(r"--loss (\w+)=\d", page.read_text()))
+        assert used <= names, f"{name_of(page)}: {used - names}"
+    described = re.findall(r"\(`(\w+)`\)", (ROOT / "docs" / "physics.md").read_text())
+    assert names <= set(described), names - set(described)
