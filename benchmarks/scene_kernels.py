@@ -21,7 +21,7 @@ from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu import plane_sweep as matching
 from climatenerf.scene import read_scene
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.multiview_stereo import distances, pictures_of
+from climatenerf.training.evidence.multiview_stereo import build_pictures, depth_ranges
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid, grow
@@ -66,7 +66,7 @@ def snow_sums(random: np.random.Generator, points: int) -> Job:
 
 def windows(random: np.random.Generator, pixels: TrainingPixels, points, count: int) -> Job:
     """Windows of photos, each at all distances at which the kernel looks."""
-    pictures = pictures_of(pixels, *distances(pixels, points, (1.0, 5.0)))
+    pictures = build_pictures(pixels, *depth_ranges(pixels, points, (1.0, 5.0)))
     view = random.integers(0, len(pictures.size), count)
     place = (random.uniform(0.05, 0.95, (count, 2)) * pictures.size[view]).astype(np.float32)
     looked = 0
@@ -85,12 +85,12 @@ def windows(random: np.random.Generator, pixels: TrainingPixels, points, count: 
 
 def places(random: np.random.Generator, pixels: TrainingPixels, count: int) -> Job:
     """Places about the cameras of which every photo is asked."""
-    witness = pixels.witness
+    witness = pixels.sky_hull
     assert witness is not None, "the reference street has labels"
     x = torch.from_numpy(random.normal(0, 8, (count, 3)).astype(np.float32))
     radius = torch.full((count,), 0.1)
     asked = count * len(witness.views[-1])
-    return Job(lambda: witness.agreed(x, radius), "places seen", asked, 0.5, 13)
+    return Job(lambda: witness.consensus(x, radius), "places seen", asked, 0.5, 13)
 
 
 def main() -> None:

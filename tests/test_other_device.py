@@ -23,9 +23,9 @@ from climatenerf.render.frame import render_frame
 from climatenerf.render.session import prepare
 from climatenerf.scene import load_image
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.free_space import Carving
-from climatenerf.training.evidence.multiview_stereo import match_photos
-from climatenerf.training.evidence.sparse_depth import find_point_rays
+from climatenerf.training.evidence.free_space import FreeSpace
+from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
+from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 from climatenerf.training.trainer import Fitting
@@ -123,7 +123,7 @@ def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
             refine_poses=True,
         )
         extent = find_extent(poses, None)
-        fitting = Fitting(pixels, len(train), extent, settings, find_point_rays(scene))
+        fitting = Fitting(pixels, len(train), extent, settings, read_sparse_depth(scene))
         assert fitting.knows_sky and fitting.carving.ground is not None
         fitting.run(nothing)
         assert fitting.field.embeddings.device == TOY and fitting.poses.shift.device == TOY
@@ -135,12 +135,12 @@ def test_photos_are_matched_alike_on_both():
     for device in (contextlib.nullcontext(), on_toy()):
         with device:
             pixels = photos(BENT, lambda i, t, x: grey(x))
-            matched = match_photos(pixels, None, (1.5, 4.0), 0)
+            matched = plane_sweep_depth(pixels, None, (1.5, 4.0), 0)
             assert matched is not None
             field = Field(TINY, 5, np.array([0.0, 3.0, 0.0]), 3.0, 0.1)
-            carving = Carving(field, pixels, matched, FitSettings())
+            carving = FreeSpace(field, pixels, matched, FitSettings())
             place = matched.rays_o + 0.3 * matched.depth[:, None] * matched.rays_d
-            before = carving.in_the_way(place, torch.full_like(matched.depth, 0.01))
+            before = carving.too_near_camera(place, torch.full_like(matched.depth, 0.01))
             found.append(to_numpy(matched.depth))
             empty.append(to_numpy(before))
     assert len(found[0]) > 300 and np.array_equal(*found)

@@ -8,7 +8,7 @@ from climatenerf.field.normalisation import find_extent
 from climatenerf.render.frame import render_frame
 from climatenerf.scene import load_image
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.sparse_depth import find_point_rays
+from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.trainer import Fitting
@@ -62,6 +62,6 @@ def with_labels(scene, relabel, **settings):
     extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
     chosen = FitSettings(preset="tiny", minutes=None, steps=1000, **settings)
     pixels = labelled_pixels(known, [relabel(each) for each in labels])
-    fitting = Fitting(pixels, len(views), extent, chosen, find_point_rays(known))
+    fitting = Fitting(pixels, len(views), extent, chosen, read_sparse_depth(known))
     fitting.reached = 0.5
     return fitting

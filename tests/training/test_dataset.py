@@ -95,8 +95,8 @@ def test_what_a_mask_hides_says_nothing_of_what_is_empty():
     x, radius = torch.tensor([[2.5, -1.0, 40.0]]), torch.tensor([0.01])
     for given, carved in ((None, True), (masks, False)):
         pixels = TrainingPixels(CAMERAS, [0] * 6, poses, images, labels, given)
-        assert pixels.witness is not None and pixels.label is not None
-        assert bool(pixels.witness.agreed(x, radius)) == carved
+        assert pixels.sky_hull is not None and pixels.label is not None
+        assert bool(pixels.sky_hull.consensus(x, radius)) == carved
         assert (pixels.label == UNKNOWN).any() == (not carved)
 
 

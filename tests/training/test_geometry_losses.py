@@ -153,7 +153,7 @@ def test_labels_that_know_nothing_are_none():
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
     image, label = np.zeros((14, 20, 3), np.uint8), np.full((14, 20), 255, np.uint8)
     pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image], [label])
-    assert pixels.label is None and pixels.witness is None and not pixels.knows_sky
+    assert pixels.label is None and pixels.sky_hull is None and not pixels.knows_sky
 
 
 def test_without_sky_what_was_labelled_so_is_unknown():
@@ -166,5 +166,5 @@ def test_without_sky_what_was_labelled_so_is_unknown():
     pixels = TrainingPixels([camera], [0], up[None], images, [label])
     assert pixels.knows_sky and pixels.edge.numel()
     other = pixels.without_sky()
-    assert not other.knows_sky and not other.edge.numel() and other.witness is None
+    assert not other.knows_sky and not other.edge.numel() and other.sky_hull is None
     assert other.label is not None and (other.label != 255).any() and pixels.knows_sky

@@ -22,8 +22,8 @@ from climatenerf.scene import load_scene
 from climatenerf.scene.scene import with_split
 from climatenerf.training import run as run_module
 from climatenerf.training.evidence import free_space as carving_module
-from climatenerf.training.evidence.sparse_depth import PointRays
-from climatenerf.training.evidence.visual_hull import Witness
+from climatenerf.training.evidence.sparse_depth import SparseDepth
+from climatenerf.training.evidence.visual_hull import VisualHull
 from climatenerf.training.folder import check_config
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
@@ -223,7 +223,7 @@ def begin(scene, **settings):
     chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
     extent = run_module.find_extent(poses, None)
     pixels, settings = load_pixels(scene, 1), FitSettings(**chosen)
-    points = run_module.shown_points(scene, pixels)
+    points = run_module.unmasked_sparse_depth(scene, pixels)
     return run_module.Fitting(pixels, len(views), extent, settings, points)
 
 
@@ -276,7 +276,7 @@ def labelled(fitting):
     pixels.label = torch.where(grey > 128, SKY, others).to(torch.uint8)
     sizes = (pixels.pixel_start[1:] - pixels.pixel_start[:-1]).tolist()
     maps = [part.view(36, 48).numpy() for part in pixels.label.split(sizes)]
-    pixels.witness = Witness([CAMERA] * len(maps), pixels.c2w.numpy(), maps, [SKY], 0.1)
+    pixels.sky_hull = VisualHull([CAMERA] * len(maps), pixels.c2w.numpy(), maps, [SKY], 0.1)
     return run_module.Fitting(pixels, len(maps), fitting.extent, fitting.settings)
 
 
@@ -395,16 +395,16 @@ def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
     fitting = begin(scene, steps=4)
     fitting.field.occupancy.refine()
-    fitting.carving.bar(everywhere=False)
+    fitting.carving.force_empty(everywhere=False)
     assert (
-        fitting.carving.held.shape == fitting.field.occupancy.occupied.shape
-        and fitting.carving.held.any()
+        fitting.carving.protected.shape == fitting.field.occupancy.occupied.shape
+        and fitting.carving.protected.any()
     )
     fitted(scene, tmp_path / "run", steps=2)  # its other files
     checkpoint(fitting, tmp_path / "run")
     again = begin(scene, steps=4)
     restore(again, tmp_path / "run")
-    assert torch.equal(again.carving.held, fitting.carving.held)
+    assert torch.equal(again.carving.protected, fitting.carving.protected)
     assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
 
 
@@ -415,7 +415,7 @@ def test_a_resumed_fit_draws_the_ground_in_the_units_of_the_run(scene, tmp_path,
     views = [dataclasses.replace(view, seen=np.arange(200)) for view in scene.views]
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
     every = torch.ones(1, dtype=torch.bool)
-    monkeypatch.setattr(carving_module, "on_the_ground", lambda label: every.expand(label.shape))
+    monkeypatch.setattr(carving_module, "is_ground", lambda label: every.expand(label.shape))
     first = begin(scene, steps=4)
     fitted(scene, tmp_path / "run", steps=2)
     checkpoint(first, tmp_path / "run")
@@ -582,9 +582,9 @@ def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
     """Matched points reach the fit; without the loss, or by the settings, none are looked for."""
     scene, asked = make_scene(tmp_path / "toy"), []
 
-    def match_photos(pixels, points, typical, seed):
+    def plane_sweep_depth(pixels, points, typical, seed):
         asked.append(seed)
-        return PointRays(
+        return SparseDepth(
             torch.zeros(9, 3), torch.eye(3).repeat(3, 1), torch.ones(9), torch.zeros(9).long()
         )
 
@@ -596,7 +596,7 @@ def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
         measured.append(len(fitting.measured))
         return fitting
 
-    monkeypatch.setattr(run_module, "match_photos", match_photos)
+    monkeypatch.setattr(run_module, "plane_sweep_depth", plane_sweep_depth)
     monkeypatch.setattr(run_module, "Fitting", begin)
     for index, chosen in enumerate(
         ({}, {"multiview_stereo": False}, {"losses": Losses(sparse_depth=0.0)})

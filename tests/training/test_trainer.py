@@ -19,7 +19,7 @@ from climatenerf.render.volume import camera_rays, render_view
 from climatenerf.scene import load_image
 from climatenerf.training import losses
 from climatenerf.training import trainer as fit
-from climatenerf.training.evidence.sparse_depth import find_point_rays
+from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings, Losses
 from climatenerf.training.trainer import Fitting
@@ -143,7 +143,7 @@ def test_space_outside_every_picture_stays_empty(scene):
         assert occupancy.occupied.view(-1)[cells][0] == 0
         if not again:
             occupancy.refine()
-            fitting.carving.bar(everywhere=False)
+            fitting.carving.force_empty(everywhere=False)
 
 
 def test_a_fit_that_stops_early_does_not_claim_normals(scene):
@@ -264,10 +264,10 @@ def test_points_put_matter_where_they_are(scene):
     off = {}
     for name, given in (("with", known), ("without", scene)):
         fitting = begin(scene, steps=150)
-        found = find_point_rays(given)
+        found = read_sparse_depth(given)
         fitting.measured = [] if found is None else [found]
         fitting.run(lambda _: None)
-        rays = find_point_rays(known)
+        rays = read_sparse_depth(known)
         assert rays is not None
         near = torch.full_like(rays.depth, fitting.field.near)
         samples = fitting.field.march(rays.rays_o, rays.rays_d, near, 2 * rays.depth)
@@ -328,7 +328,7 @@ def test_exposures_do_not_become_floaters(tmp_path):
         extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
         chosen = FitSettings("tiny", None, 300, samples_per_step=2**15, **settings)
         pixels = labelled_pixels(scene, labels)
-        return Fitting(pixels, len(views), extent, chosen, find_point_rays(scene))
+        return Fitting(pixels, len(views), extent, chosen, read_sparse_depth(scene))
 
     plain = start()
     gains = 1.5 ** np.random.default_rng(0).uniform(-1, 1, len(labels))
@@ -363,7 +363,7 @@ def test_someone_in_one_photo_leaves_the_scene(tmp_path):
     extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
     settings = FitSettings("tiny", None, 500, samples_per_step=2**15)
     pixels = labelled_pixels(scene, labels)
-    fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(scene))
+    fitting = Fitting(pixels, len(views), extent, settings, read_sparse_depth(scene))
     fitting.run(lambda _: None)
     x, y = (np.arange(48) + 0.5) / 48, (np.arange(36) + 0.5) / 36
     place = torch.tensor(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).float()

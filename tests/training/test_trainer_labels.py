@@ -14,8 +14,8 @@ from climatenerf.field.normalisation import find_extent
 from climatenerf.ops import dispatch
 from climatenerf.training import losses
 from climatenerf.training import trainer as fit
-from climatenerf.training.evidence.free_space import Carving
-from climatenerf.training.evidence.sparse_depth import PointRays, find_point_rays
+from climatenerf.training.evidence.free_space import FreeSpace
+from climatenerf.training.evidence.sparse_depth import SparseDepth, read_sparse_depth
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import PAPER, FitSettings, Losses
 from climatenerf.training.trainer import Fitting
@@ -89,16 +89,16 @@ def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
 
     assert asked() == [0, 1, 2]
 
-    class Witness:
-        def agreed(self, x, radius):
+    class VisualHull:
+        def consensus(self, x, radius):
             far = (x - batch.rays_o[0]).norm(dim=-1)
             return far > 1.5  # the nearest is seen as matter elsewhere
 
-    fitting.pixels.witness = Witness()
+    fitting.pixels.sky_hull = VisualHull()
     assert asked() == [1, 2]
     x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
     cell, _ = fitting.field._cells(fitting.field.to_grid(x[None]))
-    fitting.carving.held.view(-1)[cell] = True  # a sparse point lies by the last
+    fitting.carving.protected.view(-1)[cell] = True  # a sparse point lies by the last
     assert asked() == [1]
 
 
@@ -153,7 +153,7 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
     def everywhere(carving):
         return torch.full_like(carving.field.occupancy.occupied, spared, dtype=torch.bool)
 
-    monkeypatch.setattr(Carving, "shown_to_stand", everywhere)
+    monkeypatch.setattr(FreeSpace, "find_obstacles", everywhere)
     known, labels = labelled(scene)
     pixels = labelled_pixels(known, labels)
     views = known.of_split("train")
@@ -167,7 +167,7 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
             samples_per_step=2**15,
             losses=Losses(sparse_depth=0.0, ground_height=weight),
         )
-        fitting = Fitting(pixels, len(views), extent, settings, find_point_rays(known))
+        fitting = Fitting(pixels, len(views), extent, settings, read_sparse_depth(known))
         fitting.run(lambda _: None)
         batch = pixels.draw(3000, torch.Generator().manual_seed(1))
         d, o = batch.rays_d[batch.label == 3], batch.rays_o[batch.label == 3]
@@ -187,10 +187,10 @@ def test_what_is_matched_on_the_ground_is_left_to_its_map(scene):
     extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
     settings = FitSettings(preset="tiny", minutes=None, steps=10)
     batch = pixels.draw(2000, torch.Generator().manual_seed(0))
-    matched = PointRays(batch.rays_o, batch.rays_d, torch.full((2000,), 3.0), batch.image)
+    matched = SparseDepth(batch.rays_o, batch.rays_d, torch.full((2000,), 3.0), batch.image)
     lies = int((batch.label == 3).sum())
     assert 200 < lies < 1800
-    points = find_point_rays(known)
+    points = read_sparse_depth(known)
     fitting = Fitting(pixels, len(views), extent, settings, points, matched)
     assert fitting.carving.ground is not None
     assert fitting.measured[0] is points
@@ -287,7 +287,7 @@ def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
     assert full.field.occupancy.barred.any() and full.knows_sky
     assert not with_labels(scene, np.asarray, free_space=False).field.occupancy.barred.any()
     bare = with_labels(scene, np.asarray, sky_labels=False)
-    assert not bare.knows_sky and bare.pixels.witness is None
+    assert not bare.knows_sky and bare.pixels.sky_hull is None
     assert not (bare.pixels.label == SKY).any() and (full.pixels.label == SKY).any()
     factors = []
     monkeypatch.setattr(fit, "scale_gradient", lambda x, factor: factors.append(factor) or x)

@@ -15,8 +15,8 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
 from climatenerf.core.device import integers, to_device, to_numpy, upload
 from climatenerf.core.errors import UserError
-from climatenerf.training.evidence.frusta import pyramids
-from climatenerf.training.evidence.visual_hull import Witness
+from climatenerf.training.evidence.frusta import frustum_planes
+from climatenerf.training.evidence.visual_hull import VisualHull
 from climatenerf.training.pixel_directions import Directions
 
 SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
@@ -85,7 +85,7 @@ class TrainingPixels:
         self.cameras = [cameras[i] for i in camera_of]
         self.directions = Directions(cameras)
         self.camera = torch.as_tensor(list(camera_of))
-        self.pyramids = pyramids(self.cameras, c2w)
+        self.frusta = frustum_planes(self.cameras, c2w)
         self.width = torch.tensor([camera.width for camera in self.cameras])
         self.height = torch.tensor([camera.height for camera in self.cameras])
         counts = self.width * self.height
@@ -102,7 +102,7 @@ class TrainingPixels:
             self.usable, self.drawable = to_device(flat), torch.from_numpy(flat)
             self.share = int(flat.sum()) / flat.size
         self.label = None
-        self.witness = None
+        self.sky_hull = None
         self.edge = torch.zeros(0, dtype=torch.long)
         known = (None if label is None else MERGED[label] for label in labels or ())
         flat, merged = in_one_row(shapes, known, np.uint8, UNKNOWN)
@@ -121,13 +121,13 @@ class TrainingPixels:
             at = [np.flatnonzero(sky_edge(each)) for each in merged]
             starts = to_numpy(self.pixel_start)[:-1]
             self.edge = to_device(np.concatenate([e + s for e, s in zip(at, starts, strict=True)]))
-            self.witness = Witness(self.cameras, c2w, merged, [SKY], SKY_SHARE)
-        self.ground_witness = self.standing_witness = None
+            self.sky_hull = VisualHull(self.cameras, c2w, merged, [SKY], SKY_SHARE)
+        self.ground_hull = self.obstacle_hull = None
         if self.label is not None and bool(
             torch.isin(self.label, torch.tensor(GROUND, dtype=torch.uint8)).any()
         ):
-            self.ground_witness = Witness(self.cameras, c2w, merged, GROUND, GROUND_SHARE)
-            self.standing_witness = Witness(self.cameras, c2w, merged, STANDING, STANDING_SHARE)
+            self.ground_hull = VisualHull(self.cameras, c2w, merged, GROUND, GROUND_SHARE)
+            self.obstacle_hull = VisualHull(self.cameras, c2w, merged, STANDING, STANDING_SHARE)
         scaled = (None if depth is None else in_units(depth) for depth in relative or ())
         flat, _ = in_one_row(shapes, scaled, np.float16, np.nan)
         self.relative = to_device(flat) if flat.size else None
@@ -135,7 +135,7 @@ class TrainingPixels:
     def without_sky(self) -> "TrainingPixels":
         """The same pixels, with what is labelled sky unknown."""
         other = copy.copy(self)
-        other.witness, other.edge = None, self.edge[:0]
+        other.sky_hull, other.edge = None, self.edge[:0]
         if self.label is not None:
             other.label = torch.where(self.label == SKY, UNKNOWN, self.label).to(torch.uint8)
         return other

@@ -36,8 +36,8 @@ from climatenerf.scene.images import (
 )
 from climatenerf.scene.scene import Scene, load_scene, save_scene
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.multiview_stereo import match_photos
-from climatenerf.training.evidence.sparse_depth import shown_points
+from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
+from climatenerf.training.evidence.sparse_depth import unmasked_sparse_depth
 from climatenerf.training.folder import (
     OPTIMISER,
     SCHEMA_VERSION,
@@ -176,11 +176,11 @@ def begin(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
     check_moves(poses, scene.scale)
     pixels = load_pixels(scene, downscale)
     extent = find_extent(poses, scene.points_world())
-    points = shown_points(scene, pixels)
+    points = unmasked_sparse_depth(scene, pixels)
     matched = None
     if settings.multiview_stereo and settings.losses.sparse_depth:
         known = pixels if settings.sky_labels else pixels.without_sky()
-        matched = match_photos(known, points, (extent.near, extent.unit), settings.seed)
+        matched = plane_sweep_depth(known, points, (extent.near, extent.unit), settings.seed)
     return Fitting(pixels, len(poses), extent, settings, points, matched)
 
 
@@ -375,8 +375,8 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
     barred = fitting.field.occupancy.barred
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
     barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
-    fitting.carving.find_ground()  # in the units of the run
-    fitting.carving.find_cells_of_points()
+    fitting.carving.fit_ground()  # in the units of the run
+    fitting.carving.rasterise_points()
     fitting.generator.set_state(state["generator"])
     fitting.steps, fitting.samples, fitting.rays = state["counters"].tolist()
     floats = state["floats"].tolist()

@@ -26,10 +26,10 @@ from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.ops import dispatch, reference
 from climatenerf.training import losses
 from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels
-from climatenerf.training.evidence.free_space import Carving, on_the_ground
-from climatenerf.training.evidence.monocular_depth import RelativeDepth
-from climatenerf.training.evidence.sky_prior import fill_sky
-from climatenerf.training.evidence.sparse_depth import PointRays, joined
+from climatenerf.training.evidence.free_space import FreeSpace, is_ground
+from climatenerf.training.evidence.monocular_depth import DepthAlignment
+from climatenerf.training.evidence.sky_prior import fit_sky_prior
+from climatenerf.training.evidence.sparse_depth import SparseDepth, concatenate
 from climatenerf.training.gradients import scale_gradient
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.poses import RATE as POSE_RATE
@@ -70,8 +70,8 @@ class Fitting:
         images: int,
         extent: Extent,
         settings: FitSettings,
-        points: PointRays | None = None,
-        matched: PointRays | None = None,
+        points: SparseDepth | None = None,
+        matched: SparseDepth | None = None,
         size: FieldSize | None = None,
     ):
         """Begins with an untrained field (its size: the preset's); some of `matched` are wrong."""
@@ -87,7 +87,7 @@ class Fitting:
         size = size or PRESETS[settings.preset]
         self.field = Field(size, images, np.array(extent.centre), extent.unit, extent.near, initial)
         self.masks, self.poses = TransientMasks(images, initial), PoseCorrections(images)
-        self.relative = RelativeDepth(images)
+        self.relative = DepthAlignment(images)
         self.rooms = Rooms(torch.get_default_device().type == "cuda")
         self.generator = torch.Generator().manual_seed(settings.seed)
         if not settings.sky_labels:
@@ -95,19 +95,19 @@ class Fitting:
         self.knows_sky = pixels.knows_sky
         sky_shares = (1.0, 1.0) if self.knows_sky else SKY_SHARES
         view_shares = VIEW_SHARES if settings.warm_up else (1.0, 1.0)
-        self.fill = fill_sky(pixels, self.generator)
-        self.carving = Carving(self.field, pixels, points, settings)
+        self.fill = fit_sky_prior(pixels, self.generator)
+        self.carving = FreeSpace(self.field, pixels, points, settings)
         if matched is not None and self.carving.ground is not None:
             # A map is better than what is matched on ground: windows mix fences with lawns behind.
             label = pixels.label_towards(matched.image, matched.rays_d)
-            matched = matched.some(~on_the_ground(label))
+            matched = matched.select(~is_ground(label))
         self.measured = [each for each in (points, matched) if each is not None]
         kinds = pixels.kinds()
         self.still = still_cells(pixels, self.measured, images)
         self.solid_of = to_device(SOLID_OF.astype(np.int64))
         kinds = kinds[self.solid_of[kinds.long()] != UNKNOWN]
         # A head that has met one class alone, or nothing but ground, would say so of everything.
-        classed = kinds.numel() > 1 and not bool(on_the_ground(kinds).all())
+        classed = kinds.numel() > 1 and not bool(is_ground(kinds).all())
         self.learns_classes = settings.losses.classes > 0 and classed
         # Normals are learned later.
         self.field.learned[:] = torch.tensor([False, self.learns_classes])
@@ -256,7 +256,7 @@ class Fitting:
         if settings.losses.sparse_depth and self.measured:
             some = max(n // POINT_SHARE, 16)
             drawn = [each.draw(some, self.generator) for each in self.measured]
-            loss_of_depth, more = self.depth_loss(joined(drawn))
+            loss_of_depth, more = self.depth_loss(concatenate(drawn))
             weight = len(drawn) * settings.losses.sparse_depth  # of each kind as if it were alone
             loss, used = loss + weight * loss_of_depth, used + more
 
@@ -369,14 +369,14 @@ class Fitting:
         """
         ray = samples.ray_index()
         heavy = weights.detach() > GROUND_WEIGHT
-        some = self.rooms.chosen("ground", on_the_ground(batch.label)[ray] & heavy)
+        some = self.rooms.chosen("ground", is_ground(batch.label)[ray] & heavy)
         own = ray[some]
         d = batch.rays_d.detach()[own]
         q = self.field.to_grid(batch.rays_o.detach()[own] + samples.t[some, None] * d)
         # Later the field has learned what is ground, so lumps by what stands are pulled as well,
         # and all harder: less goes with them.
         classed = self.stage > self.classed_at and self.learns_classes
-        far, goal, pulled = self.carving.far_from_ground(q, d, t[some], self.rooms, classed)
+        far, goal, pulled = self.carving.ground_offsets(q, d, t[some], self.rooms, classed)
         some, pull = some[far], SURE_PULL if classed else 1.0
         own = weights[some] * pulled
         return pull * losses.ground_height_loss(own, t[some], goal, batch.rays_o.shape[0])
@@ -389,7 +389,7 @@ class Fitting:
         asked = self.rooms.chosen("sky", (batch.label == SKY)[ray] & (weights > MIN_WEIGHT))
         own = ray[asked]
         x = batch.rays_o.detach()[own] + samples.t[asked, None] * batch.rays_d.detach()[own]
-        return asked, self.carving.shows_sky(x)
+        return asked, self.carving.in_sky_hull(x)
 
     def surface_loss(
         self,
@@ -456,7 +456,7 @@ class Fitting:
         self.rooms.took(name, samples.offsets[-1])
         return samples
 
-    def depth_loss(self, measured: PointRays) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
+    def depth_loss(self, measured: SparseDepth) -> tuple[Float[Tensor, ""], Int[Tensor, ""]]:
         """`losses.sparse_depth_loss` of rays to sparse points; and the samples used."""
         field = self.field
         if self.settings.refine_poses:
@@ -538,7 +538,7 @@ class Fitting:
         late = self.stage > REFINE_AT and self.steps > 128
         if late and occupancy.side < self.field.size.occupancy_side:
             occupancy.refine()
-            self.carving.bar(everywhere=False)
+            self.carving.force_empty(everywhere=False)
 
     def adapt(self, rays: int, samples: int) -> None:
         """Keeps the samples per step at their budget, and makes marching finer with time.

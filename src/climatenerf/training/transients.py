@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from climatenerf.core.classes import PERSON, VEHICLE
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.sparse_depth import PointRays
+from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.losses import FAINT
 
 CELLS = (6, 12, 24, 48)  # along each side of an image, of the mask's levels
@@ -111,7 +111,7 @@ def can_move(label: UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
 
 
 def still_cells(
-    pixels: TrainingPixels, measured: Sequence[PointRays], images: int
+    pixels: TrainingPixels, measured: Sequence[SparseDepth], images: int
 ) -> Bool[Tensor, "images cells cells"]:
     """Where in each image points lie on what its label says can move.
 

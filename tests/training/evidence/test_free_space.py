@@ -10,8 +10,8 @@ from climatenerf.field.hash_field import Field
 from climatenerf.ops.reference import contract
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence import ground_height as ground_map
-from climatenerf.training.evidence.free_space import Carving
-from climatenerf.training.evidence.sparse_depth import PointRays
+from climatenerf.training.evidence.free_space import FreeSpace
+from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.static_shapes import Rooms
 
@@ -51,7 +51,7 @@ def points(c2w, n=300):
                 rows.append((pose[:3, 3], d, np.linalg.norm(x - pose[:3, 3]), index))
                 break
     eye, d, depth, image = zip(*rows, strict=True)
-    return PointRays(
+    return SparseDepth(
         torch.from_numpy(np.array(eye, np.float32)),
         torch.from_numpy(np.array(d, np.float32)),
         torch.from_numpy(np.array(depth, np.float32)),
@@ -66,7 +66,7 @@ def carving(change=None, **settings):
     images = [np.zeros((60, 80, 3), np.uint8)] * 12
     pixels = TrainingPixels([CAMERA], [0] * 12, c2w, images, maps)
     field = Field(TINY, 12, np.array([0.0, 0.0, 0.5]), 3.0, 0.1)
-    return Carving(field, pixels, points(c2w), FitSettings(**settings))
+    return FreeSpace(field, pixels, points(c2w), FitSettings(**settings))
 
 
 def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tower():
@@ -110,7 +110,7 @@ def test_matter_with_points_is_kept_though_every_view_takes_it_for_sky():
     beside, _ = field._cells(on_tower - torch.tensor([0.9 * side, 0.0, 0.0]))
     assert not barred[beside].any(), "and beside them"
     found.points = None
-    found.bar()
+    found.force_empty()
     assert barred[cells].float().mean() > 0.2, "without points the word would empty it"
 
 
@@ -120,7 +120,7 @@ def test_what_is_much_nearer_to_a_camera_than_its_points_is_empty():
     assert found.points is not None
     middle, size = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
     x, radius = middle * field.unit + field.centre, size * field.unit * 3**0.5 / 2
-    before = found.in_the_way(x, radius)
+    before = found.too_near_camera(x, radius)
     away = torch.stack([(x - eye).norm(dim=-1) for eye in found.pixels.c2w[:, :3, 3]])
     nearest = [found.points.depth[found.points.image == i] for i in range(12)]
     told = torch.tensor([len(each) >= 20 for each in nearest])
@@ -132,12 +132,12 @@ def test_what_is_much_nearer_to_a_camera_than_its_points_is_empty():
     apart = torch.cdist(x[before][spared], found.points.ends).amin(-1)
     assert spared.float().mean() < 0.5 and (apart < 3 * size.min() * field.unit).all(), "by points"
     one = int(told.nonzero()[0, 0])
-    found.points = found.points.some(torch.isin(found.points.image, torch.tensor([one])))
-    assert away[one][found.in_the_way(x, radius)].max() < float(nearest[one].min()) + 1e-3
-    found.points = found.points.some(torch.arange(19))
-    assert not found.in_the_way(x, radius).any(), "too few points say nothing"
+    found.points = found.points.select(torch.isin(found.points.image, torch.tensor([one])))
+    assert away[one][found.too_near_camera(x, radius)].max() < float(nearest[one].min()) + 1e-3
+    found.points = found.points.select(torch.arange(19))
+    assert not found.too_near_camera(x, radius).any(), "too few points say nothing"
     found.points = None
-    assert not found.in_the_way(x, radius).any()
+    assert not found.too_near_camera(x, radius).any()
 
 
 def test_smooth_ground_right_before_a_camera_is_spared():
@@ -149,11 +149,11 @@ def test_smooth_ground_right_before_a_camera_is_spared():
     )
     x, radius = middle * found.field.unit + found.field.centre, size * found.field.unit * 3**0.5 / 2
     some = found.points
-    found.points = PointRays(some.rays_o, some.rays_d, some.depth + 4.0, some.image)
-    known = found.ground.over(middle)[1]
+    found.points = SparseDepth(some.rays_o, some.rays_d, some.depth + 4.0, some.image)
+    known = found.ground.height_above(middle)[1]
     low = known & (x[:, 2].abs() < radius)
-    kept, found.ground = found.in_the_way(x, radius), None
-    without = found.in_the_way(x, radius)
+    kept, found.ground = found.too_near_camera(x, radius), None
+    without = found.too_near_camera(x, radius)
     assert (without & low).sum() > 20 and not (kept & low).any()
     assert (kept & known).any() and torch.equal(kept & ~known, without & ~known)
 
@@ -162,7 +162,7 @@ def test_what_is_below_a_crest_nearby_is_not_taken_to_be_in_the_open():
     """A ditch 0.3 units deep: what is in it is hidden from most, though they see its far bank."""
     xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 7
     z = torch.where(xy[:, 0].abs() < 0.5, -0.3, 0.0)
-    ground = ground_map.draw_ground(torch.cat([xy, z[:, None]], -1))
+    ground = ground_map.fit_ground_height(torch.cat([xy, z[:, None]], -1))
     assert ground is not None
     q = torch.tensor([[0.0, 0.0, -0.15], [0.0, 0.0, 0.9], [2.5, 0.0, 0.9]])
     assert ground.clears(q, torch.full((3,), 0.02)).tolist() == [False, True, True]
@@ -173,17 +173,17 @@ def test_where_no_point_lies_nothing_is_taken_to_be_in_the_open():
     """A lawn without points beside a road with many may lie higher than the road."""
     xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 4
     xy = xy[xy[:, 0] < 0]
-    ground = ground_map.draw_ground(torch.cat([xy, torch.zeros(len(xy), 1)], -1))
+    ground = ground_map.fit_ground_height(torch.cat([xy, torch.zeros(len(xy), 1)], -1))
     assert ground is not None
     q = torch.tensor([[-0.5, 0.0, 0.1], [0.1, 0.0, 0.1], [0.35, 0.0, 0.1]])
-    assert ground.over(q)[1].all(), "but the map is known there"
+    assert ground.height_above(q)[1].all(), "but the map is known there"
     assert ground.clears(q, torch.full((3,), 0.02)).tolist() == [True, True, False]
 
 
 def refined(found):
     """With cells of half the size, as later in a fit."""
     found.field.occupancy.refine()
-    found.bar(everywhere=False)
+    found.force_empty(everywhere=False)
     return found
 
 
@@ -197,7 +197,7 @@ def rim(shift):
 
 def asked(found, x, d, t, classed=False):
     q = found.field.to_grid(x)
-    far, _, pulled = found.far_from_ground(q, d, t / found.field.unit, EXACT, classed)
+    far, _, pulled = found.ground_offsets(q, d, t / found.field.unit, EXACT, classed)
     return torch.zeros(len(x), dtype=torch.bool).index_fill(0, far[pulled], True)
 
 
@@ -206,7 +206,7 @@ def test_the_air_beside_the_tower_costs_and_the_tower_does_not():
     x, d, t = rim(torch.linspace(-1.5, 1.5, 61))
     spared = asked(found, x, d, t)
     assert spared[x[:, 1].abs() > 1.35].all(), "half of the views see it before or behind the tower"
-    found.stands[:] = False
+    found.obstacle[:] = False
     costs = asked(found, x, d, t)
     assert found.ground is not None and costs[x[:, 1].abs() > 1.0].all()
     assert not costs[in_matter(x)].any()
@@ -240,7 +240,7 @@ def test_matter_with_points_of_its_own_is_spared():
     found = carving(err)
     x, d, t = rim(torch.linspace(-0.4, 0.4, 17))
     assert not asked(found, x, d, t).any()
-    found.stands[:] = False
+    found.obstacle[:] = False
     assert asked(found, x, d, t).any()
 
 
@@ -248,9 +248,9 @@ def test_a_point_is_one_however_many_photos_show_it_and_most_of_them_name_it():
     found = carving()
     once = points(poses(12, height=1.5))
     assert found.points is not None
-    many = PointRays(*(torch.cat([each] * 3) for each in vars(once).values()))
-    places, lies = found.points_by_most_views(many)
-    single, alone = found.points_by_most_views(once)
+    many = SparseDepth(*(torch.cat([each] * 3) for each in vars(once).values()))
+    places, lies = found.classify_points(many)
+    single, alone = found.classify_points(once)
     assert len(places) == len(single) == len(once.depth) and torch.equal(lies, alone)
     ground = (places * found.field.unit + found.field.centre)[:, 2].abs() < 0.01
     assert (ground == lies).float().mean() > 0.97, "but for pixels at the tower's foot"
@@ -263,15 +263,15 @@ def test_points_off_the_map_are_no_ground_and_spare_what_is_by_them(monkeypatch)
     z = torch.where(xy[:, 0] > 0.2, 0.6, 0.0)
     q = found.field.to_grid(torch.cat([xy, z[:, None]], -1))
     lies = torch.ones(3000, dtype=torch.bool)
-    monkeypatch.setattr(found, "points_by_most_views", lambda _: (q, lies.clone()))
-    found.find_ground()
-    found.find_cells_of_points()
+    monkeypatch.setattr(found, "classify_points", lambda _: (q, lies.clone()))
+    found.fit_ground()
+    found.rasterise_points()
     assert found.ground is not None
-    over, known = found.ground.over(q)
+    over, known = found.ground.height_above(q)
     off = over.abs() > found.ground.tolerance
     assert known.all() and 0.02 < off.float().mean() < 0.2
     cells, _ = found.field._cells(q[off])
-    assert found.stands.view(-1)[cells].all() and found.stepped.view(-1)[cells].all()
+    assert found.obstacle.view(-1)[cells].all() and found.stepped.view(-1)[cells].all()
     assert not found.stepped.view(-1)[found.field._cells(q[over.abs() < 0.01])[0]].all()
 
 
@@ -284,7 +284,7 @@ def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
     t = way * torch.tensor([0.7, 1.0, 1.2, 1.0])  # above, on and under the ground; on the tower
     x = o + t[:, None] * d
     q = found.field.to_grid(x)
-    far, goal, pulled = found.far_from_ground(q, d, t / found.field.unit, EXACT)
+    far, goal, pulled = found.ground_offsets(q, d, t / found.field.unit, EXACT)
     assert far[pulled].tolist() == [0, 2]
     assert torch.allclose(goal[pulled] * found.field.unit, way[[0, 2]], atol=0.15)
 
@@ -293,7 +293,7 @@ def test_what_stands_is_spared_with_a_rim_about_it():
     """Labels alone tell of it: the tower's points are taken for ground's."""
     found = carving()
     found.standing = found.standing[:0]
-    found.find_cells_of_points()
+    found.rasterise_points()
     beside = torch.tensor([0.0, 0.0, 0.9]).repeat(60, 1)
     beside[:, 1] = torch.linspace(0.0, 2.5, 60)
     o = torch.tensor([4.0, 0.0, 1.5]).expand(60, 3)
@@ -302,11 +302,11 @@ def test_what_stands_is_spared_with_a_rim_about_it():
     cell = 2 * found.field.unit / found.field.occupancy.side
     off = beside[:, 1] - 0.5
     assert not costs[off < 0.5 * cell].any() and costs[off > 3 * cell].all()
-    hull = found.shown_to_stand()
+    hull = found.find_obstacles()
     beyond = torch.roll(hull, 1, dims=2) & ~hull
     beyond[:, :, 0] = False
-    assert beyond.any() and found.stands[beyond].all(), "neighbours along y"
-    found.stands[:] = False
+    assert beyond.any() and found.obstacle[beyond].all(), "neighbours along y"
+    found.obstacle[:] = False
     bare = asked(found, beside, (beside - o) / t[:, None], t)
     assert bare[off > 0].sum() > costs.sum() and not bare[off < 0].any()
 
@@ -327,22 +327,22 @@ def test_lumps_by_the_tower_cost_once_the_field_takes_them_for_ground(monkeypatc
     x, d, t = rim(torch.linspace(-0.5, 1.5, 41))
     before, later = asked(found, x, d, t), asked(found, x, d, t, classed=True)
     by_class = x[:, 1] > edge
-    spared = found.stands.view(-1)[field._cells(field.to_grid(x))[0]]
+    spared = found.obstacle.view(-1)[field._cells(field.to_grid(x))[0]]
     assert (by_class & spared).any() and not before[spared].any()
     assert later[by_class].all() and torch.equal(later[~by_class], before[~by_class])
     found.steps = found.standing = field.to_grid(x[by_class])
-    found.find_cells_of_points()
+    found.rasterise_points()
     stepped = asked(found, x, d, t, classed=True)
     assert not stepped[by_class].any()
 
 
 def test_what_stands_is_kept_when_cells_are_halved():
     found = refined(carving())
-    asked_again = found.shown_to_stand()
+    asked_again = found.find_obstacles()
     assert found.hull is not None and found.hull.shape == asked_again.shape
     both, either = (found.hull & asked_again).sum(), (found.hull | asked_again).sum()
     assert asked_again.any() and both > 0.6 * either, (both, either)
-    assert (found.stands | ~asked_again).float().mean() > 0.999
+    assert (found.obstacle | ~asked_again).float().mean() > 0.999
 
 
 def test_a_label_is_looked_up_where_a_ray_goes_through_the_picture():

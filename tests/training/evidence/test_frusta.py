@@ -6,7 +6,11 @@ import torch
 from support.toy_scene import poses
 
 from climatenerf.core.cameras import Camera
-from climatenerf.training.evidence.frusta import before_a_camera, in_view, pyramids
+from climatenerf.training.evidence.frusta import (
+    frustum_planes,
+    intersects_frustum,
+    within_camera_range,
+)
 
 PLAIN = Camera(48, 36, 40.0, 44.0, 20.0, 19.0)
 BENT = Camera(48, 36, 40.0, 44.0, 20.0, 19.0, k1=-0.2, k2=0.03, p1=0.01)
@@ -29,7 +33,9 @@ def projected(camera, c2w, x):
 def test_points_in_view_are_those_that_a_plain_camera_shows():
     c2w = np.stack(poses(5))
     x = np.random.default_rng(0).uniform(-6, 6, (20_000, 3)).astype(np.float32)
-    ours = in_view(torch.from_numpy(x), torch.zeros(len(x)), pyramids([PLAIN] * 5, c2w)).numpy()
+    ours = intersects_frustum(
+        torch.from_numpy(x), torch.zeros(len(x)), frustum_planes([PLAIN] * 5, c2w)
+    ).numpy()
     theirs = projected(PLAIN, c2w, x)
     assert 0.2 < theirs.mean() < 0.9
     assert (ours != theirs).mean() < 1e-3, "but for rounding at the border"
@@ -38,7 +44,9 @@ def test_points_in_view_are_those_that_a_plain_camera_shows():
 def test_nothing_that_a_distorted_camera_shows_is_left_out_and_little_more_is_taken():
     c2w = np.stack(poses(5))
     x = np.random.default_rng(1).uniform(-6, 6, (20_000, 3)).astype(np.float32)
-    ours = in_view(torch.from_numpy(x), torch.full((len(x),), 1e-3), pyramids([BENT] * 5, c2w))
+    ours = intersects_frustum(
+        torch.from_numpy(x), torch.full((len(x),), 1e-3), frustum_planes([BENT] * 5, c2w)
+    )
     theirs = projected(BENT, c2w, x)
     assert not (theirs & ~ours.numpy()).any()
     assert (ours.numpy() & ~theirs).mean() < 0.1
@@ -46,14 +54,14 @@ def test_nothing_that_a_distorted_camera_shows_is_left_out_and_little_more_is_ta
 
 def test_a_ball_is_in_view_as_soon_as_it_touches_the_pyramid():
     c2w = np.eye(4)[None]
-    views = pyramids([PLAIN], c2w)
+    views = frustum_planes([PLAIN], c2w)
     edge = np.array([(48 - 20) / 40, 0.0, 1.0])  # the middle of the right side, at 1 m
     outward = np.array([40, 0, -28]) / np.hypot(40, 28)
     x = torch.from_numpy((3 * edge + 0.5 * outward).astype(np.float32))[None]
-    assert not in_view(x, torch.tensor([0.49]), views)
-    assert in_view(x, torch.tensor([0.51]), views)
+    assert not intersects_frustum(x, torch.tensor([0.49]), views)
+    assert intersects_frustum(x, torch.tensor([0.51]), views)
     behind = torch.tensor([[0.0, 0.0, -2.0]])
-    assert not in_view(behind, torch.tensor([1.0]), views)
+    assert not intersects_frustum(behind, torch.tensor([1.0]), views)
 
 
 @pytest.mark.parametrize(
@@ -61,12 +69,12 @@ def test_a_ball_is_in_view_as_soon_as_it_touches_the_pyramid():
 )
 def test_all_is_in_view_of_a_camera_too_wide_for_a_pyramid(camera):
     x = torch.tensor([[0.0, 0.0, -2.0], [9.0, 9.0, 0.0]])
-    assert in_view(x, torch.zeros(2), pyramids([camera], np.eye(4)[None])).all()
+    assert intersects_frustum(x, torch.zeros(2), frustum_planes([camera], np.eye(4)[None])).all()
 
 
 def test_no_places_are_asked_and_none_answered():
-    views = pyramids([PLAIN], np.eye(4)[None])
-    assert in_view(torch.zeros(0, 3), torch.zeros(0), views).shape == (0,)
+    views = frustum_planes([PLAIN], np.eye(4)[None])
+    assert intersects_frustum(torch.zeros(0, 3), torch.zeros(0), views).shape == (0,)
 
 
 def test_what_is_before_a_camera_is_within_its_pyramid_and_its_reach():
@@ -77,8 +85,8 @@ def test_what_is_before_a_camera_is_within_its_pyramid_and_its_reach():
     near = np.zeros(len(x), bool)
     for pose, far in zip(c2w, reach, strict=True):
         near |= projected(PLAIN, [pose], x) & (np.linalg.norm(x - pose[:3, 3], axis=-1) < far)
-    arguments = (pyramids([PLAIN] * 5, c2w), torch.from_numpy(eyes), torch.from_numpy(reach))
-    ours = before_a_camera(torch.from_numpy(x), torch.zeros(len(x)), *arguments)
+    arguments = (frustum_planes([PLAIN] * 5, c2w), torch.from_numpy(eyes), torch.from_numpy(reach))
+    ours = within_camera_range(torch.from_numpy(x), torch.zeros(len(x)), *arguments)
     assert near.sum() > 100 and (ours.numpy() != near).sum() <= 2, "but for rounding"
-    balls = before_a_camera(torch.from_numpy(x), torch.full((len(x),), 0.2), *arguments)
+    balls = within_camera_range(torch.from_numpy(x), torch.full((len(x),), 0.2), *arguments)
     assert (ours | ~balls).all() and balls.sum() < ours.sum(), "whole balls are nearer"

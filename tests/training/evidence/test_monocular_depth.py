@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from climatenerf.training.dataset import in_units
-from climatenerf.training.evidence.monocular_depth import RelativeDepth
+from climatenerf.training.evidence.monocular_depth import DepthAlignment
 
 
 def rays(n=4000, images=3, seed=0):
@@ -17,7 +17,7 @@ SCALE, SHIFT = torch.tensor([2.0, 0.5, 30.0]), torch.tensor([-1.0, 4.0, 0.1])
 
 def test_scale_and_shift_of_each_image_are_found():
     image, inverse = rays()
-    relative = RelativeDepth(3)
+    relative = DepthAlignment(3)
     loss = relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)
     scale, shift, spread = relative.affine()
     assert torch.allclose(scale, SCALE, rtol=1e-3) and torch.allclose(shift, SHIFT, atol=1e-2)
@@ -27,8 +27,8 @@ def test_scale_and_shift_of_each_image_are_found():
 def test_the_loss_does_not_depend_on_the_networks_units():
     image, inverse = rays()
     bent = inverse + 0.1 * torch.sin(20 * inverse)
-    first = RelativeDepth(3).loss(inverse, bent, image, inverse > 0)
-    second = RelativeDepth(3).loss(inverse, SCALE[image] * bent + SHIFT[image], image, inverse > 0)
+    first = DepthAlignment(3).loss(inverse, bent, image, inverse > 0)
+    second = DepthAlignment(3).loss(inverse, SCALE[image] * bent + SHIFT[image], image, inverse > 0)
     assert first == pytest.approx(float(second), rel=1e-3) and first > 1e-3
 
 
@@ -37,7 +37,7 @@ def test_gradients_move_a_wrong_depth_towards_the_right_one():
     given = inverse.clone()
     given[0] += 0.3  # nearer than it should be
     given.requires_grad_()
-    RelativeDepth(3).loss(
+    DepthAlignment(3).loss(
         given, SCALE[image] * inverse + SHIFT[image], image, inverse > 0
     ).backward()
     assert given.grad is not None and torch.isfinite(given.grad).all()
@@ -46,21 +46,21 @@ def test_gradients_move_a_wrong_depth_towards_the_right_one():
 
 def test_what_is_not_known_or_inside_out_says_nothing():
     image, inverse = rays()
-    relative = RelativeDepth(3)
+    relative = DepthAlignment(3)
     bent = inverse + 0.1 * torch.sin(20 * inverse)
     assert relative.loss(inverse, -bent, image, inverse > 0) == 0  # far would be near
-    assert RelativeDepth(3).loss(inverse, bent, image, inverse > 0) > 0
+    assert DepthAlignment(3).loss(inverse, bent, image, inverse > 0) > 0
     none = torch.zeros(len(image), dtype=torch.bool)
     assert relative.loss(inverse, inverse, image, none) == 0
     few = torch.arange(len(image)) < 10
-    assert RelativeDepth(3).loss(inverse, inverse, image, few) == 0
-    flat = RelativeDepth(3).loss(inverse, torch.ones_like(inverse), image, inverse > 0)
+    assert DepthAlignment(3).loss(inverse, inverse, image, few) == 0
+    flat = DepthAlignment(3).loss(inverse, torch.ones_like(inverse), image, inverse > 0)
     assert flat == 0 and torch.isfinite(flat)
 
 
 def test_sums_from_earlier_steps_help_when_a_step_has_few_rays():
     image, inverse = rays(60)
-    relative = RelativeDepth(3)
+    relative = DepthAlignment(3)
     for seed in range(5):
         image, inverse = rays(60, seed=seed)
         relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)

@@ -16,12 +16,12 @@ from climatenerf.scene.images import load_image
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence import multiview_stereo as matching
 from climatenerf.training.evidence.multiview_stereo import (
-    distances,
-    match_photos,
+    build_pictures,
+    depth_ranges,
     neighbours,
-    pictures_of,
+    plane_sweep_depth,
 )
-from climatenerf.training.evidence.sparse_depth import PointRays, find_point_rays
+from climatenerf.training.evidence.sparse_depth import SparseDepth, read_sparse_depth
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference" / "street"
 ASKED = 5 * 96 * 72 // matching.PIXELS  # windows of five photos
@@ -39,30 +39,30 @@ def errors(pixels, found):
 def test_a_patterned_wall_is_found_where_it_is(camera):
     grey = pattern()
     pixels = photos(camera, lambda i, t, x: grey(x), exposure=lambda i: (1.0, 0.5, 0.8)[i % 3])
-    found = match_photos(pixels, None, TYPICAL, 0)
+    found = plane_sweep_depth(pixels, None, TYPICAL, 0)
     assert found is not None
     off = errors(pixels, found)
     assert len(off) > 0.15 * ASKED
     assert np.median(off) < 0.005 and (off < 0.02).mean() > 0.95
     assert torch.allclose(found.rays_d.norm(dim=-1), torch.ones(len(off)), atol=1e-5)
-    again = match_photos(pixels, None, TYPICAL, 0)
+    again = plane_sweep_depth(pixels, None, TYPICAL, 0)
     assert again is not None and torch.equal(again.depth, found.depth)
 
 
 def test_what_shows_nothing_is_not_matched():
     blank = photos(PLAIN, lambda i, t, x: np.full(t.shape, 0.5))
-    assert match_photos(blank, None, TYPICAL, 0) is None
+    assert plane_sweep_depth(blank, None, TYPICAL, 0) is None
     other = [pattern(seed) for seed in range(5)]
     strangers = photos(PLAIN, lambda i, t, x: other[i](x))
-    found = match_photos(strangers, None, TYPICAL, 0)
+    found = plane_sweep_depth(strangers, None, TYPICAL, 0)
     assert found is None or len(found.depth) < 0.03 * ASKED
     one = photos(PLAIN, lambda i, t, x: other[0](x), c2w=rows_of_cameras(1))
-    assert match_photos(one, None, TYPICAL, 0) is None
+    assert plane_sweep_depth(one, None, TYPICAL, 0) is None
 
 
 def test_stripes_that_fit_in_many_places_are_left_alone():
     stripes = photos(PLAIN, lambda i, t, x: 0.5 + 0.4 * np.sin(2 * np.pi * x[..., 0] / 0.25))
-    found = match_photos(stripes, None, TYPICAL, 0)
+    found = plane_sweep_depth(stripes, None, TYPICAL, 0)
     if found is not None:  # by the pictures' sides, where most distances leave the neighbours
         place = stripes.place_towards(found.image, found.rays_d)
         assert ((place[:, 0] > 0.3) & (place[:, 0] < 0.7)).sum() < 0.01 * ASKED
@@ -75,12 +75,12 @@ def test_sky_and_what_masks_hide_is_not_asked():
     for label, mask in zip(labels, masks, strict=True):
         label[:24], mask[:, :48] = 10, False
     pixels = photos(PLAIN, lambda i, t, x: grey(x), labels=labels, masks=masks)
-    found = match_photos(pixels, None, TYPICAL, 0)
+    found = plane_sweep_depth(pixels, None, TYPICAL, 0)
     assert found is not None
     place = pixels.place_towards(found.image, found.rays_d)
     assert place[:, 0].min() > 0.5 and place[:, 1].min() > 1 / 3
     assert len(found.depth) > 0.05 * ASKED
-    pictures = pictures_of(pixels, np.full((5, 9), 1.5), np.full((5, 9), 4.0))
+    pictures = build_pictures(pixels, np.full((5, 9), 1.5), np.full((5, 9), 4.0))
     shown = pictures.grey.reshape(5, 72, 96)
     assert (shown[:, :, :48] == kernels.UNSEEN).all() and (shown[:, :, 48:] > 0).all()
 
@@ -132,7 +132,7 @@ def turned(pitch, roll):
 def test_likeness_is_that_of_the_slow_twin():
     pixels, c2w = unlike_cameras()
     near, middle = np.full((5, 9), 1.0), np.full((5, 9), 4.0)
-    pictures = pictures_of(pixels, near, middle)
+    pictures = build_pictures(pixels, near, middle)
     cameras = pixels.cameras
     images = [
         pictures.grey[start : start + c.width * c.height].reshape(c.height, c.width).astype(float)
@@ -171,20 +171,20 @@ def test_each_ninth_of_a_photo_has_distances_of_its_own():
     depth = np.repeat([2.0, 8.0, 1.0, 1.0], [30, 30, 5, 30])
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
     turn = pixels.c2w[1, :3, :3].numpy()
-    points = PointRays(
+    points = SparseDepth(
         torch.zeros(95, 3),
         torch.from_numpy((local @ turn.T).astype(np.float32)),
         torch.from_numpy(depth.astype(np.float32)),
         torch.ones(95, dtype=torch.long),
     )
-    near, middle = distances(pixels, points, TYPICAL)
+    near, middle = depth_ranges(pixels, points, TYPICAL)
     assert middle[1, 0] == 2.0 and middle[1, 2] == 8.0
     assert near[1, 0] == pytest.approx(0.5 * 2.0 * local[0, 2], rel=1e-5), "z-depth, with a margin"
     assert near[1, 2] == pytest.approx(0.5 * 8.0 * local[30, 2], rel=1e-5)
     assert (middle[1, [1, 3, 5, 7]] == np.median(depth)).all(), "few points: the photo's"
     assert (middle[0] == np.median(depth)).all(), "a photo without points: that of all"
     assert (near > 0).all(), "its inverse is searched"
-    near, middle = distances(pixels, None, TYPICAL)
+    near, middle = depth_ranges(pixels, None, TYPICAL)
     assert (near == TYPICAL[0]).all() and (middle == TYPICAL[1]).all()
 
 
@@ -215,16 +215,16 @@ def test_the_street_s_distances_are_found(monkeypatch):
         np.stack([scene.c2w_world(view) for view in views]),
         [load_image(view, scene) for view in views],
     )
-    points = find_point_rays(scene)
+    points = read_sparse_depth(scene)
     assert points is not None
-    moved = points.some(torch.arange(points.depth.shape[0]))
+    moved = points.select(torch.arange(points.depth.shape[0]))
     moved.image.add_(len(scene.of_split("heldout")))
-    found = match_photos(pixels, moved, TYPICAL, 0)
+    found = plane_sweep_depth(pixels, moved, TYPICAL, 0)
     assert found is not None
     off = []
     for i, view in enumerate(scene.of_split("heldout")):
         truth = next(truth for truth in truths if truth.name == Path(view.name).name)
-        some = found.some(found.image == i)
+        some = found.select(found.image == i)
         place = pixels.place_towards(some.image, some.rays_d).numpy()
         height, width = truth.depth.shape
         true = truth.depth[(place[:, 1] * height).astype(int), (place[:, 0] * width).astype(int)]

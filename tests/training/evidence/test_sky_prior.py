@@ -11,9 +11,9 @@ from climatenerf.training.evidence.sky_prior import (
     COLUMNS,
     LOWEST,
     ROWS,
-    SkyFill,
+    SkyPrior,
     direction,
-    fill_sky,
+    fit_sky_prior,
     spread,
 )
 
@@ -50,7 +50,7 @@ def test_directions_are_unit_and_cover_the_sky_evenly():
 
 
 def test_what_is_seen_stays_and_gaps_lie_between():
-    fill = fill_sky(pixels([60, 200]), torch.Generator().manual_seed(0))
+    fill = fit_sky_prior(pixels([60, 200]), torch.Generator().manual_seed(0))
     dark, bright = (float(decode_srgb(torch.tensor(v / 255))) for v in (60, 200))
     seen = fill.colour[~fill.unseen]
     assert 0.02 < (~fill.unseen).float().mean() < 0.6
@@ -66,7 +66,7 @@ def test_drawn_directions_are_unseen_ones_with_their_colours():
     colour = torch.rand(ROWS, COLUMNS, 3)
     unseen = torch.zeros(ROWS, COLUMNS, dtype=torch.bool)
     unseen[3:6, 10:20] = True
-    d, drawn, which = SkyFill(colour, unseen).draw(20000, torch.Generator().manual_seed(0))
+    d, drawn, which = SkyPrior(colour, unseen).draw(20000, torch.Generator().manual_seed(0))
     d, drawn = d[which], drawn[which]
     assert 0.5 < len(d) / (20000 * unseen.float().mean()) < 1.5
     row = ((d[:, 2] - LOWEST) / (1 - LOWEST) * ROWS).long()
@@ -76,7 +76,7 @@ def test_drawn_directions_are_unseen_ones_with_their_colours():
 
 def test_where_no_label_tells_sky_all_that_is_above_the_horizon_stands_for_it():
     assert MERGED[0] != MERGED[SKY_ID]
-    fill = fill_sky(pixels([100, 100], label=0), torch.Generator())
+    fill = fit_sky_prior(pixels([100, 100], label=0), torch.Generator())
     grey = float(decode_srgb(torch.tensor(100 / 255)))
     assert fill.colour.numpy() == pytest.approx(grey, abs=1e-5)
     assert 0.3 < fill.unseen.float().mean() < 0.98
@@ -87,7 +87,7 @@ def test_where_labels_tell_sky_a_house_above_the_horizon_is_none():
     labelled = pixels(dark_sky_beside_a_bright_house)
     own = (labelled.pixel_start[:-1], labelled.pixel_start[1:])
     labelled.label[own[0][1] : own[1][1]] = MERGED[2]
-    fill = fill_sky(labelled, torch.Generator().manual_seed(0))
+    fill = fit_sky_prior(labelled, torch.Generator().manual_seed(0))
     dark = float(decode_srgb(torch.tensor(60 / 255)))
     assert fill.colour.numpy() == pytest.approx(dark, abs=1e-5)
 
@@ -100,7 +100,7 @@ def test_photos_that_look_down_give_an_even_grey_sky_that_would_light_them(shown
     low.c2w[:, :3, 3] = 0
     batch = low.draw(1000, torch.Generator().manual_seed(0))
     assert batch.rays_d[:, 2].max() < LOWEST
-    fill = fill_sky(low, torch.Generator())
+    fill = fit_sky_prior(low, torch.Generator())
     r, g, b = (float(decode_srgb(torch.tensor(v / 255))) for v in (shown, shown // 2, shown // 4))
     radiance = (0.2126 * r + 0.7152 * g + 0.0722 * b) / 0.2
     assert fill.unseen.all() and (radiance > 1) == bright
@@ -113,7 +113,7 @@ def test_where_hardly_a_pixel_is_labelled_sky_what_is_above_stands_for_it(monkey
     room = pixels([100, 100], label=0)
     room.label[:2] = SKY
     assert room.knows_sky
-    fill = fill_sky(room, torch.Generator().manual_seed(0))
+    fill = fit_sky_prior(room, torch.Generator().manual_seed(0))
     wall = float(decode_srgb(torch.tensor(100 / 255)))
     assert fill.colour.numpy() == pytest.approx(wall, abs=1e-5) and not fill.unseen.all()
 

@@ -6,7 +6,7 @@ import torch
 from PIL import Image
 from support.toy_scene import CAMERA, make_scene
 
-from climatenerf.training.evidence.sparse_depth import find_point_rays, shown_points
+from climatenerf.training.evidence.sparse_depth import read_sparse_depth, unmasked_sparse_depth
 from climatenerf.training.run import load_pixels
 
 
@@ -20,7 +20,7 @@ def scene(tmp_path):
 
 
 def test_rays_end_on_their_points_and_held_out_views_give_none(scene):
-    found = find_point_rays(scene)
+    found = read_sparse_depth(scene)
     assert found is not None
     training = scene.of_split("train")
     assert found.depth.shape[0] == sum(len(v.seen) for v in training)
@@ -38,7 +38,7 @@ def test_rays_end_on_their_points_and_held_out_views_give_none(scene):
 
 
 def test_drawn_rays_stay_whole(scene):
-    found = find_point_rays(scene)
+    found = read_sparse_depth(scene)
     drawn = found.draw(50, torch.Generator().manual_seed(0))
     ends = drawn.rays_o + drawn.depth[:, None] * drawn.rays_d
     distance = (ends[:, None] - torch.tensor(scene.points_world()[None], dtype=torch.float32)).norm(
@@ -49,15 +49,15 @@ def test_drawn_rays_stay_whole(scene):
 
 def test_without_knowledge_of_who_sees_what_there_are_none(scene):
     unknown = tuple(replace(v, seen=None) for v in scene.views)
-    assert find_point_rays(replace(scene, views=unknown)) is None
-    assert find_point_rays(replace(scene, points=None)) is None
+    assert read_sparse_depth(replace(scene, views=unknown)) is None
+    assert read_sparse_depth(replace(scene, points=None)) is None
     nothing = tuple(replace(v, seen=np.empty(0, int)) for v in scene.views)
-    assert find_point_rays(replace(scene, views=nothing)) is None
+    assert read_sparse_depth(replace(scene, views=nothing)) is None
 
 
 def test_what_a_mask_hides_is_no_measured_depth(scene, tmp_path):
     """A mirror's points lie behind it: where it is masked they tell nothing of the wall."""
-    every = find_point_rays(scene)
+    every = read_sparse_depth(scene)
     views = scene.of_split("train")
     view = next(v for v in views if len(v.seen) == 3)
     c2w, points = scene.c2w_world(view), scene.points_world()[view.seen]
@@ -71,11 +71,11 @@ def test_what_a_mask_hides_is_no_measured_depth(scene, tmp_path):
         for v in scene.views
     )
     masked = replace(scene, views=masked)
-    found = shown_points(masked, load_pixels(masked, 1))
+    found = unmasked_sparse_depth(masked, load_pixels(masked, 1))
     image = [v.name for v in views].index(view.name)
     assert (every.image == image).sum() == 3 and (found.image == image).sum() == 2
     assert (found.image != image).sum() == (every.image != image).sum()
     left = points[np.argmin(column)]
     ends = found.ends[found.image == image].numpy()
     assert np.linalg.norm(ends - left, axis=-1).min() > 0.1
-    assert shown_points(scene, load_pixels(scene, 1)).depth.shape == every.depth.shape
+    assert unmasked_sparse_depth(scene, load_pixels(scene, 1)).depth.shape == every.depth.shape

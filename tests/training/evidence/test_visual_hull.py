@@ -7,7 +7,7 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import BUILDING, SKY, UNKNOWN
 from climatenerf.ops import reference
 from climatenerf.training.evidence import visual_hull as witness
-from climatenerf.training.evidence.visual_hull import Witness, depth_within
+from climatenerf.training.evidence.visual_hull import VisualHull, depth_within
 
 CAMERA = Camera(80, 60, 60.0, 60.0, 40.0, 30.0)
 TOWER = (np.array([-0.5, -0.5, 0.0]), np.array([0.5, 0.5, 2.0]))
@@ -43,7 +43,7 @@ def labels(camera, c2w):
 def asking(count=12, change=None):
     c2w = poses(count)
     maps = [labels(CAMERA, pose) for pose in c2w]
-    return Witness([CAMERA] * count, c2w, change(maps) if change else maps, [SKY], 0.1)
+    return VisualHull([CAMERA] * count, c2w, change(maps) if change else maps, [SKY], 0.1)
 
 
 def places(n=4000, seed=0):
@@ -59,7 +59,7 @@ def in_matter(x, margin=0.0):
 
 def test_the_tower_and_the_ground_stay_and_the_air_beside_them_goes():
     x = places()
-    agreed = asking().agreed(x, torch.full((len(x),), 0.1))
+    agreed = asking().consensus(x, torch.full((len(x),), 0.1))
     assert not (agreed & in_matter(x, 0.1)).any()
     beside = (x[:, :2].norm(dim=-1) > 1.0) & (x[:, :2].norm(dim=-1) < 2.5)
     beside &= (x[:, 2] > 1.3) & (x[:, 2] < 2.0)
@@ -68,7 +68,7 @@ def test_the_tower_and_the_ground_stay_and_the_air_beside_them_goes():
 
 def test_larger_footprints_are_emptied_less():
     x, one = places(), asking()
-    shares = [one.agreed(x, torch.full((len(x),), r)).float().mean() for r in (0.0, 0.2, 0.8)]
+    shares = [one.consensus(x, torch.full((len(x),), r)).float().mean() for r in (0.0, 0.2, 0.8)]
     assert shares[0] > shares[1] > shares[2]
 
 
@@ -79,7 +79,7 @@ def test_one_view_alone_empties_nothing():
         alone = asking(
             change=lambda maps, o=other: [maps[0]] + [np.full_like(m, o) for m in maps[1:]]
         )
-        assert not alone.agreed(x, torch.zeros(len(x))).any()
+        assert not alone.consensus(x, torch.zeros(len(x))).any()
 
 
 def test_a_wrong_label_in_one_view_of_many_removes_no_matter():
@@ -89,7 +89,7 @@ def test_a_wrong_label_in_one_view_of_many_removes_no_matter():
     x = places()
     x = x[in_matter(x, -0.1)]
     assert len(x) > 100
-    assert not asking(12, err).agreed(x, torch.zeros(len(x))).any()
+    assert not asking(12, err).consensus(x, torch.zeros(len(x))).any()
 
 
 def test_neighbouring_frames_have_one_voice():
@@ -102,10 +102,10 @@ def test_neighbouring_frames_have_one_voice():
     c2w = poses(12)
     c2w[1, :3, 3] = c2w[0, :3, 3] + [0.0, 0.2, 0.0]
     maps = [labels(CAMERA, pose) for pose in c2w]
-    close = Witness([CAMERA] * 12, c2w, err(maps, {0, 1}), [SKY], 0.1)
-    far = Witness([CAMERA] * 12, c2w, err(maps, {0, 6}), [SKY], 0.1)
-    assert not close.agreed(x, torch.zeros(1)).any()
-    assert far.agreed(x, torch.zeros(1)).any()
+    close = VisualHull([CAMERA] * 12, c2w, err(maps, {0, 1}), [SKY], 0.1)
+    far = VisualHull([CAMERA] * 12, c2w, err(maps, {0, 6}), [SKY], 0.1)
+    assert not close.consensus(x, torch.zeros(1)).any()
+    assert far.consensus(x, torch.zeros(1)).any()
 
 
 def test_few_voices_among_many_watchers_are_not_enough(monkeypatch):
@@ -115,8 +115,8 @@ def test_few_voices_among_many_watchers_are_not_enough(monkeypatch):
         return [np.full_like(maps[0], SKY)] * 2 + maps[2:]
 
     x = torch.tensor([[0.0, 0.0, 1.0]])
-    assert not asking(30, err).agreed(x, torch.zeros(1)).any()
-    assert asking(12, err).agreed(x, torch.zeros(1)).any()
+    assert not asking(30, err).consensus(x, torch.zeros(1)).any()
+    assert asking(12, err).consensus(x, torch.zeros(1)).any()
 
 
 def test_depth_within_the_sky_counts_pixels_from_its_edge():
@@ -142,9 +142,9 @@ def test_a_thin_wire_in_a_large_photo_is_not_lost(monkeypatch):
 def test_a_distorted_camera_is_asked_at_the_right_pixel():
     bent = Camera(80, 60, 60.0, 60.0, 40.0, 30.0, k1=-0.15)
     c2w = poses(12)
-    one = Witness([bent] * 12, c2w, [labels(bent, pose) for pose in c2w], [SKY], 0.1)
+    one = VisualHull([bent] * 12, c2w, [labels(bent, pose) for pose in c2w], [SKY], 0.1)
     x = places()
-    agreed = one.agreed(x, torch.full((len(x),), 0.1))
+    agreed = one.consensus(x, torch.full((len(x),), 0.1))
     assert agreed.any() and not (agreed & in_matter(x, 0.1)).any()
 
 
@@ -152,7 +152,7 @@ def test_the_kernel_matches_its_twin():
     c2w = poses(12)
     wide = Camera(100, 40, 60.0, 55.0, 52.0, 19.0)  # views need not be of one size
     cameras = [CAMERA, wide] * 6
-    found = Witness(
+    found = VisualHull(
         cameras, c2w, [labels(*each) for each in zip(cameras, c2w, strict=True)], [SKY], 0.1
     )
     x, radius = places(), 0.3 * torch.rand(4000, generator=torch.Generator().manual_seed(1))
@@ -163,7 +163,7 @@ def test_the_kernel_matches_its_twin():
     ]
     least = (witness.MIN_VOICES, found.share, found.apart)
     real = reference.label_votes(x, radius, reach, *views, least)
-    ours = found.agreed(x, radius)
+    ours = found.consensus(x, radius)
     # Rounding may put a place that lies on a pixel's border into its neighbour.
     assert (ours == real).float().mean() > 0.999
     assert 0.1 < real.float().mean() < 0.9

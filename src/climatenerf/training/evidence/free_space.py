@@ -18,62 +18,62 @@ from climatenerf.core.device import to_device
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import reference
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.frusta import before_a_camera, in_view
-from climatenerf.training.evidence.ground_height import draw_ground
-from climatenerf.training.evidence.sparse_depth import PointRays
+from climatenerf.training.evidence.frusta import intersects_frustum, within_camera_range
+from climatenerf.training.evidence.ground_height import fit_ground_height
+from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.static_shapes import Rooms
 
 
-class Carving:
+class FreeSpace:
     """Bars cells of a field's occupancy, and knows where sky and ground are seen."""
 
     def __init__(
         self,
         field: Field,
         pixels: TrainingPixels,
-        points: PointRays | None,
+        points: SparseDepth | None,
         settings: FitSettings,
     ):
         self.field, self.pixels, self.points = field, pixels, points
         self.carves, self.moves = settings.free_space, settings.refine_poses
         self.solid = to_device(SOLID)
         self.knows_ground = settings.losses.ground_height > 0 and points is not None
-        self.find_ground()
-        self.bar()
+        self.fit_ground()
+        self.force_empty()
 
-    def find_ground(self) -> None:
+    def fit_ground(self) -> None:
         """Draws the map of the ground, and notes points that stand on it, and steps off it."""
         self.ground, self.steps = None, torch.zeros(0, 3)
         places, lies = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
         if self.knows_ground and self.points is not None:
-            places, lies = self.points_by_most_views(self.points)
-            self.ground = draw_ground(places[lies])
+            places, lies = self.classify_points(self.points)
+            self.ground = fit_ground_height(places[lies])
         if self.ground is not None:
             # Steps and banks that the map cannot follow are not to be levelled.
-            steps = lies & (self.ground.over(places)[0].abs() > self.ground.tolerance)
+            steps = lies & (self.ground.height_above(places)[0].abs() > self.ground.tolerance)
             self.steps, lies = places[steps], lies & ~steps
         self.standing = places[~lies]
         self.hull = None
 
-    def points_by_most_views(
-        self, points: PointRays
+    def classify_points(
+        self, points: SparseDepth
     ) -> tuple[Float[Tensor, "p 3"], Bool[Tensor, "p"]]:
         """Each point once, in grid units, and whether most views that show it label it ground."""
-        lies = on_the_ground(self.pixels.label_towards(points.image, points.rays_d))
+        lies = is_ground(self.pixels.label_towards(points.image, points.rays_d))
         place = (self.field.to_grid(points.ends) / SAME).round()
         once, row, views = place.unique(dim=0, return_inverse=True, return_counts=True)
         votes = torch.zeros(once.shape[0]).index_add(0, row, lies.float())
         return once * SAME, votes > 0.5 * views
 
-    def bar(self, everywhere: bool = True) -> None:
+    def force_empty(self, everywhere: bool = True) -> None:
         """Bars the cells that are known to be empty.
 
         Args:
             everywhere: ask of all cells; else of those that are occupied, which is quicker.
         """
-        witness, occupancy = self.pixels.witness, self.field.occupancy
-        self.find_cells_of_points()
+        witness, occupancy = self.pixels.sky_hull, self.field.occupancy
+        self.rasterise_points()
         if not self.carves:
             return
         cells = torch.arange(occupancy.occupied.numel())
@@ -84,21 +84,23 @@ class Carving:
         radius = size * (self.field.unit * 3**0.5 / 2)
         empty = torch.zeros(cells.shape[0], dtype=torch.bool)
         if not self.moves:  # cameras that are still to turn have something else in view
-            empty = ~in_view(x, radius, self.pixels.pyramids)
-            empty |= self.in_the_way(x, radius)
+            empty = ~intersects_frustum(x, radius, self.pixels.frusta)
+            empty |= self.too_near_camera(x, radius)
         if witness is not None:
-            empty |= witness.agreed(x, radius)
+            empty |= witness.consensus(x, radius)
         barred = occupancy.barred.view(-1)
         barred[cells[empty]] = True
-        barred[_grown(self.held).view(-1)] = False
+        barred[_grown(self.protected).view(-1)] = False
         if self.ground is not None:
             high = self.ground.clears(centre, size * (3**0.5 / 2)).nonzero()[:, 0]
-            high = high[self.shows_ground(centre[high], radius[high])]
-            high = high[~self.stands.view(-1)[cells[high]]]
+            high = high[self.in_ground_hull(centre[high], radius[high])]
+            high = high[~self.obstacle.view(-1)[cells[high]]]
             barred[cells[high]] = True
         occupancy.occupied.view(-1)[barred] = 0
 
-    def in_the_way(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def too_near_camera(
+        self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]
+    ) -> Bool[Tensor, "n"]:
         """Whether balls (world m) lie before a camera and much nearer than all that it shows.
 
         What fills a corner of a few photos may as well be a dark lump before them; other photos
@@ -114,63 +116,63 @@ class Carving:
             if depth.numel() >= MIN_POINTS:
                 reach[image] = IN_THE_WAY * depth.quantile(NEAREST)
         eyes = self.pixels.c2w[:, :3, 3]
-        before = before_a_camera(x, radius, self.pixels.pyramids, eyes, reach)
+        before = within_camera_range(x, radius, self.pixels.frusta, eyes, reach)
         if self.ground is not None:
-            over, known = self.ground.over(self.field.to_grid(x))
+            over, known = self.ground.height_above(self.field.to_grid(x))
             before &= ~known | (over > radius / self.field.unit + self.ground.tolerance)
         return before
 
-    def find_cells_of_points(self) -> None:
+    def rasterise_points(self) -> None:
         """Notes the occupancy's cells in which sparse points lie, and those by what stands."""
         ends = torch.zeros(0, 3) if self.points is None else self.field.to_grid(self.points.ends)
-        self.held = self.cells_of(ends)
+        self.protected = self.cells_containing(ends)
         if self.hull is None:
-            self.hull = self.shown_to_stand()
+            self.hull = self.find_obstacles()
         while self.hull.shape[1] < self.field.occupancy.side:  # asking of all again takes seconds
             for axis in (1, 2, 3):
                 self.hull = self.hull.repeat_interleave(2, dim=axis)
-        self.stands = _grown(self.cells_of(self.standing) | self.hull)
-        self.stepped = _grown(self.cells_of(self.steps))
+        self.obstacle = _grown(self.cells_containing(self.standing) | self.hull)
+        self.stepped = _grown(self.cells_containing(self.steps))
 
-    def shown_to_stand(self) -> Bool[Tensor, "k g g g"]:
+    def find_obstacles(self) -> Bool[Tensor, "k g g g"]:
         """The occupancy's cells where most photos see what stands on the ground."""
-        occupancy, witness = self.field.occupancy, self.pixels.standing_witness
+        occupancy, witness = self.field.occupancy, self.pixels.obstacle_hull
         stands = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
         if self.ground is None or witness is None:
             return stands
         for cells in torch.arange(stands.numel()).split(AT_ONCE):
             centre, _ = occupancy.cell_centres(cells)
-            near = self.ground.over(centre)[1].nonzero()[:, 0]
+            near = self.ground.height_above(centre)[1].nonzero()[:, 0]
             x = centre[near] * self.field.unit + self.field.centre
-            stands.view(-1)[cells[near]] = witness.agreed(x, torch.zeros(near.shape[0]))
+            stands.view(-1)[cells[near]] = witness.consensus(x, torch.zeros(near.shape[0]))
         return stands
 
-    def cells_of(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
+    def cells_containing(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
         """The occupancy's cells in which places (grid units) lie."""
         held = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
         cells, inside = self.field._cells(q)
         held.view(-1)[cells[inside]] = True
         return held
 
-    def shows_sky(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    def in_sky_hull(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether photos agree to see sky behind places x (world m), and no point is by them."""
-        witness = self.pixels.witness
+        witness = self.pixels.sky_hull
         if witness is None or not self.carves:
             return torch.ones(x.shape[0], dtype=torch.bool)
-        agreed = witness.agreed(x, torch.zeros(x.shape[0]))
+        agreed = witness.consensus(x, torch.zeros(x.shape[0]))
         cells, _ = self.field._cells(self.field.to_grid(x))
-        return agreed & ~self.held.view(-1)[cells]
+        return agreed & ~self.protected.view(-1)[cells]
 
-    def shows_ground(
+    def in_ground_hull(
         self, q: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]
     ) -> Bool[Tensor, "n"]:
         """Whether photos agree to see ground behind balls about q (grid units); radius in m."""
-        witness = self.pixels.ground_witness
+        witness = self.pixels.ground_hull
         if witness is None:
             return torch.zeros(q.shape[0], dtype=torch.bool)
-        return witness.agreed(q * self.field.unit + self.field.centre, radius)
+        return witness.consensus(q * self.field.unit + self.field.centre, radius)
 
-    def far_from_ground(
+    def ground_offsets(
         self,
         q: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
@@ -189,29 +191,29 @@ class Carving:
         """
         if self.ground is None:
             return torch.zeros(0, dtype=torch.long), t[:0], t[:0] > 0
-        over, known = self.ground.over(q)
-        ahead, _ = self.ground.over(q + STEP * rays_d)
+        over, known = self.ground.height_above(q)
+        ahead, _ = self.ground.height_above(q + STEP * rays_d)
         nearing = (over - ahead) / STEP
         off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
         far = rooms.chosen("far", known & (nearing > MIN_NEARING) & (off != 0))
         cells, _ = self.field._cells(q[far])
         pulled = torch.zeros(far.shape[0], dtype=torch.bool)
         if classed:
-            pulled = self.taken_for_ground(q[far]) & ~self.stepped.view(-1)[cells]
-        rest = rooms.chosen("rest", ~pulled & ~self.stands.view(-1)[cells])
-        pulled[rest] = self.shows_ground(q[far[rest]], torch.zeros(rest.shape[0]))
+            pulled = self.classified_as_ground(q[far]) & ~self.stepped.view(-1)[cells]
+        rest = rooms.chosen("rest", ~pulled & ~self.obstacle.view(-1)[cells])
+        pulled[rest] = self.in_ground_hull(q[far[rest]], torch.zeros(rest.shape[0]))
         # Rays that do not near the ground, in a room's rest: 0/0.
         on = off[far] / nearing[far].clamp_min(MIN_NEARING)
         return far, (t[far] + on).clamp_min(0.0), pulled
 
     @torch.no_grad()
-    def taken_for_ground(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    def classified_as_ground(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether matter at q (grid units) is ground by the field's own classes."""
         _, logits = self.field.surface_at(reference.contract(q))
-        return on_the_ground(self.solid[logits.argmax(-1)])
+        return is_ground(self.solid[logits.argmax(-1)])
 
 
-def on_the_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
+def is_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Whether merged classes are such as lie on the ground."""
     return torch.stack([label == kind for kind in GROUND]).any(0)
 

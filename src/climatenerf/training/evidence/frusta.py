@@ -19,7 +19,9 @@ BORDER = 64  # points along each side of a picture from which its pyramid of sig
 WIDE = 0.1  # least cosine from the axis that fits into a pyramid; beyond it all counts as in view
 
 
-def pyramids(cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]) -> Float[Tensor, "v 4 4"]:
+def frustum_planes(
+    cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]
+) -> Float[Tensor, "v 4 4"]:
     """The four sides of each view's pyramid of sight, as planes.
 
     Args:
@@ -48,7 +50,7 @@ def pyramids(cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]) -> Floa
     return to_device(np.stack(planes).astype(np.float32))
 
 
-def in_view(
+def intersects_frustum(
     x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], views: Float[Tensor, "v 4 4"]
 ) -> Bool[Tensor, "n"]:
     """Whether balls about x (world m) with a radius (m) reach into any view's pyramid of sight."""
@@ -61,7 +63,7 @@ def in_view(
     return torch.cat(found)
 
 
-def before_a_camera(
+def within_camera_range(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
     views: Float[Tensor, "v 4 4"],

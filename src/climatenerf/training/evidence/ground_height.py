@@ -28,7 +28,7 @@ ROUGHNESS = 2.0  # tolerance over the distance within which nine tenths of the p
 
 
 @dataclass(frozen=True)
-class GroundMap:
+class GroundHeight:
     """Heights on lines about the scene's middle, rows along y; all in grid units."""
 
     height: Float[Tensor, "c c"]
@@ -54,7 +54,7 @@ class GroundMap:
         x, y = _fine(q)
         return inside & high & self.sure[y, x]
 
-    def over(self, q: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
+    def height_above(self, q: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
         """Height of positions over the map, and whether the map is known there."""
         place = q[:, :2] / HALF_SIDE
         height = torch.nn.functional.grid_sample(
@@ -64,7 +64,7 @@ class GroundMap:
         return q[:, 2] - height, (place.abs() < 1).all(-1) & self.known[y, x]
 
 
-def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
+def fit_ground_height(q: Float[Tensor, "n 3"]) -> GroundHeight | None:
     """The map through points on the ground (grid units); None for too few.
 
     The least mean distance (not squared: labels err) plus the price of bending, the thin plate's.
@@ -96,7 +96,7 @@ def draw_ground(q: Float[Tensor, "n 3"]) -> GroundMap | None:
     line = to_device(np.linspace(-HALF_SIDE, HALF_SIDE, CELLS, dtype=np.float32))
     lines = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
     near = torch.cdist(lines, q[:, :2]).amin(-1)
-    return GroundMap(
+    return GroundHeight(
         height=(height + middle).float().view(CELLS, CELLS),
         known=(near < REACH).view(CELLS, CELLS),
         sure=_next_to(q),

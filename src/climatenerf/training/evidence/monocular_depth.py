@@ -13,7 +13,7 @@ KEPT = 0.95  # of the sums from step to step
 MIN_RAYS = 20.0  # of an image, before its scale and shift are believed
 
 
-class RelativeDepth:
+class DepthAlignment:
     """Scale and shift of every image's relative depth."""
 
     def __init__(self, images: int):

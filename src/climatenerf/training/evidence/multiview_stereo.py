@@ -16,7 +16,7 @@ from climatenerf.core.classes import SKY
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.ops.cpu.plane_sweep import TILES, UNSEEN, Pictures, match
 from climatenerf.training.dataset import TrainingPixels, in_one_row
-from climatenerf.training.evidence.sparse_depth import PointRays
+from climatenerf.training.evidence.sparse_depth import SparseDepth
 
 WINDOWS = 2**17  # that are looked for, of all photos together, at most,
 PIXELS = 8  # of a photo's for one window
@@ -33,12 +33,12 @@ WIDE = 0.1  # least cosine from a camera's axis: beyond it no pinhole sees a pix
 WEIGHTS = (0.299, 0.587, 0.114)  # of grey (Rec. 601)
 
 
-def match_photos(
+def plane_sweep_depth(
     pixels: TrainingPixels,
-    points: PointRays | None,
+    points: SparseDepth | None,
     typical: tuple[float, float],
     seed: int,
-) -> PointRays | None:
+) -> SparseDepth | None:
     """Rays of random pixels to the places that neighbouring photos show alike.
 
     Args:
@@ -47,8 +47,8 @@ def match_photos(
         typical: nearest and typical distance (m) where no points do.
         seed: of the pixels that are chosen.
     """
-    near, middle = distances(pixels, points, typical)
-    pictures = pictures_of(pixels, near, middle)
+    near, middle = depth_ranges(pixels, points, typical)
+    pictures = build_pictures(pixels, near, middle)
     windows = min(WINDOWS, pixels.rgb.shape[0] // PIXELS)
     pixel = pixels.anywhere(windows, torch.Generator().manual_seed(seed))
     if pixels.label is not None:
@@ -64,7 +64,7 @@ def match_photos(
     found = match(pictures, of, pixel)
     sure = _sure(pictures, of, pixel, found)
     of, local, z = of[sure], local[sure], 1 / found[sure, 0]
-    kept = seen_back(pictures, of, local * z[:, None])
+    kept = confirmed_by_neighbour(pictures, of, local * z[:, None])
     if not kept.any():
         return None
     of, local, z = (
@@ -73,7 +73,7 @@ def match_photos(
         to_device(z[kept]),
     )
     c2w, length = pixels.c2w[of], local.norm(dim=-1)
-    return PointRays(
+    return SparseDepth(
         rays_o=c2w[:, :3, 3].contiguous(),
         rays_d=(c2w[:, :3, :3] @ (local / length[:, None])[:, :, None])[:, :, 0].contiguous(),
         depth=z * length,
@@ -81,7 +81,7 @@ def match_photos(
     )
 
 
-def seen_back(
+def confirmed_by_neighbour(
     pictures: Pictures, of: Int[np.ndarray, "n"], x: Float[np.ndarray, "n 3"]
 ) -> Bool[np.ndarray, "n"]:
     """Whether a neighbour, searching in its turn, finds places x (in camera frames), too."""
@@ -118,7 +118,7 @@ def _tiles(place: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
 def _tiles_towards(
     pixels: TrainingPixels, image: Int[np.ndarray, "n"], local: Float[np.ndarray, "n 3"]
 ) -> Int[np.ndarray, "n"]:
-    """The tiles in which straightened photos show directions; -1 outside."""
+    """The tiles in which undistorted photos show directions; -1 outside."""
     shape = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in pixels.cameras])[image]
     z = np.maximum(local[:, 2:], WIDE)
     place = (local[:, :2] / z * shape[:, :2] + shape[:, 2:4]) / shape[:, 4:]
@@ -139,8 +139,8 @@ def _sure(
     return alike & (inverse > 0) & (inverse < most)
 
 
-def distances(
-    pixels: TrainingPixels, points: PointRays | None, typical: tuple[float, float]
+def depth_ranges(
+    pixels: TrainingPixels, points: SparseDepth | None, typical: tuple[float, float]
 ) -> tuple[Float[np.ndarray, "v tiles"], Float[np.ndarray, "v tiles"]]:
     """The nearest z-depth (m) that each tile of the photos may show, and the median ray length."""
     count = pixels.c2w.shape[0]
@@ -164,7 +164,7 @@ def distances(
     return near, middle
 
 
-def pictures_of(
+def build_pictures(
     pixels: TrainingPixels,
     near: Float[np.ndarray, "v tiles"],
     middle: Float[np.ndarray, "v tiles"],
@@ -175,7 +175,7 @@ def pictures_of(
     rgb = to_numpy(pixels.rgb)
     usable = None if pixels.usable is None else to_numpy(pixels.usable)
     straight = (
-        straightened(camera, rgb[a:b], None if usable is None else usable[a:b])
+        undistorted_grey(camera, rgb[a:b], None if usable is None else usable[a:b])
         for camera, a, b in zip(pixels.cameras, starts[:-1], starts[1:], strict=True)
     )
     shapes = [(camera.height, camera.width) for camera in pixels.cameras]
@@ -195,7 +195,7 @@ def pictures_of(
     )
 
 
-def straightened(
+def undistorted_grey(
     camera: Camera, rgb: UInt8[np.ndarray, "hw 3"], usable: Bool[np.ndarray, "hw"] | None
 ) -> UInt8[np.ndarray, "h w"]:
     """A photo in grey as a pinhole camera of the same size would have it.

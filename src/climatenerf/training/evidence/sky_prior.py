@@ -25,7 +25,7 @@ SPREADS = 400  # rounds of spreading, over some 20 cells; what lies farther stay
 
 
 @dataclass(frozen=True)
-class SkyFill:
+class SkyPrior:
     """Colours of the sky where no photo shows it."""
 
     colour: Float[Tensor, "rows columns 3"]
@@ -51,7 +51,7 @@ def direction(row: Float[Tensor, "n"], column: Float[Tensor, "n"]) -> Float[Tens
     return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=-1)
 
 
-def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill:
+def fit_sky_prior(pixels: TrainingPixels, generator: torch.Generator) -> SkyPrior:
     """The sky of all photos on a map, and its gaps filled.
 
     Where no label tells sky, whatever photos show above the horizon stands for it: indoors, rays
@@ -69,8 +69,8 @@ def fill_sky(pixels: TrainingPixels, generator: torch.Generator) -> SkyFill:
         known, seen = looked_at(batch, above)
     if not bool(seen.any()):
         ground = luma(decode_srgb(batch.rgb)).mean()
-        return SkyFill((ground / ALBEDO).clamp_max(1.0).expand(ROWS, COLUMNS, 3), ~seen)
-    return SkyFill(spread(known, seen), ~seen)
+        return SkyPrior((ground / ALBEDO).clamp_max(1.0).expand(ROWS, COLUMNS, 3), ~seen)
+    return SkyPrior(spread(known, seen), ~seen)
 
 
 def looked_at(

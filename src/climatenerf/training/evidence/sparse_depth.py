@@ -14,7 +14,7 @@ from climatenerf.training.dataset import TrainingPixels
 
 
 @dataclass(frozen=True)
-class PointRays:
+class SparseDepth:
     """Rays that end on a sparse point."""
 
     rays_o: Float[Tensor, "m 3"]
@@ -31,18 +31,18 @@ class PointRays:
         """The points, world m."""
         return self.rays_o + self.depth[:, None] * self.rays_d
 
-    def some(self, which: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "PointRays":
+    def select(self, which: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "SparseDepth":
         """Those of the given rows, or of a mask."""
-        return PointRays(
+        return SparseDepth(
             self.rays_o[which], self.rays_d[which], self.depth[which], self.image[which]
         )
 
-    def draw(self, n: int, generator: torch.Generator) -> "PointRays":
+    def draw(self, n: int, generator: torch.Generator) -> "SparseDepth":
         """n random ones of them."""
-        return self.some(integers(generator, 0, self.depth.shape[0], n))
+        return self.select(integers(generator, 0, self.depth.shape[0], n))
 
 
-def find_point_rays(scene: Scene) -> PointRays | None:
+def read_sparse_depth(scene: Scene) -> SparseDepth | None:
     """One ray for each point that each training view shows, or None if that is not known."""
     points = scene.points_world()
     eyes, ends, of = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, int)]
@@ -58,7 +58,7 @@ def find_point_rays(scene: Scene) -> PointRays | None:
     if not kept.any():
         return None
     rays_d = (end - eye)[kept] / depth[kept, None]
-    return PointRays(
+    return SparseDepth(
         rays_o=to_device(eye[kept].astype(np.float32)),
         rays_d=to_device(rays_d.astype(np.float32)),
         depth=to_device(depth[kept].astype(np.float32)),
@@ -66,16 +66,16 @@ def find_point_rays(scene: Scene) -> PointRays | None:
     )
 
 
-def shown_points(scene: Scene, pixels: TrainingPixels) -> PointRays | None:
-    """`find_point_rays` of what no mask hides: behind a mirror there is no wall at that depth."""
-    points = find_point_rays(scene)
+def unmasked_sparse_depth(scene: Scene, pixels: TrainingPixels) -> SparseDepth | None:
+    """`read_sparse_depth` of what no mask hides: behind a mirror there is no wall at that depth."""
+    points = read_sparse_depth(scene)
     if points is None:
         return None
     kept = pixels.usable_towards(points.image, points.rays_d)
-    return points.some(kept) if bool(kept.any()) else None
+    return points.select(kept) if bool(kept.any()) else None
 
 
-def joined(some: Sequence[PointRays]) -> PointRays:
+def concatenate(some: Sequence[SparseDepth]) -> SparseDepth:
     """The rays of all of them; at least one."""
     every = zip(*(vars(each).values() for each in some), strict=True)
-    return PointRays(*(torch.cat(same) for same in every))
+    return SparseDepth(*(torch.cat(same) for same in every))

@@ -23,7 +23,7 @@ MIN_VOICES = 2  # views that must agree
 APART = 0.1  # of the cameras' spread: neighbouring frames err alike, so they have one voice
 
 
-class Witness:
+class VisualHull:
     """Asks views whether a place is in front of what they label as one of some classes."""
 
     def __init__(
@@ -55,7 +55,7 @@ class Witness:
         eyes = poses[:, :3, 3]
         self.apart = APART * float(np.linalg.norm(eyes - eyes.mean(0), axis=-1).mean())
 
-    def agreed(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    def consensus(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether enough views see nothing else within `radius` (m) of places x (world m)."""
         least = (MIN_VOICES, self.share, self.apart)
         return dispatch.label_votes(x, radius, self.views, least)
