@@ -1,4 +1,4 @@
-"""Snow on scenes in closed form: every check of its physics that needs no reference scene."""
+"""Snow on analytic scenes: thickness, coverage, shelter, brightness, wind and cascades."""
 
 import math
 
@@ -31,8 +31,8 @@ def on_plane(plane: HalfSpace, n: int, half: float = 1.3, seed: int = 0) -> torc
     return torch.cat([xy, z[:, None]], -1)
 
 
-def first_point(snow, rays_o, rays_d):
-    """Where rays meet the snow: mean over the rendering weights; and their opacity."""
+def mean_hit(snow, rays_o, rays_d):
+    """Mean point of each ray over its rendering weights, and its opacity."""
     zero = torch.zeros(len(rays_o))
     samples = snow.march(rays_o, rays_d, zero, zero + torch.inf)
     points, opacities = [], []
@@ -48,7 +48,7 @@ def first_point(snow, rays_o, rays_d):
 
 @pytest.mark.parametrize("case", range(24))
 def test_thickness_over_planes(case):
-    """Random offsets, tilts up to 5 degrees, headings and spacings; nothing was calibrated."""
+    """Random offsets, headings and spacings, and tilts up to 5 degrees."""
     rng = np.random.default_rng(case)
     depth = (0.02, 0.03, 0.05, 0.1, 0.2, 0.4)[case % 6]
     plane = ground(
@@ -60,11 +60,11 @@ def test_thickness_over_planes(case):
     feet = on_plane(plane, 60, 0.6, seed=case)
     assert snow.covered(feet).all()
     assert snow.depth_over(feet).numpy() == pytest.approx(np.full(60, depth), rel=0.1)
-    # RenderOutput from the side, too.
-    aside = torch.tensor(rng.normal(0, 1.0, (60, 3)), dtype=torch.float32)
-    aside[:, 2] = 2.0
-    direction = -aside / aside.norm(dim=1, keepdim=True)
-    points, opacity = first_point(snow, feet - 1.2 * direction, direction)
+    # The same for rays from the side.
+    origin = torch.tensor(rng.normal(0, 1.0, (60, 3)), dtype=torch.float32)
+    origin[:, 2] = 2.0
+    direction = -origin / origin.norm(dim=1, keepdim=True)
+    points, opacity = mean_hit(snow, feet - 1.2 * direction, direction)
     height = plane.distance(points) / plane.normal[2]
     assert opacity.min() > 0.998
     assert height.numpy() == pytest.approx(np.full(60, depth), rel=0.1)
@@ -75,7 +75,7 @@ def test_thickness_over_planes(case):
     assert (normal @ torch.tensor(plane.normal)).min() > math.cos(math.radians(6))
 
 
-def test_coverage_follows_the_slope():
+def test_coverage_is_a_logistic_of_the_slope():
     for slope in (20.0, 30.0, 35.0, 37.0, 39.0, 45.0, 60.0):
         plane = ground(math.radians(slope), 0.7)
         snow = bake([plane], 0.1)
@@ -87,14 +87,14 @@ def test_coverage_follows_the_slope():
             assert snow.deposits.weight[middle].mean() == pytest.approx(logistic, abs=0.02)
         else:
             assert snow.deposits.weight[middle].sum() == 0 or snow.deposits.weight.max() < 0.02
-        share = float(snow.covered(on_plane(plane, 400, 0.6)).float().mean())
+        covered = float(snow.covered(on_plane(plane, 400, 0.6)).float().mean())
         if slope < 36:
-            assert share == 1
+            assert covered == 1
         if slope > 38:
-            assert share == 0
+            assert covered == 0
 
 
-def test_bare_under_a_roof_and_covered_in_the_open():
+def test_ground_is_bare_under_a_roof_and_covered_in_the_open():
     roof = [
         Box((-0.8, -1.5, 2.0), (0.8, 0.7, 2.1)),
         Box((-0.8, -1.5, -1.0), (-0.7, -1.4, 2.0)),
@@ -123,7 +123,7 @@ def test_no_snow_hangs_below_a_thin_table():
         assert snow.depth_over(on_top).numpy() == pytest.approx(depth, rel=0.1)
 
 
-def test_swept_depth_is_monotone():
+def test_thickness_increases_with_depth():
     rocks = [Box((x, x / 2, -1), (x + 0.3, x / 2 + 0.4, x / 4 + 0.3)) for x in (-1.0, -0.4, 0.3)]
     slope = HalfSpace((-math.sin(0.6), 0.0, math.cos(0.6)), -0.4)
     field = [ground(0.05, 1.0), slope, *rocks]
@@ -134,22 +134,22 @@ def test_swept_depth_is_monotone():
         thickness.append(snow.with_depth(depth).depth_over(feet))
     steps = torch.stack(thickness).diff(dim=0)
     assert thickness[0].max() == 0
-    assert steps.min() > -1e-3  # of the march; the lattice itself is monotone
+    assert steps.min() > -1e-3  # error of the march; the lattice itself is monotone
     assert (thickness[-1] > 0.3).float().mean() > 0.7
     assert torch.equal(snow.depth_over(feet), thickness[-1])
 
 
-def test_the_limit_of_no_snow():
+def test_vanishing_depth_gives_no_snow():
     assert bake([ground()], None) is None
     assert bake([ground()], 0.0) is None
     snow = bake([ground()], 1e-4)
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(200, 3)
     feet = on_plane(ground(), 200)
-    _, opacity = first_point(snow, feet - 2 * down, down)
+    _, opacity = mean_hit(snow, feet - 2 * down, down)
     assert opacity.max() < 1e-4
 
 
-def test_empty_scene_and_extremes_stay_finite():
+def test_empty_scene_and_extreme_parameters_stay_finite():
     nothing = bake([], 0.1)
     assert nothing is not None
     assert nothing.depth_over(on_plane(ground(), 5)).tolist() == [0.0] * 5
@@ -166,7 +166,7 @@ def test_empty_scene_and_extremes_stay_finite():
         assert (snow.colour(points) >= 0).all()
 
 
-def test_same_seed_same_snow_on_any_number_of_threads():
+def test_snow_depends_on_the_seed_but_not_on_threads():
     threads = numba.get_num_threads()
     scene = [ground(0.04, 2.0), *table()]
     first = bake(scene, seed=3)
@@ -187,11 +187,11 @@ def test_same_seed_same_snow_on_any_number_of_threads():
     assert not np.array_equal(first.deposits.weight, bake(scene, seed=4).deposits.weight)
 
 
-def test_brightness():
+def test_brightness_over_white_and_black_ground():
     white = HalfSpace(colour=(1.0, 1.0, 1.0))
     feet = on_plane(white, 50)
     top = feet + torch.tensor([0.0, 0.0, 0.1])
-    # Snow on white ground is white under the light that the scene has, and no brighter.
+    # Snow on white ground has the radiance of a white surface in the scene's light.
     light = np.array([0.02, 0.03, 0.05])
     dim = bake([white], light=light / 10)
     expected = np.broadcast_to(light / 10, (50, 3))
@@ -199,12 +199,12 @@ def test_brightness():
     assert bake([white], light=light).colour(top).numpy() == pytest.approx(
         np.broadcast_to(light, (50, 3)), rel=0.02
     )
-    # Over dark ground: (0 + c0) / (1 + c0).
+    # On black ground: (0 + c0)/(1 + c0).
     dark = bake([HalfSpace(colour=(0.0, 0.0, 0.0))]).colour(top)
     assert dark.numpy() == pytest.approx(0.8, rel=0.02)
 
 
-def test_shadow_towards_the_sun():
+def test_sun_shadow_darkens_snow():
     wall = Box((0.5, -8.0, -1.0), (0.7, 8.0, 1.0))
     sun = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
     snow = bake([HalfSpace(colour=(1.0, 1.0, 1.0)), wall], sun=sun)
@@ -215,7 +215,7 @@ def test_shadow_towards_the_sun():
     assert lit.numpy() == pytest.approx(wrap, rel=0.02)
 
 
-def test_wind_leaves_the_lee_bare():
+def test_tilted_fall_leaves_the_lee_of_a_wall_bare():
     wall = Box((-0.1, -8.0, -1.0), (0.1, 8.0, 0.8))
     # From +x (90 degrees clockwise from +y), 45 degrees from the vertical.
     snow = bake([ground(), wall], fall_tilt=math.radians(45), wind_direction=math.radians(90))
@@ -230,7 +230,7 @@ def test_wind_leaves_the_lee_bare():
     assert snow.depth_over(line(0.6)).mean() == pytest.approx(0.1, rel=0.1)
 
 
-def test_fall_directions():
+def test_fall_directions_are_spread_about_the_wind():
     directions = fall_directions(Snow(depth=0.1), 0)
     assert np.linalg.norm(directions, axis=1) == pytest.approx(1)
     assert directions.mean(0)[:2] == pytest.approx([0, 0], abs=1e-12)
@@ -240,7 +240,7 @@ def test_fall_directions():
     assert not np.allclose(fall_directions(Snow(depth=0.1), 5), directions)
 
 
-def test_nothing_below_the_water():
+def test_no_snow_below_the_water_level():
     snow = bake([ground(), Box((-0.5, -0.5, -1.0), (0.5, 0.5, 0.6))]).above(0.3)
     feet = on_plane(ground(), 300)
     depth = snow.depth_over(feet)
@@ -249,7 +249,7 @@ def test_nothing_below_the_water():
     assert not snow.covered(feet).any()
     top = torch.tensor([[0.0, 0.1, 0.6]])
     assert snow.depth_over(top).item() == pytest.approx(0.1, rel=0.1)
-    # From under the water upwards, and level rays on both sides.
+    # A ray upwards from under water, and horizontal rays above and below the water level.
     o = torch.tensor([[1.0, 1.0, 0.2], [2.0, 0.0, 0.65], [2.0, 0.0, 0.05]])
     d = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     samples = snow.march(o, d, torch.zeros(3), torch.full((3,), 9.0))
@@ -259,31 +259,31 @@ def test_nothing_below_the_water():
     assert counts[2] == 0
 
 
-def test_cascades_meet_without_a_step():
+def test_thickness_is_continuous_across_cascades():
     grid = SnowGrid((0.0, 0.0), (-1.0, 2.0), 0.05, 16, 3)  # 0.8, 1.6 and 3.2 m
     snow = bake([ground(0.03, 0.4)], 0.1, grid)
     plane = ground(0.03, 0.4)
     feet = on_plane(plane, 3000, 3.1)
     assert snow.covered(feet).all()
     assert snow.depth_over(feet).numpy() == pytest.approx(0.1, rel=0.1)
-    # A slanting ray through all three lands where it should.
+    # An oblique ray through all three cascades hits the snow at the right height.
     direction = torch.tensor([[0.95, 0.1, -0.3]])
     direction /= direction.norm()
-    points, opacity = first_point(snow, torch.tensor([[-2.9, 0.1, 0.6]]), direction)
+    points, opacity = mean_hit(snow, torch.tensor([[-2.9, 0.1, 0.6]]), direction)
     assert opacity > 0.99
     assert plane.distance(points).item() == pytest.approx(0.1, abs=0.01)
 
 
-def test_fuzzy_ground():
-    """A fitted surface is not sharp: depth counts from where half of the light is gone."""
+def test_depth_is_measured_from_the_half_transmittance_of_blurred_ground():
+    """A fitted surface is blurred; its height is where the transmittance from above is 1/2."""
     field = AnalyticField([ground()], extinction=40.0, box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
     snow = bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=GRID)
     assert snow is not None
-    own = on_plane(ground(0, 0, -math.log(2) / 40), 300)
-    assert snow.depth_over(own).numpy() == pytest.approx(0.1, rel=0.1)
+    surface = on_plane(ground(0, 0, -math.log(2) / 40), 300)
+    assert snow.depth_over(surface).numpy() == pytest.approx(0.1, rel=0.1)
 
 
-def test_grid_choice():
+def test_grid_adapts_to_path_and_scene():
     lower, upper = np.array([-190.0, -190.0, -190.0]), np.array([190.0, 190.0, 190.0])
     street = np.stack([np.linspace(-8, 8, 20), np.zeros(20), np.full(20, 1.6)], 1)
     grid = choose_grid(lower, upper, street)
@@ -301,7 +301,7 @@ def test_grid_choice():
         SnowGrid((0.0, 0.0), (0.0, 1.0), 0.05, 40)
 
 
-def test_progress_reaches_the_end():
+def test_progress_increases_to_one():
     seen: list[float] = []
     field = AnalyticField([ground()], box=((-2.0, -2.0, -1.0), (2.0, 2.0, 3.0)))
     bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=GRID, progress=seen.append)

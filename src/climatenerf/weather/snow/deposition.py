@@ -1,8 +1,8 @@
-"""Where snow lands: rays are shot along the fall direction, from the sky into the fitted field.
+"""Deposition of snow: rays along the fall direction, from the sky into the fitted field.
 
-Snow stays where such a ray first meets matter, so nothing lies under a roof or a table. A ray's
-deposit is the point where half of its light is gone: thin floaters and the fuzz of a fitted surface
-move it by nothing or by little.
+Snow stays where such a ray first meets a surface, so the ground under a roof or a table stays bare.
+The deposit of a ray lies where its transmittance is 1/2. Thin floaters and the blurred density of a
+fitted surface shift that point little or not at all.
 """
 
 import math
@@ -18,51 +18,51 @@ from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.protocol import RadianceField
 from climatenerf.weather.parameters import Snow
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid
-from climatenerf.weather.snow.surface_fit import halfway, smooth_ground
+from climatenerf.weather.snow.surface_fit import half_transmittance, smooth_ground
 
 PASSES = 3
-"""Fall directions; three, so that no half-sheltered place lies exactly on the threshold."""
-SLOPE_BASE = 0.4  # m; a fitted surface is rough, and over less its slopes are those of noise
-_FAR = 2  # from this cascade on one direction has to do
+"""Number of fall directions; three, so that no half-sheltered point is exactly at the threshold."""
+SLOPE_BASE = 0.4  # m; a fitted surface is rough, and slopes over a shorter base are noise
+_FIRST_SINGLE_PASS = 2  # cascades from this one on use one fall direction
 JITTER = 0.05
 """Spread of the fall direction, rad."""
-_CHUNK = 1 << 14  # rays marched at once
-_STRETCH = 100.0  # spacings; a field's steps may grow along a ray, so rays start anew after this
+_CHUNK = 1 << 14  # rays per march
+_STRETCH = 100.0  # spacings; a field's steps may grow along a ray, so rays restart after this
 _LUMA = (0.2126, 0.7152, 0.0722)  # Rec. 709
 
 
 class Light(NamedTuple):
-    """The scene's light, as snow sees it."""
+    """Illumination of the snow."""
 
     irradiance_over_pi: Float[np.ndarray, "3"]
-    """Linear radiance of a white horizontal surface in the open."""
+    """Linear radiance of a white, unoccluded horizontal surface."""
     sun_direction: Float[np.ndarray, "3"] | None
-    """Unit vector towards the sun; None (or below the horizon): diffuse light only."""
+    """Unit vector towards the sun, world frame; None or below the horizon: diffuse light only."""
 
 
 def fall_directions(snow: Snow, seed: int) -> Float[np.ndarray, "p 3"]:
-    """Directions that snow falls along, one for each pass: the wind's tilt, slightly spread.
+    """Return the fall direction of each pass: the tilted mean direction plus a small spread.
 
     Args:
-        snow: its fall_tilt and wind_direction (where the wind comes from, clockwise from +y).
-        seed: turns the spread.
+        snow: fall_tilt and wind_direction (where the wind comes from, clockwise from +y), rad.
+        seed: random seed of the rotation of the spread.
 
     Returns:
-        Unit vectors pointing down.
+        Unit vectors that point downwards, world frame.
     """
     tilt, azimuth = snow.fall_tilt, snow.wind_direction
     away = -np.array([math.sin(azimuth), math.cos(azimuth), 0.0])
     fall = math.sin(tilt) * away - math.cos(tilt) * np.array([0.0, 0.0, 1.0])
     across = np.array([away[1], -away[0], 0.0])
     along = np.cross(across, fall)
-    # Evenly on a circle whose spread equals that of a disc of radius JITTER.
-    turn = np.random.default_rng(seed).uniform(0, 2 * math.pi)
-    angles = turn + 2 * math.pi * np.arange(PASSES) / PASSES
+    # Evenly spaced on a circle with the same variance as a disc of radius JITTER.
+    phase = np.random.default_rng(seed).uniform(0, 2 * math.pi)
+    angles = phase + 2 * math.pi * np.arange(PASSES) / PASSES
     spread = JITTER / math.sqrt(2)
     directions = fall + spread * (
         np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * along
     )
-    # At the largest tilt (80 deg) the spread still leaves every direction downwards.
+    # Even at the largest tilt (80 deg) every direction points downwards.
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
@@ -76,24 +76,25 @@ def find_deposits(
     progress: Callable[[float], None] | None = None,
     appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Deposits:
-    """Find where snow lands and how bright it is there.
+    """Find where snow lands and how bright it is there. World frame, m.
 
     Args:
         field: the fitted field.
-        snow: fall direction, slope, colour; its depth only says from where the sun is looked for.
-        grid: where to look.
-        light: the scene's light.
-        cameras: camera positions, m: the field is asked for colours as seen from the nearest.
-        seed: of the fall direction's spread and the rays' offsets.
-        progress: called with the share that is done, 0 to 1.
-        appearance: exposure and light of the field's colours; None: the mean of all photos.
+        snow: fall direction, slope and colour. Its depth only sets the height from which shadow
+            rays towards the sun start.
+        grid: extent and spacing of the search.
+        light: illumination of the scene.
+        cameras: camera positions, m. Colours of the ground are those seen from the nearest one.
+        seed: random seed of the fall directions' spread and of the rays' offsets.
+        progress: callback with the finished fraction, 0 to 1.
+        appearance: exposure and lighting of the field's colours; None: the mean of all photos.
 
     Returns:
-        The deposits; none where nothing catches snow.
+        The deposits; empty where no surface catches snow.
     """
     directions = fall_directions(snow, seed)
-    passes = np.array([PASSES if k < _FAR else 1 for k in range(grid.cascades)])
-    done, last = 0, int(passes.sum())
+    passes = np.array([PASSES if k < _FIRST_SINGLE_PASS else 1 for k in range(grid.cascades)])
+    done, total = 0, int(passes.sum())
     positions: list[np.ndarray] = []
     weights: list[np.ndarray] = []
     shades: list[np.ndarray] = []
@@ -101,12 +102,12 @@ def find_deposits(
     for k in range(grid.cascades):
         for p in range(passes[k]):
 
-            def tell(share: float, done: int = done) -> None:
+            def pass_progress(fraction: float, done: int = done) -> None:
                 if progress is not None:
-                    progress((done + share) / last)
+                    progress((done + fraction) / total)
 
             random = np.random.default_rng([seed, k, p])
-            hits, weight = _land(field, snow, grid, k, directions[p], random, tell)
+            hits, weight = _run_pass(field, snow, grid, k, directions[p], random, pass_progress)
             done += 1
             shade = np.full(len(hits), np.nan, np.float32)
             if p == 0:
@@ -125,30 +126,33 @@ def find_deposits(
     )
 
 
-def _land(
+def _run_pass(
     field: RadianceField,
     snow: Snow,
     grid: SnowGrid,
     cascade: int,
     direction: Float[np.ndarray, "3"],
     random: np.random.Generator,
-    tell: Callable[[float], None],
+    progress: Callable[[float], None],
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n"]]:
-    """One pass over one cascade: parallel rays on a square grid, one in each cell.
+    """Run one pass over one cascade: parallel rays on a square grid, one per cell.
 
-    The grid and the tent of `snow_lattice` make a partition of unity, so level ground receives
-    exactly the same everywhere.
+    The tent functions of `snow.lattice` on this grid are a partition of unity, so horizontal ground
+    receives exactly the same amount of snow everywhere.
+
+    Returns:
+        Deposits (m, world frame) and their weights, 0 to 1.
     """
     h = grid.spacing_of(cascade)
     half = grid.half_side(cascade) + 3 * h
     bottom, top = grid.z_range
     middle = (bottom + top) / 2
     drift = direction[:2] / -direction[2]  # metres sideways per metre of fall
-    # Rays are numbered by where they cross the middle height; those that land in the square at
-    # any height cross up to `reach` beside it. The sideways way is cut at the square's side.
-    reach = np.minimum(np.abs(drift) * (top - bottom) / 2, half)
-    count = np.ceil((2 * (half + reach)) / h).astype(int)
-    first = np.array(grid.centre) - half - reach + random.uniform(0, h, 2)
+    # Rays are indexed by where they cross the middle height. A ray that lands in the square may
+    # cross the middle height up to `margin` outside it; the margin is at most half a side.
+    margin = np.minimum(np.abs(drift) * (top - bottom) / 2, half)
+    count = np.ceil((2 * (half + margin)) / h).astype(int)
+    first = np.array(grid.centre) - half - margin + random.uniform(0, h, 2)
     hits = np.full((count[1], count[0], 3), np.nan, np.float32)
     opacity = np.zeros((count[1], count[0]), np.float32)
     rows = max(1, _CHUNK // count[0])
@@ -158,37 +162,40 @@ def _land(
         x = np.broadcast_to(first[0] + np.arange(count[0]) * h, (len(j), count[0]))
         y = np.broadcast_to((first[1] + j * h)[:, None], x.shape)
         crossing = np.stack([x, y], -1)
-        begin = crossing - drift * (top - middle)
-        wanted = _outside(begin, crossing + drift * (middle - bottom), grid.centre, inner)
-        rays_o = np.concatenate([begin[wanted], np.full((int(wanted.sum()), 1), top)], -1)
-        length, dark = _first_hits(
+        start = crossing - drift * (top - middle)
+        selected = _leaves_square(start, crossing + drift * (middle - bottom), grid.centre, inner)
+        rays_o = np.concatenate([start[selected], np.full((int(selected.sum()), 1), top)], -1)
+        hit_t, hit_opacity = _first_hits(
             field, rays_o, direction, (top - bottom) / -direction[2], _STRETCH * h, random
         )
-        hits[row : row + len(j)][wanted] = rays_o + length[:, None] * direction
-        opacity[row : row + len(j)][wanted] = dark
-        tell(min(row + rows, count[1]) / count[1])
-    # A smoother ground is what the snow lies on: a fitted surface is rough by centimetres.
+        hits[row : row + len(j)][selected] = rays_o + hit_t[:, None] * direction
+        opacity[row : row + len(j)][selected] = hit_opacity
+        progress(min(row + rows, count[1]) / count[1])
+    # Snow lies on a smoothed ground, since a fitted surface is rough by centimetres.
     base = max(2, round(SLOPE_BASE / h))
-    smooth, up = smooth_ground(hits, direction / -direction[2], 0.03 + 0.5 * h, base)
+    smooth, slope_cosine = smooth_ground(hits, direction / -direction[2], 0.03 + 0.5 * h, base)
     weight = np.clip((opacity - 0.5) / 0.3, 0, 1)
-    steep = snow.slope_sharpness * (up - math.cos(snow.slope))
-    weight = weight / (1 + np.exp(-np.clip(steep, -60, 60)))
-    away = np.abs(smooth[..., :2] - np.array(grid.centre, np.float32)).max(-1)
-    keep = (weight > 1e-3) & (away < half) & (away >= inner)  # NaN: no hit, compares False
+    logit = snow.slope_sharpness * (slope_cosine - math.cos(snow.slope))
+    weight = weight / (1 + np.exp(-np.clip(logit, -60, 60)))
+    offset = np.abs(smooth[..., :2] - np.array(grid.centre, np.float32)).max(-1)
+    keep = (weight > 1e-3) & (offset < half) & (offset >= inner)  # no hit: NaN compares False
     return smooth[keep], weight[keep].astype(np.float32)
 
 
-def _outside(
+def _leaves_square(
     start: Float[np.ndarray, "*n 2"],
     end: Float[np.ndarray, "*n 2"],
     centre: tuple[float, float],
     inner: float,
 ) -> np.ndarray:
-    """Rays with an end outside the inner square (the finer cascade has the others)."""
+    """Return True for rays with an end outside the inner square.
+
+    The finer cascade handles the other rays.
+    """
     if inner <= 0:
         return np.ones(start.shape[:-1], bool)
-    away = np.maximum(np.abs(start - np.array(centre)), np.abs(end - np.array(centre)))
-    return away.max(-1) >= inner
+    offset = np.maximum(np.abs(start - np.array(centre)), np.abs(end - np.array(centre)))
+    return offset.max(-1) >= inner
 
 
 def _first_hits(
@@ -199,31 +206,34 @@ def _first_hits(
     stretch: float,
     random: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Ray length at which half of the light is gone (NaN: nowhere), and the opacity.
+    """Return the ray length of transmittance 1/2 (NaN: never reached) and the opacity.
 
-    A ray is followed in stretches, the first of random length: else the samples of neighbours would
-    lie at the same heights, and a gently sloping ground would get steps.
+    Rays are marched in stretches of `stretch` metres, and the first stretch has a random length.
+    Otherwise the samples of neighbouring rays would lie at equal heights, and gently sloping ground
+    would get steps.
     """
-    where = np.full(len(rays_o), np.nan)
-    depth = np.zeros(len(rays_o))
-    begin = -random.uniform(0, stretch, len(rays_o))
-    alive = np.arange(len(rays_o))
-    while len(alive):
-        start = begin[alive]
-        origins = to_device((rays_o[alive] + start[:, None] * direction).astype(np.float32))
+    hit_t = np.full(len(rays_o), np.nan)
+    depth = np.zeros(len(rays_o))  # optical depth so far
+    next_start = -random.uniform(0, stretch, len(rays_o))
+    active = np.arange(len(rays_o))
+    while len(active):
+        start = next_start[active]
+        origins = to_device((rays_o[active] + start[:, None] * direction).astype(np.float32))
         directions = torch.tensor(direction, dtype=torch.float32).expand_as(origins).contiguous()
         t_min = to_device(np.maximum(-start, 0).astype(np.float32))
         t_max = to_device(np.minimum(length - start, stretch).astype(np.float32))
         samples = field.march(origins, directions, t_min, t_max)
         parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
-        found = halfway(*(to_numpy(part) for part in parts), depth[alive])
-        where[alive] = np.where(np.isnan(found[0]), where[alive], found[0] + start)
-        depth[alive] = found[1]
-        begin[alive] += stretch
-        alive = alive[(found[1] < 7) & (begin[alive] < length)]
-    # Rays that begin inside of something (a tower higher than the region) land nowhere.
-    where[where < 0.01] = np.nan
-    return where, -np.expm1(-depth)
+        found_t, found_depth = half_transmittance(
+            *(to_numpy(part) for part in parts), depth[active]
+        )
+        hit_t[active] = np.where(np.isnan(found_t), hit_t[active], found_t + start)
+        depth[active] = found_depth
+        next_start[active] += stretch
+        active = active[(found_depth < 7) & (next_start[active] < length)]
+    # A ray that starts inside a solid (a tower higher than the region) has no deposit.
+    hit_t[hit_t < 0.01] = np.nan
+    return hit_t, -np.expm1(-depth)
 
 
 def _shade(
@@ -235,22 +245,26 @@ def _shade(
     cameras: Float[np.ndarray, "m 3"],
     appearance: Float[Tensor, "1 e"] | None,
 ) -> Float32[np.ndarray, "n"]:
-    """Brightness (g + c0)/(1 + c0) (beta_s V_s + V_s0) of snow on the hits, 0 to 1."""
+    """Return the brightness (g + c0)/(1 + c0) (beta_s V_s + V_s0) of snow on the hits, 0 to 1.
+
+    g is the ground's luminance relative to a white surface, V_s the visibility of the sun; c0,
+    beta_s and V_s0 are `albedo_offset`, `sun_share` and `shade` of the parameters.
+    """
     if not len(hits):
         return np.zeros(0, np.float32)
     luma = torch.tensor(_LUMA)
-    white = max(float(np.dot(light.irradiance_over_pi, _LUMA)), 1e-6)  # 0: g would be 0 / 0
-    viewers = torch.tensor(cameras, dtype=torch.float32)
+    white = max(float(np.dot(light.irradiance_over_pi, _LUMA)), 1e-6)  # black scene: g would be 0/0
+    positions = torch.tensor(cameras, dtype=torch.float32)
     sun = light.sun_direction
     lift = (snow.depth or 0.0) + max(0.05, spacing)
     lower, upper = field.bounds
-    across = float((upper - lower).norm())
+    diagonal = float((upper - lower).norm())
     shades = []
     for points in to_device(hits).split(_CHUNK):
-        nearest = viewers[torch.cdist(points, viewers).argmin(1)]
-        away = points - nearest
-        # A camera inside the ground's fuzz would give a direction of length 0.
-        d = away / away.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        nearest = positions[torch.cdist(points, positions).argmin(1)]
+        offset = points - nearest
+        # A camera inside the blurred density of the ground would give a direction of length 0.
+        d = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         grey = (field.colour(points, d, appearance=appearance) @ luma / white).clamp(0, 1)
         shade = (grey + snow.albedo_offset) / (1 + snow.albedo_offset)
         visible = torch.ones(len(points))
@@ -258,10 +272,10 @@ def _shade(
             above = points + torch.tensor([0.0, 0.0, lift])
             towards = torch.tensor(sun, dtype=torch.float32).expand_as(above).contiguous()
             zero = torch.zeros(len(points))
-            samples = field.march(above, towards, zero, zero + across)
-            thick = torch.zeros(len(points), dtype=samples.sigma.dtype)
-            thick.index_add_(0, samples.ray_index(), (samples.sigma * samples.dt).detach())
-            visible = torch.exp(-thick).float()
+            samples = field.march(above, towards, zero, zero + diagonal)
+            sun_depth = torch.zeros(len(points), dtype=samples.sigma.dtype)
+            sun_depth.index_add_(0, samples.ray_index(), (samples.sigma * samples.dt).detach())
+            visible = torch.exp(-sun_depth).float()
         shade = shade * (snow.sun_share * visible + snow.shade)
         shades.append(to_numpy(shade.clamp(0, 1).float()))
     return np.concatenate(shades)

@@ -1,8 +1,9 @@
-"""From places where snow lands to metaballs: slabs of snow, prefiltered onto a sparse lattice.
+"""From deposits to metaballs: columns of snow, prefiltered onto a sparse lattice.
 
-Each deposit fills the column around it from below the ground up to the requested depth over it.
-How much of a vertex's surroundings is filled is integrated, not sampled: a tent of one spacing in
-x and y, a quadratic B-spline along z. So the thickness does not depend on how the lattice lies.
+Each deposit fills the column around it, from below the ground up to the requested depth above it.
+The filled fraction around a vertex is an integral, not a sample: weighted by a tent of one spacing
+in x and y and a quadratic B-spline along z. So the thickness does not depend on the offset of the
+lattice. World frame, m.
 """
 
 import math
@@ -22,54 +23,58 @@ from climatenerf.ops.cpu.metaballs import (
 )
 
 _BLUR = 1.5  # half-width of the vertical prefilter in spacings
-# A slab buried by the kernel's and the prefilter's reach looks like a half-space from its top.
+# A column that extends below the ground by the supports of kernel and prefilter gives the same
+# surface as a half-space.
 _BURIAL = REACH + _BLUR
-_BELOW, _ABOVE = 20.0, 40.0  # m; ground this far under and over the cameras can carry snow
-_PATCHY = 0.01  # m; thinner snow is a dusting that does not cover everything
+_BELOW, _ABOVE = 20.0, 40.0  # m; ground up to this far below and above the cameras carries snow
+_FULL_COVER_DEPTH = 0.01  # m; thinner snow covers only part of the ground
 
 
 @dataclass(frozen=True)
 class SnowGrid:
-    """Where snow is simulated, and how finely."""
+    """Extent and resolution of the snow lattice."""
 
     centre: tuple[float, float]
-    """x and y of the middle, m."""
+    """x and y of the centre, m."""
     z_range: tuple[float, float]
     """Lowest and highest ground that can carry snow, m."""
     spacing: float
-    """Of the innermost cascade's lattice, m; each further one has twice the spacing and side."""
+    """Spacing of the innermost cascade, m; each further one has twice the spacing and side."""
     half_cells: int
-    """Cells from the middle to a side; the same for every cascade; a multiple of 16."""
+    """Cells from the centre to a side, the same for every cascade; a multiple of 16."""
     cascades: int = 1
 
     def __post_init__(self) -> None:
         if self.half_cells % (2 * BRICK) or self.half_cells <= 0 or self.cascades < 1:
-            raise ValueError("half_cells must be a positive multiple of 16, cascades at least 1")
+            raise ValueError(
+                f"half_cells must be a positive multiple of {2 * BRICK} and cascades at least 1; "
+                f"got {self.half_cells} and {self.cascades}"
+            )
 
     def spacing_of(self, cascade: int) -> float:
-        """Lattice spacing of a cascade, m."""
+        """Return the lattice spacing of a cascade, m."""
         return self.spacing * 2**cascade
 
     def half_side(self, cascade: int) -> float:
-        """Half the side of a cascade's square, m."""
+        """Return half the side of a cascade's square, m."""
         return self.half_cells * self.spacing_of(cascade)
 
 
 @dataclass(frozen=True)
 class Deposits:
-    """Where snow lands; needs the scene, but not the depth of the snow."""
+    """Points where snow lands. They depend on the scene, not on the depth of the snow."""
 
     grid: SnowGrid
     position: Float32[np.ndarray, "n 3"]
-    """On the surface that catches the snow, m."""
+    """Points on the surface that catches the snow, world frame, m."""
     weight: Float32[np.ndarray, "n"]
-    """Share of the snow that stays, 0 to 1."""
+    """Fraction of the snow that stays, 0 to 1."""
     shade: Float32[np.ndarray, "n"]
-    """Brightness of snow there under the scene's light, 0 to 1; NaN: not known here."""
+    """Brightness of the snow in the scene's light, 0 to 1; NaN: not computed for this deposit."""
     cascade: Int[np.ndarray, "cascades+1"]
     """Deposits of cascade k are cascade[k]:cascade[k + 1]."""
     passes: Int[np.ndarray, "cascades"]
-    """Fall directions in each cascade; each lands one deposit per cell."""
+    """Number of fall directions per cascade; each gives at most one deposit per cell."""
 
 
 def choose_grid(
@@ -77,15 +82,15 @@ def choose_grid(
     upper: Float[np.ndarray, "3"],
     cameras: Float[np.ndarray, "m 3"],
 ) -> SnowGrid:
-    """A grid that is fine near the cameras and reaches to the scene's bounds.
+    """Return a grid that is fine near the cameras and extends to the scene's bounds.
 
     Args:
-        lower: corner of the region that holds anything, m.
-        upper: the opposite corner, m.
+        lower: lower corner of the region with density, m.
+        upper: upper corner, m.
         cameras: camera positions of the path, m.
 
     Returns:
-        Spacing 3 to 6 cm, wider only where the path itself spans more than some 40 m.
+        A grid with a spacing of 3 to 6 cm; larger if the path spans more than about 60 m.
     """
     low, high = cameras.min(0), cameras.max(0)
     centre = (low[:2] + high[:2]) / 2
@@ -96,7 +101,7 @@ def choose_grid(
     half_cells = math.ceil(min(near, far) / spacing / (2 * BRICK)) * 2 * BRICK
     half_cells = min(half_cells, 14 * 2 * BRICK)
     cascades = 1 + max(0, math.ceil(math.log2(max(far, 1e-3) / (half_cells * spacing))))
-    # Beyond the fifth the lattice is so coarse, and so far away, that snow there shows no shape.
+    # A sixth cascade would be so coarse and so far away that its shape would not be visible.
     return SnowGrid(
         (float(centre[0]), float(centre[1])),
         (max(float(lower[2]), low[2] - _BELOW), min(float(upper[2]), high[2] + _ABOVE)),
@@ -107,24 +112,24 @@ def choose_grid(
 
 
 def grow(deposits: Deposits, depth: float) -> Lattice:
-    """Let snow of a given depth lie on the deposits.
+    """Build the lattice of snow of a given depth on the deposits.
 
     Args:
-        deposits: where snow lands.
-        depth: thickness over open ground, m. Under 1 cm the cover gets patchy and then vanishes.
+        deposits: points where snow lands.
+        depth: thickness on open ground, m. Below 1 cm the cover becomes partial and then vanishes.
 
     Returns:
-        The lattice; nothing in it (no bricks) where nothing lands.
+        The lattice; without bricks if there are no deposits.
     """
     grid = deposits.grid
-    fade = min(max(depth / _PATCHY, 0.0), 1.0)
+    fade = min(max(depth / _FULL_COVER_DEPTH, 0.0), 1.0)
     cover = fade * fade * (3 - 2 * fade)
     lower, bricks, index, pool = [], [], [], []
     used = 0
     for k in range(grid.cascades):
         part = slice(int(deposits.cascade[k]), int(deposits.cascade[k + 1]))
         h, half = grid.spacing_of(k), grid.half_side(k)
-        # Room for the buried and the fallen snow, and a brick around for the balls' reach.
+        # Margin for the columns below and above the ground, and one brick for the kernel support.
         bottom = grid.z_range[0] - (_BURIAL + _BLUR + BRICK) * h
         top = grid.z_range[1] + depth + (_BLUR + BRICK) * h
         side = 2 * grid.half_cells // BRICK + 2
@@ -155,14 +160,14 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
         shade=np.concatenate([p[2] for p in pool]),
         band=band,
         near=near,
-        # Deep enough to leave no gap to a rough ground, too little to show under a table.
+        # Deep enough to leave no gap above rough ground, and too thin to be visible under a table.
         burial=np.clip(0.5 * spacing, 0.02, 0.04),
     )
 
 
 @njit(cache=True)
-def _ramp(u: float) -> float:
-    """Share of a quadratic B-spline (unit knots, centred on 0) that lies below u."""
+def _integrated_spline(u: float) -> float:
+    """Return the integral of a quadratic B-spline (unit knots, centred on 0) up to u."""
     a = min(abs(u), 1.5)
     half = 0.75 * a - a**3 / 3 if a < 0.5 else 0.5 - (1.5 - a) ** 3 / 6
     return 0.5 + half if u > 0 else 0.5 - half
@@ -176,19 +181,26 @@ def _fill(
     depth: float,
     bricks: Int[np.ndarray, "3"],
 ) -> tuple[Float32[np.ndarray, "b 8 8 8 4"], Int[np.ndarray, "x y z"]]:
-    """Spread the slabs over the vertices, in units of the spacing.
+    """Accumulate the columns at the vertices; lengths in units of the spacing.
 
-    One thread, so the order of the sums, and with it the last bit, is always the same.
+    Serial, so that the order of the floating-point sums is always the same.
+
+    Args:
+        position: deposits relative to the lattice's corner.
+        weight: filled fraction per deposit.
+        shade: brightness per deposit; NaN: unknown.
+        depth: depth of the snow.
+        bricks: number of bricks along each axis.
 
     Returns:
-        for each brick that is touched, sums at its vertices of: filling; filling times height over
-        the ground; filling where brightness is known; filling times brightness. And the bricks'
-        numbers, -1 where there is none.
+        For each occupied brick, sums at its vertices of: the filled fraction f; f times height
+        above the ground; f of deposits with known brightness; that f times brightness. And the
+        index of the brick at each (x, y, z), -1: none.
     """
     size = (bricks[0] * BRICK, bricks[1] * BRICK, bricks[2] * BRICK)
     core = np.full((bricks[0], bricks[1], bricks[2]), -1, np.int32)
     sums = np.zeros((0, BRICK, BRICK, BRICK, 4), np.float32)
-    for phase in range(2):  # find the bricks first, then fill them
+    for phase in range(2):  # 0: count the bricks; 1: fill them
         used = 0
         for r in range(position.shape[0]):
             if weight[r] <= 0:
@@ -215,18 +227,20 @@ def _fill(
                                 used += 1
                         continue
                     for m in range(first, last + 1):
-                        share = tent * (_ramp(z + depth - m) - _ramp(z - _BURIAL - m))
+                        fraction = tent * (
+                            _integrated_spline(z + depth - m) - _integrated_spline(z - _BURIAL - m)
+                        )
                         row = sums[
                             core[i // BRICK, j // BRICK, m // BRICK],
                             i % BRICK,
                             j % BRICK,
                             m % BRICK,
                         ]
-                        row[0] += share
-                        row[1] += share * (m - z)
+                        row[0] += fraction
+                        row[1] += fraction * (m - z)
                         if not math.isnan(shade[r]):
-                            row[2] += share
-                            row[3] += share * shade[r]
+                            row[2] += fraction
+                            row[3] += fraction * shade[r]
         if phase == 0:
             sums = np.zeros((used, BRICK, BRICK, BRICK, 4), np.float32)
     return sums, core
@@ -237,11 +251,15 @@ def _assemble(
     core: Int[np.ndarray, "x y z"],
     bricks: Int[np.ndarray, "3"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Quantise the vertices and copy to each brick what it needs of its neighbours."""
-    known = float(sums[..., 2].sum(dtype=np.float64))
-    # Without any known brightness (no deposit in this cascade) the value is never seen.
-    typical = float(sums[..., 3].sum(dtype=np.float64)) / known if known > 0 else 1.0
-    vertices = _quantise(sums, typical)
+    """Quantise the vertices and store with each brick the adjacent vertices of its neighbours.
+
+    Returns:
+        Brick table [x, y, z] (-1: empty), and `fill`, `height` and `shade` of `Lattice`.
+    """
+    shaded = float(sums[..., 2].sum(dtype=np.float64))
+    # Without any shaded deposit in this cascade the default is never visible.
+    default_shade = float(sums[..., 3].sum(dtype=np.float64)) / shaded if shaded > 0 else 1.0
+    vertices = _quantise(sums, default_shade)
     near = core >= 0
     for axis in range(3):
         wide = near.copy()
@@ -250,22 +268,23 @@ def _assemble(
         wide[tuple(ahead)] |= near[tuple(behind)]
         wide[tuple(behind)] |= near[tuple(ahead)]
         near = wide
-    places = np.argwhere(near)
-    fill, height, shade = _gather(places, core, *vertices)
-    touched = fill.any((1, 2, 3))
+    cells = np.argwhere(near)
+    fill, height, shade = _gather(cells, core, *vertices)
+    occupied = fill.any((1, 2, 3))
     table = np.full(core.shape, -1, np.int32)
-    table[tuple(places[touched].T)] = np.arange(int(touched.sum()))
-    return table, fill[touched], height[touched], shade[touched]
+    table[tuple(cells[occupied].T)] = np.arange(int(occupied.sum()))
+    return table, fill[occupied], height[occupied], shade[occupied]
 
 
 def _quantise(
-    sums: Float32[np.ndarray, "b 8 8 8 4"], typical: float
+    sums: Float32[np.ndarray, "b 8 8 8 4"], default_shade: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Filled fraction, height over the ground and brightness in the units of `Lattice`."""
-    filled, moment, known, bright = (sums[..., c] for c in range(4))
-    # Empty vertices (0 / 0 would give NaN) are never seen: they weigh nothing.
+    """Return filled fraction, height above the ground and brightness in the units of `Lattice`."""
+    filled, moment, shaded, brightness = (sums[..., c] for c in range(4))
+    # The floors avoid 0/0 at empty vertices, whose values have no weight.
     height = np.clip(moment / np.maximum(filled, 1e-6) / HEIGHT_UNIT, -32000, 32000)
-    shade = np.where(known > 1e-6, bright / np.maximum(known, 1e-6), np.float32(typical))
+    mean = brightness / np.maximum(shaded, 1e-6)
+    shade = np.where(shaded > 1e-6, mean, np.float32(default_shade))
     return (
         np.rint(np.minimum(filled, 1) * 255).astype(np.uint8),
         np.rint(height).astype(np.int16),
@@ -275,23 +294,24 @@ def _quantise(
 
 @njit(cache=True)
 def _gather(
-    places: Int[np.ndarray, "n 3"],
+    cells: Int[np.ndarray, "n 3"],
     core: Int[np.ndarray, "x y z"],
     fill: UInt8[np.ndarray, "b 8 8 8"],
     height: Int[np.ndarray, "b 8 8 8"],
     shade: UInt8[np.ndarray, "b 8 8 8"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    n = places.shape[0]
+    """Copy the vertices of each brick and the adjacent ones of its neighbours."""
+    n = cells.shape[0]
     all_fill = np.zeros((n, STORED, STORED, STORED), np.uint8)
     all_height = np.zeros((n, STORED, STORED, STORED), np.int16)
     all_shade = np.zeros((n, STORED, STORED, STORED), np.uint8)
     for r in range(n):
         for i in range(STORED):
-            x = places[r, 0] * BRICK + i - 1
+            x = cells[r, 0] * BRICK + i - 1
             for j in range(STORED):
-                y = places[r, 1] * BRICK + j - 1
+                y = cells[r, 1] * BRICK + j - 1
                 for m in range(STORED):
-                    z = places[r, 2] * BRICK + m - 1
+                    z = cells[r, 2] * BRICK + m - 1
                     bx, by, bz = x // BRICK, y // BRICK, z // BRICK
                     if bx < 0 or by < 0 or bz < 0:
                         continue

@@ -1,4 +1,7 @@
-"""The ground that catches snow: where fall rays are stopped, how smooth it is and how steep."""
+"""The surface that catches snow: hits of fall rays, smoothed, with the cosine of their slope.
+
+Numba kernels; world frame, m, z up.
+"""
 
 import math
 
@@ -8,56 +11,57 @@ from numba import njit, prange
 
 
 @njit(cache=True, parallel=True)
-def halfway(
+def half_transmittance(
     offsets: Int[np.ndarray, "n+1"],
     t: Float32[np.ndarray, "s"],
     dt: Float32[np.ndarray, "s"],
     sigma: Float32[np.ndarray, "s"],
     before: Float[np.ndarray, "n"],
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Where the optical depth of each ray passes ln 2, half of its light being gone.
+    """Find where the optical depth of each ray reaches ln 2, i.e. its transmittance 1/2.
 
     Args:
         offsets: samples of ray r are offsets[r]:offsets[r + 1].
         t: middle of each sample, m.
-        dt: its extent, m.
-        sigma: its extinction, 1/m.
-        before: optical depth that each ray has behind it already.
+        dt: length of each sample, m.
+        sigma: extinction of each sample, 1/m.
+        before: optical depth of each ray in front of its first sample.
 
     Returns:
-        Ray length, m (NaN: not on this stretch), and the optical depth at the end.
+        Ray length, m (NaN: not reached on this stretch), and the optical depth after the last
+        sample.
     """
     n = offsets.shape[0] - 1
-    where = np.full(n, np.nan)
+    found = np.full(n, np.nan)
     depth = before.copy()
     for r in prange(n):
         for q in range(offsets[r], offsets[r + 1]):
-            thick = sigma[q] * dt[q]
-            if depth[r] < math.log(2) <= depth[r] + thick:
-                where[r] = t[q] - dt[q] / 2 + (math.log(2) - depth[r]) / sigma[q]
-            depth[r] += thick
-    return where, depth
+            sample_depth = sigma[q] * dt[q]
+            if depth[r] < math.log(2) <= depth[r] + sample_depth:
+                found[r] = t[q] - dt[q] / 2 + (math.log(2) - depth[r]) / sigma[q]
+            depth[r] += sample_depth
+    return found, depth
 
 
 @njit(cache=True, parallel=True)
 def smooth_ground(
     hits: Float32[np.ndarray, "h w 3"], fall: Float[np.ndarray, "3"], tolerance: float, base: int
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"]]:
-    """Smoothed hits, and the cosine of the surface's slope there.
+    """Smooth the hits and return them with the cosine of the surface's slope.
 
-    Heights are averaged over pairs of opposite neighbours that lie within 3 `tolerance` of the
-    middle: a plane stays exactly as it is, and steps (a kerb, the rim of a roof) stay sharp. The
-    slope along each axis is the smaller of those on either side, and 0 where they disagree in
-    sign, so that the rim of a roof and the top of a wall count as flat.
+    A bilateral filter averages heights over pairs of opposite neighbours within 3 `tolerance` of
+    the centre. A plane is unchanged, and steps (a kerb, the edge of a roof) stay sharp. The slope
+    along each axis is the smaller of the one-sided slopes, and 0 where their signs differ. So the
+    edge of a roof and the top of a wall count as horizontal.
 
     Args:
-        hits: one for each ray of the grid, NaN where there is none.
+        hits: one for each ray of the grid, m; NaN without a hit.
         fall: fall direction, scaled to z = -1.
-        tolerance: roughness that is smoothed away, m.
-        base: cells over which the slope is taken: snow bridges what is rough below that.
+        tolerance: height of roughness to smooth away, m.
+        base: distance in cells over which slopes are measured; snow bridges finer roughness.
 
     Returns:
-        The hits, moved along their rays, and cosines (0 where there is no hit).
+        The hits, moved along their rays, and cosines (0 without a hit).
     """
     rows, columns = hits.shape[:2]
     smooth = hits.copy()
@@ -74,14 +78,14 @@ def smooth_ground(
                     ja, jb, ia, ib = j + b, j - b, i + a, i - a
                     if jb < 0 or ja >= rows or min(ia, ib) < 0 or max(ia, ib) >= columns:
                         continue
-                    up, down = hits[ja, ia, 2] - z, hits[jb, ib, 2] - z
-                    far = max(abs(up), abs(down)) / tolerance
-                    # NaN, no hit, on one side: max may return the other side.
-                    if math.isnan(up + down) or far > 3:
+                    ahead, behind = hits[ja, ia, 2] - z, hits[jb, ib, 2] - z
+                    deviation = max(abs(ahead), abs(behind)) / tolerance
+                    # With a NaN (no hit) on one side, max may return the other side.
+                    if math.isnan(ahead + behind) or deviation > 3:
                         continue
-                    share = math.exp(-(a * a + b * b) / 3 - far * far / 2)
-                    total += 2 * share
-                    moment += share * (up + down)
+                    weight = math.exp(-(a * a + b * b) / 3 - deviation * deviation / 2)
+                    total += 2 * weight
+                    moment += weight * (ahead + behind)
             lift = moment / total
             for axis in range(3):
                 smooth[j, i, axis] = hits[j, i, axis] - fall[axis] * lift
@@ -93,7 +97,7 @@ def smooth_ground(
             ux, uy, uz = _tangent(smooth, j, i, 0, base)
             vx, vy, vz = _tangent(smooth, j, i, base, 0)
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            # The fall's drift can fold the tangents onto each other: no area, no normal, no 0/0.
+            # An oblique fall can make the tangents parallel; the floor avoids 0/0.
             cosine[j, i] = abs(nz) / max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
     return smooth, cosine
 
@@ -102,7 +106,7 @@ def smooth_ground(
 def _tangent(
     points: Float32[np.ndarray, "h w 3"], j: int, i: int, dj: int, di: int
 ) -> tuple[float, float, float]:
-    """Tangent along one axis of the grid, from the side on which the surface is flatter."""
+    """Return the tangent along one axis of the grid, from the side with the smaller slope."""
     rows, columns = points.shape[:2]
     best = np.inf
     tangent = (1.0, 0.0, 0.0) if di > 0 else (0.0, 1.0, 0.0)
