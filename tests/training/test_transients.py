@@ -12,7 +12,7 @@ RATE = MASK_SHARES[1] * FitSettings().net_rate
 def train(error_at, images=4, steps=600):
     """Masks of images whose squared error at (image, place) is given."""
     torch.manual_seed(0)
-    masks = TransientMasks(images, torch.Generator().manual_seed(0))
+    masks = TransientMasks(images)
     adam = torch.optim.Adam(masks.parameters(), lr=RATE)
     for _ in range(steps):
         image, place = torch.randint(images, (1024,)), torch.rand(1024, 2)
