@@ -94,7 +94,8 @@ class TransientMasks(nn.Module):
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
     """A layer with PyTorch's default initialisation, drawn from a given generator."""
-    layer = nn.Linear(inputs, outputs)
+    # Without PyTorch's own initialisation, which draws from the global generator.
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs, device=torch.get_default_device())
     weight = torch.empty(outputs, inputs, device="cpu")
     nn.init.kaiming_uniform_(weight, a=math.sqrt(5), generator=generator)
     bound = 1 / math.sqrt(inputs)
