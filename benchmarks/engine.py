@@ -37,7 +37,7 @@ from climatenerf.field import activations
 from climatenerf.field import spherical_harmonics as directions
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
-from climatenerf.ops import dispatch, reference
+from climatenerf.ops import compositing, encoding, marching, network, reference
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.training import losses
 from climatenerf.training.dataset import Batch
@@ -93,11 +93,11 @@ def eager_positions(rays, offsets: Tensor, t: Float[Tensor, "s"]) -> Float[Tenso
 
 
 def eager_encoded(u, table, resolutions, layers, shared=None, row=None) -> Tensor:
-    """On a GPU `dispatch` has a kernel of its own for both."""
+    """On a GPU `network.encoded_mlp` has one kernel for both."""
     return reference.mlp(reference.hash_encode(u, table, resolutions), layers, shared, row)
 
 
-def eager_slopes(q: Float[Tensor, "n 3"], net: dispatch.Net) -> Float[Tensor, "n 3"]:
+def eager_slopes(q: Float[Tensor, "n 3"], net: marching.Net) -> Float[Tensor, "n 3"]:
     table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
     return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)])
 
@@ -105,17 +105,15 @@ def eager_slopes(q: Float[Tensor, "n 3"], net: dispatch.Net) -> Float[Tensor, "n
 @contextmanager
 def plain_pytorch() -> Iterator[None]:
     """Within it the program computes with PyTorch alone."""
-    operations = mock.patch.multiple(
-        dispatch,
-        hash_encode=reference.hash_encode,
-        mlp=reference.mlp,
-        encoded_mlp=eager_encoded,
-        density_slopes=eager_slopes,
+    encodings = mock.patch.object(encoding, "hash_encode", reference.hash_encode)
+    networks = mock.patch.multiple(network, mlp=reference.mlp, encoded_mlp=eager_encoded)
+    marches = mock.patch.multiple(marching, density_slopes=eager_slopes, positions=eager_positions)
+    sums = mock.patch.multiple(
+        compositing,
         render_weights=eager_weights,
         accumulate=eager_accumulate,
         distortion=eager_distortion,
         surface=eager_surface,
-        positions=eager_positions,
     )
     outputs = mock.patch.multiple(
         activations,
@@ -123,7 +121,7 @@ def plain_pytorch() -> Iterator[None]:
         thinned_density=activations.plain_thinned_density,
     )
     of_directions = mock.patch.object(directions, "harmonics", directions.spherical_harmonics)
-    with operations, outputs, of_directions:
+    with encodings, networks, marches, sums, outputs, of_directions:
         yield
 
 
@@ -164,16 +162,18 @@ def loss_of(field: Field, at: Drawn) -> Float[Tensor, ""]:
     n = batch.rays_o.shape[0]
     u = field.sample_positions(batch.rays_o, batch.rays_d, samples)
     dt, t = samples.dt / field.unit, samples.t / field.unit
-    weights, left = dispatch.render_weights(field.density_with_gradient(u) * dt, samples.offsets)
+    weights, left = compositing.render_weights(field.density_with_gradient(u) * dt, samples.offsets)
     embedding = field.embeddings.index_select(0, batch.image)
     colour = field.colour_at(u, at.ray, batch.rays_d, embedding)
-    radiance = dispatch.accumulate(weights, colour, samples.offsets)
+    radiance = compositing.accumulate(weights, colour, samples.offsets)
     radiance = radiance + left[:, None] * field.sky_colour(batch.rays_d, embedding)
     loss = losses.colour_error(radiance, batch.rgb).mean()
     loss = loss + 1e-2 * losses.distortion_loss(weights, t, dt, samples.offsets)
     loss = loss + 2e-4 * losses.opacity_entropy_loss(left)
     goal = field.density_normal(at.q)
-    logits, apart = dispatch.surface(weights.detach(), field.surface_raw(u), goal, samples.offsets)
+    logits, apart = compositing.surface(
+        weights.detach(), field.surface_raw(u), goal, samples.offsets
+    )
     target = torch.arange(n) % len(SOLID)  # their cost does not depend on what they are
     loss = loss + 4e-2 * losses.class_loss(logits, target, torch.ones(n, dtype=torch.bool))
     return loss + 4e-2 * apart.sum() / n

@@ -23,8 +23,8 @@ from numba import njit, prange
 from climatenerf.field import activations
 from climatenerf.field.hash_field import Field
 from climatenerf.field.presets import PRESETS
-from climatenerf.ops import dispatch, reference
-from climatenerf.ops.cpu import kernels as cpu
+from climatenerf.ops import compositing, encoding, marching, network, reference
+from climatenerf.ops.cpu import optimiser as cpu_optimiser
 
 SAMPLES_PER_RAY = 32
 
@@ -87,8 +87,8 @@ def backward(*outputs: torch.Tensor) -> None:
     torch.autograd.backward([o.sum() for o in outputs])
 
 
-def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
-    """Each operation on n samples, by the fast kernels (`dispatch`) or the twins (`reference`)."""
+def jobs(n: int, fast: bool) -> dict[str, Callable[[], object]]:
+    """Each operation on n samples, by the fast kernels or by their slow twins."""
     torch.manual_seed(0)
     size = SIZE
     field = Field(size, 10, torch.zeros(3).numpy(), 1.0)
@@ -108,17 +108,17 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
     goal = torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
     q = torch.randn(n, 3)
 
-    radiance = activations.radiance if ops is dispatch else activations.plain_radiance
+    radiance = activations.radiance if fast else activations.plain_radiance
 
     def density() -> torch.Tensor:
-        if ops is dispatch:
+        if fast:
             return field.grid_density(q)
         with torch.no_grad():
             return reference.density(q, field.geometry_grid, field.geometry_resolutions, geometry)
 
     def march() -> torch.Tensor:
         """Rays through cells that are all full, as long as they have samples enough."""
-        if ops is dispatch:
+        if fast:
             rays = n // SAMPLES_PER_RAY
             start, end = torch.zeros(rays), torch.full((rays,), SAMPLES_PER_RAY / 256 + 1e-6)
             d = torch.nn.functional.normalize(q[:rays], dim=-1)
@@ -136,27 +136,30 @@ def jobs(n: int, ops) -> dict[str, Callable[[], object]]:
         return q
 
     def slopes(field: Field, q: torch.Tensor) -> torch.Tensor:
-        if ops is dispatch:
-            return dispatch.density_slopes(q, field._net())
+        if fast:
+            return marching.density_slopes(q, field._net())
         layers = [(w.detach(), b.detach()) for w, b in geometry]
         grid = field.geometry_grid.detach()
         return reference.density_slopes(q, grid, field.geometry_resolutions, layers)
 
+    encodings, networks, sums = (
+        (encoding, network, compositing) if fast else (reference, reference, reference)
+    )
     return {
-        "hash encode": lambda: ops.hash_encode(u, table.detach(), resolutions),
-        "hash encode + backward": lambda: backward(ops.hash_encode(u, table, resolutions)),
+        "hash encode": lambda: encodings.hash_encode(u, table.detach(), resolutions),
+        "hash encode + backward": lambda: backward(encodings.hash_encode(u, table, resolutions)),
         "density": density,
         "march": march,
         "density slopes": lambda: slopes(field, q),
-        "network": lambda: ops.mlp(x.detach(), [(w.detach(), b.detach()) for w, b in layers],
+        "network": lambda: networks.mlp(x.detach(), [(w.detach(), b.detach()) for w, b in layers],
                                    shared.detach(), row),
-        "network + backward": lambda: backward(ops.mlp(x, layers, shared, row)),
-        "weights + backward": lambda: backward(*ops.render_weights(tau, offsets)),
-        "accumulate + backward": lambda: backward(ops.accumulate(tau, values, offsets)),
-        "surface + backward": lambda: backward(*ops.surface(tau.detach(), raw, goal, offsets)),
-        "distortion + backward": lambda: backward(ops.distortion(tau, t, ds, offsets)),
+        "network + backward": lambda: backward(networks.mlp(x, layers, shared, row)),
+        "weights + backward": lambda: backward(*sums.render_weights(tau, offsets)),
+        "accumulate + backward": lambda: backward(sums.accumulate(tau, values, offsets)),
+        "surface + backward": lambda: backward(*sums.surface(tau.detach(), raw, goal, offsets)),
+        "distortion + backward": lambda: backward(sums.distortion(tau, t, ds, offsets)),
         "radiance + backward": lambda: backward(radiance(values)),
-        "merge": lambda: ops.merge_order(t, offsets, t, offsets),
+        "merge": lambda: sums.merge_order(t, offsets, t, offsets),
     }  # fmt: skip
 
 
@@ -167,7 +170,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
     few = min(options.twin_samples, options.samples)
-    fast, slow = jobs(options.samples, dispatch), jobs(few, reference)
+    fast, slow = jobs(options.samples, fast=True), jobs(few, fast=False)
     best = bounds(options.repeats, options.samples)
     rows: dict[str, dict] = {"machine": best}
     for name in fast:
@@ -190,7 +193,7 @@ def main() -> None:
     moments = [torch.zeros(2**22).numpy() for _ in range(2)]
     scalars = tuple(map(np.float32, (0.01, 0.9, 0.99, 1e-15, 0.1, 0.01)))
     adam = common.measure(
-        lambda: cpu.adam(table.numpy(), gradient.clone().numpy(), *moments, *scalars),
+        lambda: cpu_optimiser.adam(table.numpy(), gradient.clone().numpy(), *moments, *scalars),
         options.repeats,
     )
     rows["Adam, a tenth touched"] = {"Mentries/s": 2**22 / adam["median"] / 1e6, "seconds": adam}

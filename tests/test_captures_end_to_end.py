@@ -182,7 +182,7 @@ def test_sheltered_places_stay_bare(fitted, rendered):
     import torch
 
     from climatenerf.field.checkpoint import load_field
-    from climatenerf.ops import dispatch
+    from climatenerf.ops import compositing
     from climatenerf.paths.camera_path import camera_path
     from climatenerf.render.volume import camera_rays
     from climatenerf.scene import load_scene
@@ -196,7 +196,7 @@ def test_sheltered_places_stay_bare(fitted, rendered):
     above = (o + torch.where(solid, depth, 0.0)[:, None] * d) + torch.tensor([0.0, 0.0, 0.6])
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(above).contiguous()
     samples = field.march(above, up, torch.zeros(len(o)), torch.full((len(o),), 60.0))
-    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     snow = torch.from_numpy(rendered["snow"]["mask_snow"]).reshape(-1)
     bare, open_sky = snow[solid & (left < 0.02)], snow[solid & (left > 0.9)]
     if len(bare) < 50 or len(open_sky) < 50:

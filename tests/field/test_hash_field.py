@@ -3,7 +3,7 @@ import torch
 from support.random_field import directions, points, random_field
 
 from climatenerf.field.activations import _Brightness
-from climatenerf.ops import dispatch, reference
+from climatenerf.ops import compositing, reference
 
 
 def ends(n, t_max=1e9):
@@ -181,7 +181,7 @@ def test_rays_of_snow_and_sun_meet_what_cameras_do():
     ):
         begin = torch.full((1,), start)
         samples = own.march(o - start * d, d, begin, begin + field.unit)
-        weights, rest = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        weights, rest = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
         left[name] = float(rest)
     assert left["camera"] < 1e-3 and left["snow"] < 1e-3 and left["beside"] == 1
     assert field.thin == 0.1, "the field itself is as it was"
@@ -247,11 +247,11 @@ def test_accumulated_colour_of_an_opaque_field_is_a_mean_of_its_colours():
         field.geometry_net[3].add_(6.0)
     o, d = points(field, 100, spread=0.2), directions(100)
     samples = field.march(o, d, *ends(100), stop=1e-5)
-    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     assert (left < 1e-3).all()
     ray = samples.ray_index()
     colour = field.colour(o[ray] + samples.t[:, None] * d[ray], d, ray)
-    seen = dispatch.accumulate(weights, colour, samples.offsets)
+    seen = compositing.accumulate(weights, colour, samples.offsets)
     low = torch.full((100, 3), torch.inf).scatter_reduce(
         0, ray[:, None].expand(-1, 3), colour, "amin"
     )

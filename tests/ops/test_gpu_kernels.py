@@ -17,8 +17,16 @@ from support.random_field import random_field
 from climatenerf.field import hash_field as field_module
 from climatenerf.field.activations import plain_radiance
 from climatenerf.field.protocol import FUSED
-from climatenerf.ops import dispatch, reference
-from climatenerf.ops.cpu import kernels as cpu
+from climatenerf.ops import (
+    compositing,
+    dispatch,
+    encoding,
+    marching,
+    network,
+    optimiser,
+    reference,
+    visual_hull,
+)
 from climatenerf.render import volume as view_module
 from climatenerf.render.volume import composited
 
@@ -27,20 +35,32 @@ os.environ["TRITON_INTERPRET"] = str(int(DEVICE == "cpu"))  # it is read where a
 triton = pytest.importorskip("triton", reason="Triton is for Linux")
 import triton.language as tl  # noqa: E402
 
+from climatenerf.ops.triton import compositing as gpu_compositing  # noqa: E402
+from climatenerf.ops.triton import encoding as gpu_encoding  # noqa: E402
 from climatenerf.ops.triton import fused_render as gpu_render  # noqa: E402
-from climatenerf.ops.triton import kernels as gpu  # noqa: E402
-from climatenerf.ops.triton import marching as gpu_march  # noqa: E402
+from climatenerf.ops.triton import marching as gpu_marching  # noqa: E402
 from climatenerf.ops.triton import network as gpu_network  # noqa: E402
-from climatenerf.ops.triton import visual_hull as gpu_witness  # noqa: E402
+from climatenerf.ops.triton import optimiser as gpu_optimiser  # noqa: E402
+from climatenerf.ops.triton import visual_hull as gpu_visual_hull  # noqa: E402
+
+GPU_MODULES = (
+    gpu_compositing,
+    gpu_encoding,
+    gpu_render,
+    gpu_marching,
+    gpu_network,
+    gpu_optimiser,
+    gpu_visual_hull,
+)
 
 # The interpreter's numbers are NumPy's, which warns where a hash's products wrap around.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
 
 
-def by(kernels, monkeypatch):
-    """From here on all operations are by those kernels."""
-    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: kernels)
-    monkeypatch.setattr(dispatch, "_array", to_numpy if kernels is cpu else tensor_of)
+def use_backend(backend, monkeypatch):
+    """Let all operations use the kernels of `backend`, "cpu" or "triton"."""
+    monkeypatch.setattr(dispatch, "backend", lambda *tensors: backend)
+    monkeypatch.setattr(dispatch, "kernel_array", to_numpy if backend == "cpu" else tensor_of)
 
 
 def to_numpy(tensor):
@@ -54,12 +74,14 @@ def tensor_of(tensor):
 @pytest.fixture(autouse=True)
 def gpu_kernels(monkeypatch):
     """All operations by the GPU's kernels, in tiles so small that each test takes several."""
-    by(gpu, monkeypatch)
-    for module in (gpu, gpu_march, gpu_network):
+    use_backend("triton", monkeypatch)
+    for module in (gpu_encoding, gpu_marching, gpu_network):
         monkeypatch.setattr(module, "SAMPLES", 16)
-    monkeypatch.setattr(gpu, "LIST", 4)
-    monkeypatch.setattr(gpu_witness, "PLACES", 64)
-    monkeypatch.setattr(gpu, "ENTRIES", 16)
+    monkeypatch.setattr(gpu_marching, "SLOPE_SAMPLES", 16)
+    for module in (gpu_compositing, gpu_marching):
+        monkeypatch.setattr(module, "LIST", 4)
+    monkeypatch.setattr(gpu_visual_hull, "PLACES", 64)
+    monkeypatch.setattr(gpu_optimiser, "ENTRIES", 16)
     monkeypatch.setattr(gpu_network, "PROGRAMS", 2)  # each goes through several tiles
 
 
@@ -104,7 +126,7 @@ def test_hash_encoding_with_gradients_to_table_and_positions(generator):
     u = torch.rand(40, 3, generator=generator)
     u[0], u[1] = 0.0, 0.999999
     pairs = both(
-        lambda u, table: dispatch.hash_encode(u, table, resolutions.to(DEVICE)),
+        lambda u, table: encoding.hash_encode(u, table, resolutions.to(DEVICE)),
         lambda u, table: reference.hash_encode(u, table, resolutions),
         u,
         table,
@@ -127,15 +149,15 @@ def test_compositing(generator, rays):
     s, ds = torch.rand(n, generator=generator).sort()[0], torch.full((n,), 0.02)
     offsets = rays.to(DEVICE)
     assert assert_close(both(
-        lambda tau: dispatch.render_weights(tau, offsets),
+        lambda tau: compositing.render_weights(tau, offsets),
         lambda tau: reference.render_weights(tau, rays), tau,
     )) == 3  # fmt: skip
     assert assert_close(both(
-        lambda w, v: dispatch.accumulate(w, v, offsets),
+        lambda w, v: compositing.accumulate(w, v, offsets),
         lambda w, v: reference.accumulate(w, v, rays), weights, values,
     )) == 3  # fmt: skip
     assert assert_close(both(
-        lambda w: dispatch.distortion(w, s.to(DEVICE), ds.to(DEVICE), offsets),
+        lambda w: compositing.distortion(w, s.to(DEVICE), ds.to(DEVICE), offsets),
         lambda w: reference.distortion(w, s.double(), ds.double(), rays), weights,
     )) == 2  # fmt: skip
 
@@ -148,7 +170,7 @@ def test_networks_go_to_matrix_products(generator):
     on_device = [(w.to(DEVICE), b.to(DEVICE)) for w, b in layers]
     double = [(w.double(), b.double()) for w, b in layers]
     pairs = both(
-        lambda x: dispatch.mlp(x, on_device), lambda x: reference.mlp(x, double),
+        lambda x: network.mlp(x, on_device), lambda x: reference.mlp(x, double),
         random(generator, 30, 6),
     )  # fmt: skip
     assert assert_close(pairs, 1e-3) == 2
@@ -164,7 +186,7 @@ def test_an_encoding_with_its_network(generator, outputs, with_rays):
     w2, b2 = random(generator, 8, outputs), random(generator, outputs)
     shared, row = random(generator, 4, 8), torch.arange(70) * 4 // 70
 
-    def network(encoded):
+    def run(encoded):
         def run(u, table, w1, b1, w2, b2, shared):
             rays = (shared, row.to(u.device)) if with_rays else (None, None)
             return encoded(u, table, resolutions.to(u.device), [(w1, b1), (w2, b2)], *rays)
@@ -173,12 +195,12 @@ def test_an_encoding_with_its_network(generator, outputs, with_rays):
 
     given = (u, table, w1, b1, w2, b2, shared)
     if not with_rays:
-        given, reduced = given[:-1], network
-        network = lambda encoded: lambda *inputs: reduced(encoded)(*inputs, None)  # noqa: E731
+        given, reduced = given[:-1], run
+        run = lambda encoded: lambda *inputs: reduced(encoded)(*inputs, None)  # noqa: E731
     twin = lambda u, table, resolutions, layers, *rays: reference.mlp(  # noqa: E731
         reference.hash_encode(u, table, resolutions), layers, *rays
     )
-    pairs = both(network(dispatch.encoded_mlp), network(twin), *given)
+    pairs = both(run(network.encoded_mlp), run(twin), *given)
     # A GPU's gradients pass through the tensor cores once, with 11 bits.
     assert assert_close(pairs, 1e-4 if DEVICE == "cpu" else 3e-3) == 1 + len(given)
 
@@ -189,10 +211,10 @@ def test_a_tables_gradient_goes_to_its_buffer(generator):
     u = torch.rand(20, 3, generator=generator).to(DEVICE)
     layers = [(random(generator, 6, 8).to(DEVICE), torch.zeros(8, device=DEVICE))]
     layers += [(random(generator, 8, 2).to(DEVICE), torch.zeros(2, device=DEVICE))]
-    dispatch.encoded_mlp(u, table, resolutions.to(DEVICE), layers).sum().backward()
+    network.encoded_mlp(u, table, resolutions.to(DEVICE), layers).sum().backward()
     wanted, table.grad = table.grad, None
     table.grad_buffer = torch.ones_like(table)
-    dispatch.encoded_mlp(u, table, resolutions.to(DEVICE), layers).sum().backward()
+    network.encoded_mlp(u, table, resolutions.to(DEVICE), layers).sum().backward()
     assert table.grad is None
     assert torch.allclose(table.grad_buffer - 1, wanted, atol=1e-4 * float(wanted.abs().max()))
 
@@ -202,7 +224,7 @@ def test_slopes_of_the_density_inside_and_outside_the_core(generator):
     table, resolutions, *layers = (x.cpu().double() if x.is_floating_point() else x.cpu()
                                    for x in weights)  # fmt: skip
     q = 2 * random(generator, 70, 3)
-    ours = dispatch.density_slopes(q.to(DEVICE), weights).cpu().double()
+    ours = marching.density_slopes(q.to(DEVICE), weights).cpu().double()
     pairs = [(layers[0], layers[1]), (layers[2], layers[3])]
     real = reference.density_slopes(q.double(), table, resolutions, pairs)
     # On a cell's face the slope jumps; rounding decides the side.
@@ -225,7 +247,7 @@ def test_density_inside_and_outside_the_core(generator):
     weights = net(generator)
     q = 2 * random(generator, 40, 3)
     q[0] = 0.0
-    ours = dispatch.density(q.to(DEVICE), weights).cpu()
+    ours = marching.density(q.to(DEVICE), weights).cpu()
     assert torch.allclose(ours, density_of(weights)(q), rtol=1e-3)
 
 
@@ -249,13 +271,13 @@ def test_marching(generator, monkeypatch, skip, share, thin):
     )
     spans[2, 1] = 0.5
     steps = (0.1, 0.02, thin)
-    monkeypatch.setattr(dispatch, "GPU_RAYS", 19)  # in two parts, the first of two blocks
-    monkeypatch.setattr(dispatch, "CAPACITY", 64)
-    offsets, samples = dispatch.march(
+    monkeypatch.setattr(marching, "GPU_RAYS", 19)  # in two parts, the first of two blocks
+    monkeypatch.setattr(marching, "CAPACITY", 64)
+    offsets, samples = marching.march(
         (o.to(DEVICE), d.to(DEVICE)), spans.to(DEVICE), cells, steps, 1e-3, weights
     )
     offsets, samples = offsets.cpu(), samples.cpu().numpy()
-    u = dispatch.positions((o.to(DEVICE), d.to(DEVICE)), offsets.to(DEVICE),
+    u = marching.positions((o.to(DEVICE), d.to(DEVICE)), offsets.to(DEVICE),
                            torch.from_numpy(samples[0]).to(DEVICE)).cpu()  # fmt: skip
     agree = 0
     for r in range(n):
@@ -289,16 +311,16 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     with torch.no_grad():
         field.view_net[1] += 0.3  # some colours are beyond white
         field.geometry_net[-1] += 3.0  # dense enough that rays end in it
-    by(cpu, monkeypatch)
+    use_backend("cpu", monkeypatch)
     photo = field.embeddings[[1]].detach()
     assert FUSED not in field.capabilities
     real = composited(field, o, d, near, 4.0, stop, thin, photo)
     assert real[0].max() > 1 and real[1][0] == 1 and (real[1] < 0.4).sum() > 3, (
         "some see matter, one does not"
     )
-    by(gpu, monkeypatch)
+    use_backend("triton", monkeypatch)
     marched = []
-    monkeypatch.setattr(gpu, "march", lambda *given: marched.append(given))
+    monkeypatch.setattr(gpu_marching, "march", lambda *given: marched.append(given))
     field = field.to(DEVICE)
     field.occupancy.packed = None  # as the other kernels read it
     with torch.device(DEVICE):
@@ -332,7 +354,7 @@ def test_merging_two_lists(generator, rays):
         for each in (rays, other)
     ]
     given = [lists[0], rays, lists[1], other]
-    order, offsets = dispatch.merge_order(*(x.to(DEVICE) for x in given))
+    order, offsets = compositing.merge_order(*(x.to(DEVICE) for x in given))
     real, real_offsets = reference.merge_order(*given)
     assert torch.equal(order.cpu(), real) and torch.equal(offsets.cpu(), real_offsets)
 
@@ -348,7 +370,7 @@ def test_adam_leaves_entries_without_gradient_alone(generator):
         theirs.grad = gradient.clone()
         adam.step()
         given = (gradient * some).to(DEVICE)
-        dispatch.adam(ours, given, (moments[0], moments[1]), 0.01, (0.9, 0.99), 1e-15, step)
+        optimiser.adam(ours, given, (moments[0], moments[1]), 0.01, (0.9, 0.99), 1e-15, step)
         assert (given == 0).all()
     assert torch.allclose(ours.cpu()[some], theirs.detach()[some], rtol=1e-4)
     assert torch.equal(ours.cpu()[~some], start[~some])
@@ -367,7 +389,7 @@ def test_places_that_views_agree_on(generator):
     row = torch.cat([each.view(-1) for each in maps]).to(torch.uint8)
     views = row, torch.cat([ends[:1] * 0, ends[:-1]]), sizes, pinholes, c2w
     for least in ((1, 0.5, 0.2), (2, 0.7, 0.5)):
-        ours = dispatch.label_votes(
+        ours = visual_hull.label_votes(
             x.to(DEVICE), radius.to(DEVICE), tuple(each.to(DEVICE) for each in views), least
         ).cpu()
         real = reference.label_votes(
@@ -387,12 +409,7 @@ def test_all_kernels_compile_for_cuda(card, tmp_path):
         [sys.executable, str(script), card], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    kernels = {
-        name
-        for module in (gpu, gpu_march, gpu_network, gpu_render, gpu_witness)
-        for name in vars(module)
-        if is_launched(module, name)
-    }
+    kernels = {name for module in GPU_MODULES for name in vars(module) if is_launched(module, name)}
     assert kernels == set(done.stdout.split())
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops import dispatch, reference
-from climatenerf.ops.cpu import kernels as cpu
-from climatenerf.ops.cpu import simd as lanes
+from climatenerf.ops import compositing, encoding, marching, network, reference
+from climatenerf.ops.cpu import encoding as cpu
+from climatenerf.ops.cpu import simd
 
 
 @pytest.fixture
@@ -33,12 +33,12 @@ def test_hash_encoding_and_its_gradient_match_the_twin(generator, far):
     if far:
         resolutions = torch.tensor([9, 60, 90, 200])
         sides = (9, 60, 90, 200)
-        assert [lanes.is_far(table.numpy(), s) for s in sides] == [False, True, True, True]
+        assert [simd.is_far(table.numpy(), s) for s in sides] == [False, True, True, True]
     u = torch.rand(709, 3, generator=generator) * 0.999999
     u[0], u[1] = 0.0, 0.999999
     fast_table = table.clone().requires_grad_()
     slow_table = table.double().clone().requires_grad_()
-    fast = dispatch.hash_encode(u, fast_table, resolutions)
+    fast = encoding.hash_encode(u, fast_table, resolutions)
     slow = reference.hash_encode(u.double(), slow_table, resolutions)
     assert torch.allclose(fast.double(), slow, atol=2e-4)
     upstream = torch.randn(fast.shape, generator=generator)
@@ -53,7 +53,7 @@ def test_gradient_to_positions_matches_the_twin(generator):
     u = torch.rand(700, 3, generator=generator) * 0.999
     u[0], u[1] = 0.0, 0.5
     fast, slow = u.clone().requires_grad_(), u.double().clone().requires_grad_()
-    out = dispatch.hash_encode(fast, table, resolutions)
+    out = encoding.hash_encode(fast, table, resolutions)
     upstream = torch.randn(out.shape, generator=generator)
     (out * upstream).sum().backward()
     (reference.hash_encode(slow, table.double(), resolutions) * upstream.double()).sum().backward()
@@ -91,11 +91,11 @@ def test_a_trilinear_function_is_reproduced_on_dense_levels():
     table = torch.zeros(1, 512, 2)
     table[0, : (side + 1) ** 3, 0] = (corners @ torch.tensor([1.0, 2.0, 3.0])).flatten()
     u = torch.rand(50, 3) * 0.99
-    out = dispatch.hash_encode(u, table, torch.tensor([side]))
+    out = encoding.hash_encode(u, table, torch.tensor([side]))
     assert torch.allclose(out[:, 0], u * side @ torch.tensor([1.0, 2.0, 3.0]), atol=1e-4)
 
 
-def network(generator, inputs, width):
+def random_network(generator, inputs, width):
     layers = [
         (torch.randn(inputs, width, generator=generator) * 0.3, torch.randn(width) * 0.1),
         (torch.randn(width, 1, generator=generator) * 0.3, torch.zeros(1)),
@@ -105,10 +105,10 @@ def network(generator, inputs, width):
 
 def test_density_matches_the_twin_inside_and_outside_the_core(generator):
     table, resolutions = grid(generator)
-    layers, plain = network(generator, 8, 16)
+    layers, plain = random_network(generator, 8, 16)
     q = torch.randn(500, 3, generator=generator) * 2
     q[0] = 0.0
-    out = dispatch.density(q, (table, resolutions, *plain))
+    out = marching.density(q, (table, resolutions, *plain))
     twin = reference.density(
         q.double(), table.double(), resolutions, [(w.double(), b.double()) for w, b in layers]
     )
@@ -128,12 +128,12 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
 )
 def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, thin):
     table, resolutions = grid(generator)
-    layers, plain = network(generator, 8, 16)
+    layers, plain = random_network(generator, 8, 16)
     occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
     skip = skips[0]
     occupied[0, -skip:] = 1  # the finest cells at one side, whatever the share
     blocks = occupied.unfold(1, skip, skip).unfold(2, skip, skip).unfold(3, skip, skip)
-    cells = dispatch.cells_of(occupied)
+    cells = marching.cells_of(occupied)
     assert torch.equal(cells[1], blocks.amax((-3, -2, -1)))
     n = 60
     o = torch.randn(n, 3, generator=generator)
@@ -144,8 +144,8 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, t
     near, far = torch.full((n,), 0.05), torch.full((n,), 1e9)
     far[2] = 0.5
     steps = (0.05, 0.02, thin)
-    monkeypatch.setattr(dispatch, "CPU_RAYS", 32)  # in two parts
-    offsets, found = dispatch.march(
+    monkeypatch.setattr(marching, "CPU_RAYS", 32)  # in two parts
+    offsets, found = marching.march(
         (o, d),
         torch.stack([near, far, jitter], dim=-1),
         cells,
@@ -178,14 +178,14 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, t
 
 def test_a_ray_ends_where_it_is_opaque_and_cells_that_are_empty_give_no_samples(generator):
     table, resolutions = grid(generator)
-    _, (w1, b1, w2, _) = network(generator, 8, 16)
+    _, (w1, b1, w2, _) = random_network(generator, 8, 16)
     net = (table, resolutions, w1, b1, w2, torch.full((1,), 6.0))  # dense everywhere
     rays = torch.zeros(1, 3), torch.tensor([[1.0, 0, 0]])
     for fill in (0, 1):
         occupied = torch.full((2, 8, 8, 8), fill, dtype=torch.uint8)
         span = torch.tensor([[0.0, 1e9, 0.0]])
-        offsets, (_, dt, sigma) = dispatch.march(
-            rays, span, dispatch.cells_of(occupied), (0.01, 0.0, 1e-3), 1e-3, net
+        offsets, (_, dt, sigma) = marching.march(
+            rays, span, marching.cells_of(occupied), (0.01, 0.0, 1e-3), 1e-3, net
         )
         if fill:
             tau = dt * sigma
@@ -202,7 +202,7 @@ def test_weights_and_their_gradient_match_the_twin(generator):
     fast, slow = tau.clone().requires_grad_(), tau.double().requires_grad_()
     up_w = torch.randn(n, generator=generator)
     up_t = torch.randn(offsets.shape[0] - 1, generator=generator)
-    w, left = dispatch.render_weights(fast, offsets)
+    w, left = compositing.render_weights(fast, offsets)
     w2, left2 = reference.render_weights(slow, offsets)
     assert torch.allclose(w.double(), w2, atol=1e-6)
     assert torch.allclose(left.double(), left2, atol=1e-6)
@@ -214,8 +214,8 @@ def test_weights_and_their_gradient_match_the_twin(generator):
 def test_weights_and_what_is_left_sum_to_one(generator):
     offsets = packed(generator)
     tau = torch.rand(int(offsets[-1]), generator=generator) * 3
-    w, left = dispatch.render_weights(tau, offsets)
-    total = dispatch.accumulate(w, torch.ones(len(w), 1), offsets)[:, 0] + left
+    w, left = compositing.render_weights(tau, offsets)
+    total = compositing.accumulate(w, torch.ones(len(w), 1), offsets)[:, 0] + left
     assert torch.allclose(total, torch.ones_like(total), atol=1e-6)
 
 
@@ -225,7 +225,7 @@ def test_accumulation_matches_the_twin(generator):
     w, v = torch.rand(n, generator=generator), torch.randn(n, 3, generator=generator)
     fast = [w.clone().requires_grad_(), v.clone().requires_grad_()]
     slow = [w.double().requires_grad_(), v.double().requires_grad_()]
-    a, b = dispatch.accumulate(*fast, offsets), reference.accumulate(*slow, offsets)
+    a, b = compositing.accumulate(*fast, offsets), reference.accumulate(*slow, offsets)
     assert torch.allclose(a.double(), b, atol=1e-5)
     up = torch.randn(a.shape, generator=generator)
     (a * up).sum().backward()
@@ -244,7 +244,7 @@ def test_what_rays_see_of_the_surface_head_matches_the_twin(generator, known):
     raw[2, :3] = 5 * target[2]  # on it
     up, up_apart = torch.randn(rays, 6, generator=generator), torch.rand(rays, generator=generator)
     found = []
-    for run, dtype in ((dispatch.surface, torch.float32), (reference.surface, torch.float64)):
+    for run, dtype in ((compositing.surface, torch.float32), (reference.surface, torch.float64)):
         for turned in (False, True):  # as networks leave it, and as it is
             own = raw.T.contiguous().T if turned else raw
             own = leaf(own, dtype)
@@ -268,7 +268,7 @@ def test_distortion_matches_the_double_sum(generator):
     ds = torch.rand(n, generator=generator) * 0.1
     w = torch.rand(n, generator=generator)
     fast, slow = w.clone().requires_grad_(), w.double().requires_grad_()
-    a = dispatch.distortion(fast, s, ds, offsets)
+    a = compositing.distortion(fast, s, ds, offsets)
     b = reference.distortion(slow, s.double(), ds.double(), offsets)
     assert torch.allclose(a.double(), b, atol=1e-5)
     up = torch.randn(a.shape, generator=generator)
@@ -302,7 +302,7 @@ def test_network_matches_the_twin_and_autograd(generator, kind, widths):
         row = row.sort()[0]
     up = torch.randn(n, outputs, generator=generator)
     grads = []
-    for run, dtype in ((dispatch.mlp, torch.float32), (reference.mlp, torch.float64)):
+    for run, dtype in ((network.mlp, torch.float32), (reference.mlp, torch.float64)):
         own = [tuple(leaf(p, dtype) for p in pair) for pair in layers]
         given = [leaf(x, dtype), leaf(shared, dtype)]
         if "shared" in kind:
@@ -316,12 +316,12 @@ def test_network_matches_the_twin_and_autograd(generator, kind, widths):
 
 
 def test_a_network_on_what_needs_no_gradient_learns_the_same(generator):
-    layers, _ = network(generator, 8, 16)
+    layers, _ = random_network(generator, 8, 16)
     x = torch.randn(300, 8, generator=generator)
     found = []
     for needed in (True, False):
         own = [tuple(leaf(p, torch.float32) for p in pair) for pair in layers]
-        dispatch.mlp(x.clone().requires_grad_(needed), own).sum().backward()
+        network.mlp(x.clone().requires_grad_(needed), own).sum().backward()
         found.append([p.grad for pair in own for p in pair])
     for a, b in zip(*found, strict=True):
         assert torch.equal(a, b)
@@ -329,11 +329,11 @@ def test_a_network_on_what_needs_no_gradient_learns_the_same(generator):
 
 def test_gradients_of_no_light_count_as_none(generator):
     """Numbers that 32 bits do not hold in full are slow on some processors; faint ones count."""
-    layers, _ = network(generator, 8, 16)
+    layers, _ = random_network(generator, 8, 16)
     x = torch.randn(300, 8, generator=generator)
     for size, counts in ((1e-39, False), (1e-31, False), (1e-25, True)):
         own = [tuple(leaf(p, torch.float32) for p in pair) for pair in layers]
-        (size * dispatch.mlp(x, own)).sum().backward()
+        (size * network.mlp(x, own)).sum().backward()
         assert bool(own[0][0].grad.any()) == counts, size
 
 
@@ -356,7 +356,7 @@ def test_encodings_do_not_depend_on_how_many_threads_share_them(generator):
 def test_a_network_of_nothing_gives_nothing():
     layers = [(torch.ones(4, 8), torch.ones(8)), (torch.ones(8, 2), torch.ones(2))]
     x = torch.ones(0, 4, requires_grad=True)
-    out = dispatch.mlp(x, layers, torch.ones(3, 8), torch.zeros(0, dtype=torch.long))
+    out = network.mlp(x, layers, torch.ones(3, 8), torch.zeros(0, dtype=torch.long))
     assert out.shape == (0, 2)
     out.sum().backward()
     assert x.grad is not None and x.grad.shape == (0, 4)
@@ -370,7 +370,7 @@ def test_merging_two_lists_matches_the_twin(generator):
         for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
             t[a:b] = torch.rand(b - a, generator=generator).sort()[0]
         lists += [t, offsets]
-    order, offsets = dispatch.merge_order(*lists)
+    order, offsets = compositing.merge_order(*lists)
     twin, twin_offsets = reference.merge_order(*lists)
     assert torch.equal(order, twin)
     assert torch.equal(offsets, twin_offsets)

@@ -15,34 +15,34 @@ from numba import njit
 
 from climatenerf.core.vectors import length, unit
 from climatenerf.field.occupancy import Occupancy
-from climatenerf.ops import dispatch, reference
-from climatenerf.ops.cpu import kernels as cpu
-from climatenerf.ops.cpu import metaballs
+from climatenerf.ops import encoding, marching, optimiser, reference
+from climatenerf.ops.cpu import encoding as cpu_encoding
+from climatenerf.ops.cpu import marching as cpu_marching
+from climatenerf.ops.cpu import metaballs, simd, simd_metaballs
 from climatenerf.ops.cpu import network as cpu_network
-from climatenerf.ops.cpu import simd as lanes
-from climatenerf.ops.cpu import simd_metaballs as ball_lanes
+from climatenerf.ops.cpu import optimiser as cpu_optimiser
 from climatenerf.ops.cpu.simd import LANES
 
 
 @njit
 def product(weight, rows, out, count):
-    lanes.add_product(weight, rows, out, count)
+    simd.add_product(weight, rows, out, count)
 
 
 @njit
 def outer(left, right, out, count):
-    lanes.add_outer(left, right, out, count)
+    simd.add_outer(left, right, out, count)
 
 
 @njit
-def network(features, w1, b1, w2, b2, out):
-    lanes.network(features, w1, b1, w2, b2, out)
+def density_network(features, w1, b1, w2, b2, out):
+    simd.network(features, w1, b1, w2, b2, out)
 
 
 def test_kernels_are_compiled_anew_when_their_instructions_change():
-    """Numba looks at a kernel's own file alone; its text has to change with `lanes.py`'s."""
-    own, balls = (Path(each.__file__).read_bytes() for each in (lanes, ball_lanes))
-    for module in (cpu, cpu_network, metaballs):
+    """Numba looks at a kernel's own file alone; its text has to change with that of `simd.py`."""
+    own, balls = (Path(each.__file__).read_bytes() for each in (simd, simd_metaballs))
+    for module in (cpu_encoding, cpu_marching, cpu_network, cpu_optimiser, metaballs):
         text = own + balls if module is metaballs else own
         digest = hashlib.sha256(text).hexdigest()[:12]
         assert digest == module.LANES_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
@@ -73,7 +73,7 @@ def test_the_density_network(hidden):
     w1 = random.standard_normal((hidden, 10)).astype(np.float32)
     b1, w2 = (random.standard_normal(s).astype(np.float32) for s in (hidden, (1, hidden)))
     out = np.zeros((1, LANES), np.float32)
-    network(features, w1, b1, w2, np.float32(0.7), out)
+    density_network(features, w1, b1, w2, np.float32(0.7), out)
     expected = w2 @ np.maximum(w1 @ features + b1[:, None], 0) + 0.7
     assert np.allclose(out, expected, atol=1e-4)
 
@@ -88,7 +88,7 @@ def test_slopes_of_the_density_match_autograd():
     q = torch.randn(301, 3, generator=generator)
     q[0] = 0.0
     assert (q.norm(dim=-1) < 1).sum() > 20 and (q.norm(dim=-1) > 1.5).sum() > 20
-    found = dispatch.density_slopes(q, (table, resolutions, w1, b1, w2, b2))
+    found = marching.density_slopes(q, (table, resolutions, w1, b1, w2, b2))
     layers = [(w1.double(), b1.double()), (w2.double(), b2.double())]
     expected = reference.density_slopes(q.double(), table.double(), resolutions, layers)
     off = (found - expected).norm(dim=-1) / expected.norm(dim=-1).clamp_min(1e-3)
@@ -102,18 +102,18 @@ def test_many_points_are_encoded_as_few_are():
     generator = torch.Generator().manual_seed(5)
     table = torch.rand(3, 512, 2, generator=generator) - 0.5
     resolutions = torch.tensor([4, 16, 40])
-    u = torch.rand(2 * cpu.ENCODED + 37, 3, generator=generator)
-    out = dispatch.hash_encode(u, table, resolutions)
-    parts = [dispatch.hash_encode(part, table, resolutions) for part in u.split(1000)]
+    u = torch.rand(2 * cpu_encoding.ENCODED + 37, 3, generator=generator)
+    out = encoding.hash_encode(u, table, resolutions)
+    parts = [encoding.hash_encode(part, table, resolutions) for part in u.split(1000)]
     assert torch.allclose(out, torch.cat(parts), atol=1e-6)
-    assert dispatch.hash_encode(u[:0], table, resolutions).shape == (0, 6)
+    assert encoding.hash_encode(u[:0], table, resolutions).shape == (0, 6)
 
 
 def test_places_that_are_no_numbers_stay_in_the_table():
     """They would be read two billion rows on: features that mean nothing, but no crash."""
     table, resolutions = torch.ones(2, 512, 2), torch.tensor([4, 40])
     u = torch.full((20, 3), torch.nan)
-    assert dispatch.hash_encode(u, table, resolutions).shape == (20, 4)
+    assert encoding.hash_encode(u, table, resolutions).shape == (20, 4)
 
 
 def test_slopes_in_double_precision_and_of_nothing():
@@ -123,17 +123,17 @@ def test_slopes_in_double_precision_and_of_nothing():
     net = (table, resolutions, w1, torch.zeros(8), w2, torch.zeros(1))
     q = torch.randn(9, 3, generator=generator)
     wide = tuple(each.double() if each.is_floating_point() else each for each in net)
-    twin = dispatch.density_slopes(q.double(), wide)
+    twin = marching.density_slopes(q.double(), wide)
     assert twin.dtype == torch.float64
-    assert torch.allclose(dispatch.density_slopes(q, net).double(), twin, atol=1e-3)
-    assert dispatch.density_slopes(q[:0], net).shape == (0, 3)
+    assert torch.allclose(marching.density_slopes(q, net).double(), twin, atol=1e-3)
+    assert marching.density_slopes(q[:0], net).shape == (0, 3)
 
 
 @pytest.mark.parametrize("side", [32, 8, 6])
 def test_every_cell_has_its_bit(side):
     generator = torch.Generator().manual_seed(3)
     occupied = (torch.rand(2, side, side, side, generator=generator) < 0.3).to(torch.uint8)
-    words, blocks = dispatch.cells_of(occupied)
+    words, blocks = marching.cells_of(occupied)
     k, x, y, z = np.indices(occupied.shape)
     word = words.numpy()[k, x >> 2, y >> 2, z >> 2].view(np.uint64)
     bit = ((x & 3) | (y & 3) << 2 | (z & 3) << 4).astype(np.uint64)
@@ -175,12 +175,12 @@ def test_adam_leaves_alone_what_has_no_gradient():
         other.grad = gradient.clone()
         adam.step()
         moved = gradient != 0
-        dispatch.adam(own, gradient.clone(), (first, second), 0.1, (0.9, 0.99), 1e-15, step)
+        optimiser.adam(own, gradient.clone(), (first, second), 0.1, (0.9, 0.99), 1e-15, step)
         assert torch.allclose(own[moved], other[moved], atol=1e-6) and moved.sum() > n // 4
         for now, then in zip((own, first, second), before, strict=True):
             assert torch.equal(now[~moved], then[~moved])
     cleared = gradients[0].clone()
-    dispatch.adam(own, cleared, (first, second), 0.1, (0.9, 0.99), 1e-15, 3)
+    optimiser.adam(own, cleared, (first, second), 0.1, (0.9, 0.99), 1e-15, 3)
     assert (cleared == 0).all()
 
 
@@ -198,11 +198,11 @@ def test_lengths_and_their_gradients():
 WIDTH = """
 import numpy as np
 from numba import njit
-from climatenerf.ops import lanes
+from climatenerf.ops.cpu import simd
 
 @njit
 def product(weight, rows, out, count):
-    lanes.add_product(weight, rows, out, count)
+    simd.add_product(weight, rows, out, count)
 
 product(np.ones((4, 2), np.float32), np.ones((2, 32), np.float32), np.ones((4, 32), np.float32), 2)
 (text,) = product.inspect_asm().values()

@@ -16,10 +16,15 @@ from triton.runtime import JITFunction
 
 from climatenerf.core.classes import SOLID
 from climatenerf.field.presets import PRESETS, FieldSize
-from climatenerf.ops.triton import fused_render as gpu_render
-from climatenerf.ops.triton import kernels as gpu
-from climatenerf.ops.triton import network as gpu_network
-from climatenerf.ops.triton import visual_hull as gpu_witness
+from climatenerf.ops.triton import (
+    compositing,
+    encoding,
+    fused_render,
+    marching,
+    network,
+    optimiser,
+    visual_hull,
+)
 
 CARD = GPUTarget("cuda", int(sys.argv[1]) if len(sys.argv) > 1 else 80, 32)
 
@@ -65,38 +70,38 @@ def compile_all() -> None:
     steps, room = (1 / 256, 1 / 160, 1e-3), torch.zeros(3, 1024, n)
     table, resolutions = density[:2]
     features = torch.zeros(24, s)
-    gpu.hash_encode(u, table, resolutions, features)
-    gpu.hash_encode_backward(u, features, resolutions, table)
-    gpu.hash_encode_slopes(u, features, table, resolutions, u)
+    encoding.hash_encode(u, table, resolutions, features)
+    encoding.hash_encode_backward(u, features, resolutions, table)
+    encoding.hash_encode_slopes(u, features, table, resolutions, u)
     one = cells[0][:1, :12, :12, :12].contiguous()  # a single cascade without blocks
-    gpu.march(real, real, real, (one, one), steps, 1e-3, density, room, whole[1:])
-    gpu.pack(room, whole, torch.zeros(3, s))
-    gpu.grid_positions(real, real, whole, some, u)
-    gpu.weights_forward(some, whole, some, real[:, 0])
-    gpu.weights_backward(some, whole, some, real[:, 0], some)
-    gpu.accumulate_forward(some, u, whole, real)
-    gpu.accumulate_backward(some, u, whole, real, some, u)
-    gpu.distortion_forward(some, some, some, whole, real[:, 0])
-    gpu.distortion_backward(some, some, some, whole, real[:, 0], some)
-    gpu.merge_order(some, whole, some, whole, whole, order)
+    marching.march(real, real, real, (one, one), steps, 1e-3, density, room, whole[1:])
+    marching.pack(room, whole, torch.zeros(3, s))
+    marching.grid_positions(real, real, whole, some, u)
+    compositing.weights_forward(some, whole, some, real[:, 0])
+    compositing.weights_backward(some, whole, some, real[:, 0], some)
+    compositing.accumulate_forward(some, u, whole, real)
+    compositing.accumulate_backward(some, u, whole, real, some, u)
+    compositing.distortion_forward(some, some, some, whole, real[:, 0])
+    compositing.distortion_backward(some, some, some, whole, real[:, 0], some)
+    compositing.merge_order(some, whole, some, whole, whole, order)
     maps, few = torch.zeros(s, dtype=torch.uint8), torch.zeros(2, dtype=torch.long)
     views = maps, few, torch.zeros(2, 2, dtype=torch.long), torch.zeros(2, 4), torch.zeros(2, 4, 4)
     for count in (views, tuple(each[:1] for each in views)):
-        gpu_witness.label_votes(u, some, count, (1, 0.1, 0.5), maps)
-    gpu.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
+        visual_hull.label_votes(u, some, count, (1, 0.1, 0.5), maps)
+    optimiser.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
     for size in PRESETS.values():  # their widths are constants of the kernels
         rays = torch.zeros(n, size.colour_hidden), order
         for kind, shared in (("geometry", None), ("colour", rays), ("surface", None)):
             layers = net_of(size, kind)
             out = torch.zeros(s, layers[-1].shape[0])
-            gpu_network.network_forward(u, layers[:2], layers[2:], shared, out)
+            network.network_forward(u, layers[:2], layers[2:], shared, out)
             grads = layers[0], None if shared is None else shared[0], u if shared is None else None
-            gpu_network.network_backward(u, layers[:2], layers[2:], shared, out, grads)
+            network.network_backward(u, layers[:2], layers[2:], shared, out, grads)
         density, colour = net_of(size, "geometry"), net_of(size, "colour")
-        gpu.density_at(u, density, some)
-        gpu.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
-        gpu_network.density_slopes(u, density, u)
-        gpu_render.composite((real, real), real, cells, steps, (1e-3, 1e-4), density, colour,
+        marching.density_at(u, density, some)
+        marching.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
+        marching.density_slopes(u, density, u)
+        fused_render.composite((real, real), real, cells, steps, (1e-3, 1e-4), density, colour,
                              rays[0], torch.zeros(n, 5))  # fmt: skip
 
 

@@ -12,7 +12,6 @@ from torch.utils import _pytree as pytree
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 from climatenerf.ops import dispatch
-from climatenerf.ops.cpu import kernels as cpu
 
 _setup_privateuseone_for_python_backend("toy")
 TOY = torch.device("toy:0")
@@ -106,16 +105,16 @@ for _name in (
 def kernels_for_toys():
     """Within it the CPU's kernels compute for the device."""
 
-    def kernels(*tensors):
+    def backend(*tensors):
         if any(t.dtype not in (torch.float32, torch.int64, torch.uint8) for t in tensors):
             return None
         (kind,) = {t.device.type for t in tensors}
         assert kind in ("toy", "cpu")
-        return cpu
+        return "cpu"
 
-    def array(tensor):
+    def kernel_array(tensor):
         bare = tensor.detach().contiguous()
         return (bare.raw if isinstance(bare, Toy) else bare).numpy()
 
-    with mock.patch.multiple(dispatch, _kernels=kernels, _array=array):
+    with mock.patch.multiple(dispatch, backend=backend, kernel_array=kernel_array):
         yield

@@ -6,47 +6,52 @@ import pytest
 import torch
 from test_static_shapes import begun, learned_in
 
-from climatenerf.ops import dispatch
-from climatenerf.ops.cpu import kernels as cpu
+from climatenerf.ops import dispatch, marching
 
 os.environ.setdefault("TRITON_INTERPRET", "1")  # it is read where a kernel is defined
 pytest.importorskip("triton", reason="Triton is for Linux")
 if os.environ["TRITON_INTERPRET"] != "1":
     pytest.skip("kernels run on the GPU that is here", allow_module_level=True)
 
-from climatenerf.ops.triton import kernels as gpu
-from climatenerf.ops.triton import marching as gpu_march
+from climatenerf.ops.triton import compositing as gpu_compositing
+from climatenerf.ops.triton import encoding as gpu_encoding
+from climatenerf.ops.triton import marching as gpu_marching
 from climatenerf.ops.triton import network as gpu_network
-from climatenerf.ops.triton import visual_hull as gpu_witness
+from climatenerf.ops.triton import optimiser as gpu_optimiser
+from climatenerf.ops.triton import visual_hull as gpu_visual_hull
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
 
 
-def by(kernels, monkeypatch):
-    def given(tensor):
-        tensor = tensor.detach().contiguous()
-        return tensor.numpy() if kernels is cpu else tensor
+def use_backend(backend, monkeypatch):
+    """Let all operations use the kernels of `backend`, "cpu" or "triton"."""
 
-    monkeypatch.setattr(dispatch, "_kernels", lambda *tensors: kernels)
-    monkeypatch.setattr(dispatch, "_array", given)
+    def kernel_array(tensor):
+        tensor = tensor.detach().contiguous()
+        return tensor.numpy() if backend == "cpu" else tensor
+
+    monkeypatch.setattr(dispatch, "backend", lambda *tensors: backend)
+    monkeypatch.setattr(dispatch, "kernel_array", kernel_array)
 
 
 def test_a_step_by_the_gpus_kernels_learns_what_one_by_the_cpus_does(scene, monkeypatch):
     """In large tiles: the interpreter takes milliseconds for an operation, however long."""
-    for module in (gpu, gpu_network, gpu_march):
+    for module in (gpu_encoding, gpu_network, gpu_marching):
         monkeypatch.setattr(module, "SAMPLES", 4096)
     for module, name, size in (
-        (gpu_march, "RAYS", 64),
-        (gpu, "LIST", 64),
-        (gpu, "ENTRIES", 2**16),
-        (gpu_witness, "PLACES", 4096),
-        (dispatch, "CAPACITY", 128),
+        (gpu_marching, "SLOPE_SAMPLES", 4096),
+        (gpu_marching, "RAYS", 64),
+        (gpu_marching, "LIST", 64),
+        (gpu_compositing, "LIST", 64),
+        (gpu_optimiser, "ENTRIES", 2**16),
+        (gpu_visual_hull, "PLACES", 4096),
+        (marching, "CAPACITY", 128),
     ):
         monkeypatch.setattr(module, name, size)
     results = []
-    for kernels in (cpu, gpu):
-        by(kernels, monkeypatch)
-        fitting = begun(scene, kernels is gpu)
+    for backend in ("cpu", "triton"):
+        use_backend(backend, monkeypatch)
+        fitting = begun(scene, backend == "triton")
         with torch.no_grad():  # colours of their own, which gradients reach
             generator = torch.Generator().manual_seed(7)
             for grid in fitting.grid_adam.tables:

@@ -9,7 +9,7 @@ import torch
 from support.toy_fit import begin
 
 from climatenerf.core.classes import ROAD, SKY, UNKNOWN
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 from climatenerf.training import losses
 from climatenerf.training import trainer as fit
 from climatenerf.training.settings import Losses
@@ -88,7 +88,7 @@ def only(scene, weight=1.0, **settings):
     near, far = torch.full((900,), field.near), torch.full((900,), 1e9)
     samples = field.march(batch.rays_o, batch.rays_d, near, far)
     dense = 100 * samples.sigma * samples.dt  # an untrained field is haze; flat is what is solid
-    weights, left = dispatch.render_weights(dense, samples.offsets)
+    weights, left = compositing.render_weights(dense, samples.offsets)
     return fitting, (batch, samples, weights, left, samples.t / field.unit, samples.dt / field.unit)
 
 

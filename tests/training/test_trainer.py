@@ -14,7 +14,7 @@ from climatenerf.core.colour import decode_srgb, encode_srgb
 from climatenerf.core.samples import MIN_TAU
 from climatenerf.evaluation.metrics import psnr
 from climatenerf.field.normalisation import find_extent
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 from climatenerf.render.volume import camera_rays, render_view
 from climatenerf.scene import load_image
 from climatenerf.training import losses
@@ -39,7 +39,7 @@ def depth_of(field, c2w):
     o, d = camera_rays(CAMERA, c2w)
     n = o.shape[0]
     samples = field.march(o, d, torch.full((n,), 0.5), torch.full((n,), 100.0))
-    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     total = torch.zeros(n).index_add(0, samples.ray_index(), weights * samples.t)
     return torch.where(left < 0.5, total / (1 - left).clamp_min(1e-3), torch.inf)
 
@@ -242,7 +242,7 @@ def test_rays_below_the_horizon_end_on_matter(scene):
         near, far = torch.full((len(o),), fitting.field.near), torch.full((len(o),), 1e9)
         samples = fitting.field.march(o, d, near, far)
         tau = samples.sigma * samples.dt
-        left[weight] = float(dispatch.render_weights(tau, samples.offsets)[1].mean())
+        left[weight] = float(compositing.render_weights(tau, samples.offsets)[1].mean())
     assert left[1.0] < 0.5 * left[0.0], left
 
 
@@ -272,7 +272,7 @@ def test_points_put_matter_where_they_are(scene):
         near = torch.full_like(rays.depth, fitting.field.near)
         samples = fitting.field.march(rays.rays_o, rays.rays_d, near, 2 * rays.depth)
         tau = samples.sigma * samples.dt
-        weights, left = dispatch.render_weights(tau, samples.offsets)
+        weights, left = compositing.render_weights(tau, samples.offsets)
         unit = fitting.field.unit
         off[name] = losses.sparse_depth_loss(
             weights, left, samples.t / unit, rays.depth / unit, samples.ray_index()
@@ -297,7 +297,7 @@ def lost_before_surfaces(field, scene):
         o, d = camera_rays(CAMERA, pose)
         end = 0.9 * depth_of(FIELD, pose).clamp_max(6.0)
         samples = field.march(o, d, torch.full_like(end, 0.3), end)
-        _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
         lost.append(1 - left)
     return float(torch.cat(lost).mean())
 

@@ -11,7 +11,7 @@ from climatenerf.core.classes import PERSON, ROAD, SKY, UNKNOWN, VEHICLE
 from climatenerf.core.colour import decode_srgb
 from climatenerf.core.samples import Samples
 from climatenerf.field.normalisation import find_extent
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 from climatenerf.training import losses
 from climatenerf.training import trainer as fit
 from climatenerf.training.evidence.free_space import FreeSpace
@@ -31,7 +31,7 @@ def opacity(fitting):
         torch.full((1000,), fitting.field.near),
         torch.full((1000,), 1e9),
     )
-    left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)[1]
+    left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)[1]
     return float((1 - left).mean())
 
 
@@ -173,7 +173,7 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
         d, o = batch.rays_d[batch.label == 3], batch.rays_o[batch.label == 3]
         near, far = torch.full((len(d),), fitting.field.near), torch.full((len(d),), 1e9)
         samples = fitting.field.march(o, d, near, far)
-        weights, _ = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        weights, _ = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
         ray = samples.ray_index()
         height = o[ray, 2] + samples.t * d[ray, 2]
         above[weight] = float((weights * (height > 0.15)).sum() / len(d))

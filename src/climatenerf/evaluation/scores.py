@@ -22,7 +22,7 @@ from climatenerf.evaluation.metrics import psnr, ssim
 from climatenerf.evaluation.painting import painted, tune
 from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, world_rays
 from climatenerf.field.hash_field import Field
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import see_frame
 from climatenerf.render.heads import see_surface
@@ -193,7 +193,7 @@ def passing(
     rays_o, rays_d = camera_rays(camera, c2w)
     start = torch.full_like(t_max, fitted.near)
     samples = fitted.march(rays_o, rays_d, start, t_max.clamp_min(fitted.near), RENDER_STEP)
-    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     return left
 
 
@@ -208,7 +208,7 @@ def depth_spread(
     rays_o, rays_d = camera_rays(camera, c2w)
     near = torch.full((rays_o.shape[0],), fitted.near)
     samples = fitted.march(rays_o, rays_d, near, torch.full_like(near, 1e9), RENDER_STEP)
-    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     ray, opacity = samples.ray_index(), (1 - left).clamp_min(1e-6)  # nothing there: 0/0
     own = weights / opacity[ray]
     mean = torch.zeros_like(left).index_add(0, ray, own * samples.t)
@@ -235,7 +235,7 @@ def open_sky(place: Place) -> float:
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(found), 3).contiguous()
     start, end = torch.zeros(len(found)), torch.full((len(found),), 1e9)
     samples = place.fitted.march(rays_o, up, start, end, RENDER_STEP, pruning_threshold=MIN_TAU)
-    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     return float(left.mean())
 
 

@@ -22,7 +22,7 @@ from climatenerf.field import activations, protocol
 from climatenerf.field import spherical_harmonics as directions
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
-from climatenerf.ops import dispatch, reference
+from climatenerf.ops import compositing, encoding, fused_render, marching, network, reference
 
 STEP_MIN = 1.0 / 256  # smallest marching step, grid units
 STEP_CONE = 1.0 / 160  # marching step per length travelled
@@ -158,7 +158,7 @@ class Field(nn.Module):
         learned = {protocol.NORMALS} if self.knows_normals else set()
         learned |= {protocol.CLASSES} if self.knows_classes else set()
         # The fused kernel runs on GPUs alone.
-        fused = {protocol.FUSED} if dispatch.takes_whole_rays(self.geometry_grid) else set()
+        fused = {protocol.FUSED} if fused_render.takes_whole_rays(self.geometry_grid) else set()
         always = {protocol.DENSITY, protocol.APPEARANCE, protocol.OBSERVED}
         return frozenset(always | learned | fused)
 
@@ -174,14 +174,14 @@ class Field(nn.Module):
 
     # --- geometry ----------------------------------------------------------------------------
 
-    def _net(self) -> dispatch.Net:
+    def _net(self) -> marching.Net:
         """The density's encoding and network."""
         w1, b1, w2, b2 = self.geometry_net
         return self.geometry_grid, self.geometry_resolutions, w1, b1, w2, b2
 
     def grid_density(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Density (1/grid unit) at positions in grid units, without gradient."""
-        return dispatch.density(q, self._net())
+        return marching.density(q, self._net())
 
     @torch.no_grad()
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -236,7 +236,7 @@ class Field(nn.Module):
         threshold = self.thin if pruning_threshold is None else pruning_threshold
         if jitter is None:
             jitter = torch.zeros_like(t_min)
-        offsets, (t, dt, sigma) = dispatch.march(
+        offsets, (t, dt, sigma) = marching.march(
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, t_max / self.unit, jitter], dim=-1),
             self.occupancy.cells(),
@@ -262,7 +262,7 @@ class Field(nn.Module):
         shared = self._seen_from(rays_d, self._appearance(appearance, rays_o.shape[0]))
         threshold = self.thin if pruning_threshold is None else pruning_threshold
         endless, start = torch.full_like(t_min, 1e9), torch.zeros_like(t_min)
-        found = dispatch.composite(
+        found = fused_render.composite(
             (self.to_grid(rays_o), rays_d),
             torch.stack([t_min / self.unit, endless, start], dim=-1),
             self.occupancy.cells(),
@@ -278,12 +278,12 @@ class Field(nn.Module):
     ) -> Float[Tensor, "s 3"]:
         """Unit-cube coordinates of samples on rays in world m."""
         rays = (self.to_grid(rays_o), rays_d)
-        return dispatch.positions(rays, samples.offsets, samples.t / self.unit)
+        return marching.positions(rays, samples.offsets, samples.t / self.unit)
 
     def raw_density(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Logarithm of the density per contracted length at unit-cube coordinates."""
         grid, resolutions = self.geometry_grid, self.geometry_resolutions
-        return dispatch.encoded_mlp(u, grid, resolutions, _pairs(self.geometry_net))[:, 0]
+        return network.encoded_mlp(u, grid, resolutions, _pairs(self.geometry_net))[:, 0]
 
     def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Density (1/grid unit) at unit-cube coordinates, with gradients to the parameters."""
@@ -294,7 +294,7 @@ class Field(nn.Module):
 
         Analytic, from the encoding's slopes; 0 where the density does not change.
         """
-        return -unit_vector(dispatch.density_slopes(q, self._net()))
+        return -unit_vector(marching.density_slopes(q, self._net()))
 
     def sloped_normal(
         self, q: Float[Tensor, "n 3"], step: Float[Tensor, "n"]
@@ -336,7 +336,7 @@ class Field(nn.Module):
         """Notes the cells that rays of training pixels (world m) see: weight above `least`."""
         n = rays_o.shape[0]
         samples = self.march(rays_o, rays_d, torch.full((n,), self.near), torch.full((n,), 1e9))
-        weights, _ = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+        weights, _ = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
         keep = (weights > least).nonzero()[:, 0]
         ray = samples.ray_index()[keep]
         x = rays_o[ray] + samples.t[keep, None] * rays_d[ray]
@@ -394,18 +394,18 @@ class Field(nn.Module):
     ) -> Float[Tensor, "s 3"]:
         grid, resolutions = self.appearance_grid, self.appearance_resolutions
         layers = _pairs(self.colour_net)
-        return activations.radiance(dispatch.encoded_mlp(u, grid, resolutions, layers, shared, ray))
+        return activations.radiance(network.encoded_mlp(u, grid, resolutions, layers, shared, ray))
 
     def surface_raw(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s 3+c"]:
         """Predicted normals of any length (world axes) and class logits (of `SOLID`), unit-cube u.
 
-        As `dispatch.surface` takes them.
+        As `compositing.surface` takes them.
         """
         if self.size.surface_levels:
             grid, resolutions = self.surface_grid, self.surface_resolutions
         else:
             grid, resolutions = self.appearance_grid, self.appearance_resolutions
-        return dispatch.encoded_mlp(u, grid, resolutions, _pairs(self.surface_net))
+        return network.encoded_mlp(u, grid, resolutions, _pairs(self.surface_net))
 
     def surface_at(
         self, u: Float[Tensor, "s 3"]
@@ -432,9 +432,9 @@ class Field(nn.Module):
         """Linear radiance of the sky in direction d, in the appearance given."""
         # Clouds need finer detail than the harmonics have: what the sky cannot show, floating
         # matter would. Where no photo looked the grid is blank and the harmonics go on.
-        detail = dispatch.hash_encode(0.5 + 0.499 * d, self.sky_grid, self.sky_resolutions)
+        detail = encoding.hash_encode(0.5 + 0.499 * d, self.sky_grid, self.sky_resolutions)
         x = torch.cat([directions.harmonics(d).T, detail.T, embedding.T])
-        return activations.radiance(dispatch.mlp(x.T, _pairs(self.sky_net)))
+        return activations.radiance(network.mlp(x.T, _pairs(self.sky_net)))
 
     @torch.no_grad()
     def colour(

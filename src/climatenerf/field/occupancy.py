@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.device import integers, uniform
-from climatenerf.ops import dispatch
+from climatenerf.ops import marching
 
 OPACITY = 0.3  # of a crossed cell
 FOR_MEAN = 100_000  # cells from which the cascades' mean densities are told, about
@@ -38,20 +38,20 @@ class Occupancy(torch.nn.Module):
         # from the photos, so it is not stored.
         barred = torch.zeros(cascades, side, side, side, dtype=torch.bool)
         self.register_buffer("barred", barred, persistent=False)
-        self.packed: tuple[Tensor, int, dispatch.Cells] | None = None
+        self.packed: tuple[Tensor, int, marching.Cells] | None = None
 
     @property
     def side(self) -> int:
         """Cells along an edge."""
         return self.density.shape[1]
 
-    def cells(self) -> dispatch.Cells:
-        """What marching reads: `dispatch.cells_of` the occupied ones, anew if they have changed."""
+    def cells(self) -> marching.Cells:
+        """What marching reads: `marching.cells_of` the occupied ones, anew if they have changed."""
         if self.occupied.is_inference():  # those count no changes
-            return dispatch.cells_of(self.occupied)
+            return marching.cells_of(self.occupied)
         state = self.occupied, self.occupied._version
         if self.packed is None or self.packed[0] is not state[0] or self.packed[1] != state[1]:
-            self.packed = *state, dispatch.cells_of(self.occupied)
+            self.packed = *state, marching.cells_of(self.occupied)
         return self.packed[2]
 
     def __getstate__(self) -> dict:

@@ -8,7 +8,7 @@ from climatenerf.core.classes import SKY, SOLID
 from climatenerf.core.device import to_device
 from climatenerf.core.samples import MIN_WEIGHT, offsets_of
 from climatenerf.field.protocol import RadianceField
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 from climatenerf.render.volume import RENDER_STEP, rays_at_once
 
 
@@ -32,18 +32,18 @@ def see_surface(
     for o, d in zip(rays_o.split(size), rays_d.split(size), strict=True):
         near, far = torch.full((len(o),), field.near), torch.full((len(o),), 1e9)
         samples = field.march(o, d, near, far, RENDER_STEP)
-        weights, transmittance = dispatch.render_weights(
+        weights, transmittance = compositing.render_weights(
             samples.sigma * samples.dt, samples.offsets
         )
         keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
         weights, offsets = weights[keep], offsets_of(samples.ray_index()[keep], len(o))
         normal, logits = field.surface_heads(o, d, samples, keep)
         solid = transmittance < 0.5
-        mean = dispatch.accumulate(weights, normal, offsets)
+        mean = compositing.accumulate(weights, normal, offsets)
         mean = torch.nn.functional.normalize(mean, dim=-1) * solid[:, None]
         away = (mean * d).sum(-1, keepdim=True) > 0
         normals.append(torch.where(away, -mean, mean))
-        best = dispatch.accumulate(weights, logits, offsets).argmax(-1)
+        best = compositing.accumulate(weights, logits, offsets).argmax(-1)
         kind = to_device(SOLID)[best].to(torch.uint8)
         labels.append(torch.where(solid, kind, torch.full_like(kind, SKY)))
     return torch.cat(normals), torch.cat(labels)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples, offsets_of
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 from climatenerf.render.volume import RENDER_STEP, composited, rays_at_once
 from climatenerf.weather.flood import optics as water_physics
 from climatenerf.weather.flood import waves
@@ -100,7 +100,7 @@ def _trace(
             return concatenate(parts, torch.cat([dry, wet]).argsort())
     samples, is_matter = _all_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
-    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
 
     # --- Which share of the light comes from beyond the water? -----------------------------------
     if water is None:
@@ -121,7 +121,7 @@ def _trace(
     own_t = samples.t[keep]
     colour = _through(world, water, below[ray[keep]], colour, rays_o, rays_d, ray[keep], own_t)
     offsets = offsets_of(ray[keep], n)
-    rgb = dispatch.accumulate(front[keep], colour, offsets)
+    rgb = compositing.accumulate(front[keep], colour, offsets)
 
     # --- Sky ---------------------------------------------------------------------------------
     endless = torch.full((n,), torch.inf)
@@ -171,7 +171,7 @@ def _trace(
         mine = keep[is_matter[keep]]
         x = rays_o[ray[mine]] + samples.t[mine, None] * rays_d[ray[mine]]
         height = world.matter.thickness(x)
-        thickness = dispatch.accumulate(front[mine], height[:, None], offsets_of(ray[mine], n))[
+        thickness = compositing.accumulate(front[mine], height[:, None], offsets_of(ray[mine], n))[
             :, 0
         ]
         thickness = thickness / snow_share.clamp_min(TINY) * (snow_share > MIN_SHARE)
@@ -228,7 +228,7 @@ def _all_samples(
     if world.matter is None:
         return field, torch.zeros(field.t.shape[0], dtype=torch.bool)
     own = world.matter.march(rays_o, rays_d, t_min, _opaque_from(field))
-    order, offsets = dispatch.merge_order(field.t, field.offsets, own.t, own.offsets)
+    order, offsets = compositing.merge_order(field.t, field.offsets, own.t, own.offsets)
     both = {
         key: torch.cat([getattr(field, key), getattr(own, key)])[order]
         for key in ("t", "dt", "sigma")
@@ -241,7 +241,7 @@ def _all_samples(
 
 def _opaque_from(samples: Samples) -> Float[Tensor, "n"]:
     """Ray length behind which nothing shows any more; +inf where light is left."""
-    _, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
+    _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     ends = torch.full_like(left, torch.inf)
     rays = (left < HIDDEN).nonzero()[:, 0]
     last = samples.offsets[rays + 1] - 1
@@ -466,4 +466,4 @@ def _squashed(world: World, x: Tensor, step: Tensor) -> Float[Tensor, "n"]:
 
 
 def _sum(values: Float[Tensor, "s"], offsets: Int[Tensor, "n+1"]) -> Float[Tensor, "n"]:
-    return dispatch.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]
+    return compositing.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]

@@ -10,7 +10,7 @@ from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import MIN_WEIGHT, offsets_of
 from climatenerf.field.protocol import FUSED, RadianceField
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
 GPU_RAYS_AT_ONCE = 2**16  # there each launch costs; a wet ray sends five, all traced together
@@ -68,15 +68,15 @@ def composited(
     samples = field.march(
         rays_o, rays_d, t_min, endless, step_scale, stop=stop, pruning_threshold=pruning_threshold
     )
-    weights, left = dispatch.render_weights(samples.sigma * samples.dt, samples.offsets)
-    far = dispatch.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
+    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    far = compositing.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
     keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
     ray = samples.ray_index()[keep]
     x = rays_o[ray] + samples.t[keep, None] * rays_d[ray]
     ids = None if samples.ids is None else samples.ids[keep]
     colour = field.colour(x, rays_d, ray, ids=ids, appearance=appearance)
     offsets = offsets_of(ray, t_min.shape[0])
-    return dispatch.accumulate(weights[keep], colour, offsets), left, far
+    return compositing.accumulate(weights[keep], colour, offsets), left, far
 
 
 @torch.no_grad()

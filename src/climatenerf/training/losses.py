@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.core.colour import encode_srgb
-from climatenerf.ops import dispatch
+from climatenerf.ops import compositing
 
 
 def colour_error(linear: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -36,7 +36,7 @@ def distortion_loss(
     t and dt in field units.
     """
     start, end = distance_measure(t - dt / 2), distance_measure(t + dt / 2)
-    return dispatch.distortion(weights, (start + end) / 2, end - start, offsets).mean()
+    return compositing.distortion(weights, (start + end) / 2, end - start, offsets).mean()
 
 
 def sparse_depth_loss(

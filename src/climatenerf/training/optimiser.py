@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import torch
 
-from climatenerf.ops import dispatch
+from climatenerf.ops import optimiser
 
 DECAY_EVERY = 8  # steps: all rows are read for it, while a step reads few
 
@@ -40,7 +40,7 @@ class GridAdam:
         for table, decay, *moments in zip(
             self.tables, self.decays, self.first, self.second, strict=True
         ):
-            dispatch.adam(
+            optimiser.adam(
                 table.data,
                 table.grad_buffer,  # type: ignore[attr-defined]
                 (moments[0], moments[1]),

@@ -23,7 +23,7 @@ from climatenerf.core.vectors import unit
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import Extent
 from climatenerf.field.presets import PRESETS, FieldSize
-from climatenerf.ops import dispatch, reference
+from climatenerf.ops import compositing, marching, reference
 from climatenerf.training import losses
 from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels
 from climatenerf.training.evidence.free_space import FreeSpace, is_ground
@@ -214,7 +214,7 @@ class Fitting:
         # Lengths from here on in grid units.
         t, dt = samples.t / field.unit, samples.dt / field.unit
         tau = samples.sigma * samples.dt
-        before, _ = dispatch.render_weights(tau, samples.offsets)
+        before, _ = compositing.render_weights(tau, samples.offsets)
         heavy = self.rooms.chosen("heavy", before > SEEN_WEIGHT)
         field.keep_occupied(rays_o, rays_d, samples, heavy)
         self.thin_out(tau, before)
@@ -232,7 +232,7 @@ class Fitting:
             )
         own = field.density_with_gradient(u) * dt[kept]
         tau = tau.index_copy(0, kept, scale_gradient(own, spread / chance))
-        weights, left = dispatch.render_weights(tau, samples.offsets)
+        weights, left = compositing.render_weights(tau, samples.offsets)
 
         share = weights[kept] / chance
         seen = self.rooms.chosen("seen", share.detach() > MIN_WEIGHT)
@@ -327,7 +327,7 @@ class Fitting:
             loss = loss + grown * weigh.below_horizon_opacity * losses.below_horizon_loss(
                 left, below
             )
-        distance = dispatch.accumulate(weights, t[:, None], samples.offsets)[:, 0]
+        distance = compositing.accumulate(weights, t[:, None], samples.offsets)[:, 0]
         mean_distance = distance / (1 - left).clamp_min(1e-3)  # nothing there: 0/0
         if weigh.sky and self.knows_sky:
             if self.settings.opaque_sky:
@@ -419,7 +419,7 @@ class Fitting:
             if weigh.normals:
                 self.field.learned[0].fill_(self.stage > NORMALS_AT)
                 goal = self.field.density_normal(q)
-        logits, apart = dispatch.surface(own, raw, goal, offsets_of(of, n))
+        logits, apart = compositing.surface(own, raw, goal, offsets_of(of, n))
         loss = weigh.normals * apart.sum() / n
         if weigh.classes and self.pixels.label is not None and self.learns_classes:
             target = self.solid_of[batch.label[:n].long()]
@@ -442,7 +442,7 @@ class Fitting:
         n, room = rays_o.shape[0], None
         if self.rooms.fixed:
             most = max(4 * self.settings.samples_per_step, 2**16)  # where nothing is known yet
-            room = self.rooms.room(name, min(n * dispatch.CAPACITY, most))
+            room = self.rooms.room(name, min(n * marching.CAPACITY, most))
         samples = self.field.march(
             rays_o,
             rays_d,
@@ -467,7 +467,7 @@ class Fitting:
         samples = self.march("points", measured.rays_o, measured.rays_d, field.near, far)
         u = field.sample_positions(measured.rays_o, measured.rays_d, samples)
         tau = field.density_with_gradient(u) * (samples.dt / field.unit)
-        weights, left = dispatch.render_weights(tau, samples.offsets)
+        weights, left = compositing.render_weights(tau, samples.offsets)
         loss = losses.sparse_depth_loss(
             weights, left, samples.t / field.unit, measured.depth / field.unit, samples.ray_index()
         )
@@ -511,7 +511,7 @@ class Fitting:
             # Haze before the sky would take its colour and stay.
             spread = spread * (batch.label != SKY)[ray]
         colour = scale_gradient(colour, spread[:, None])
-        own = dispatch.accumulate(share, colour, offsets_of(ray, n))
+        own = compositing.accumulate(share, colour, offsets_of(ray, n))
         # The drawn shares sum to the ray's opacity on average only; made to sum to it, they are far
         # less noisy.
         drawn = torch.zeros(n).index_add(0, ray, share.detach())

@@ -17,7 +17,7 @@ from numba import njit, prange
 
 from climatenerf.ops.cpu.simd_metaballs import BALL_REACH, ball_means, ball_sums
 
-LANES_DIGEST = "d22e9516b615"  # of `lanes.py` and `ball_lanes.py`; the former says why
+LANES_DIGEST = "60fe272ebcab"  # of `simd.py` and `simd_metaballs.py`; the former explains why
 BRICK = 8
 """Cells along a brick's side."""
 STORED = BRICK + 3

@@ -12,10 +12,10 @@ All layers of a network lie in one row of numbers: of each its weights, [outputs
 import numpy as np
 from numba import njit, prange
 
-from climatenerf.ops.cpu import simd as lanes
+from climatenerf.ops.cpu import simd
 from climatenerf.ops.cpu.simd import LANES
 
-LANES_DIGEST = "eeeb3e1424f9"  # of `lanes.py`, which says why
+LANES_DIGEST = "eeeb3e1424f9"  # of `simd.py`, which explains why
 
 BLOCK = 128  # samples at a time, some whole lanes: 64 hidden rows of them are 32 kB
 CHUNK = 2048  # samples, about, that one thread takes at once and sums gradients over
@@ -73,11 +73,11 @@ def _hidden_layers(rows, shared, which, weights, widths, size):
             whole = units // LANES * LANES
             for point in range(0, size, LANES):
                 for unit in range(0, whole, LANES):
-                    lanes.add_shared(own, shared, which, unit, point)
+                    simd.add_shared(own, shared, which, unit, point)
             for m in range(whole, units):
                 for s in range(size):
                     own[m, s] += shared[which[s], m]
-        lanes.add_product(w, below, own, count)
+        simd.add_product(w, below, own, count)
         for m in range(units):
             line = own[m]
             for s in range(BLOCK):
@@ -107,7 +107,7 @@ def network_forward(x, shared, row, weights, widths, out):
             for o in range(own.shape[0]):
                 own[o] = b[o]
             hidden = rows[first : first + widths[last]]
-            lanes.add_product(w, hidden, own, (size + LANES - 1) // LANES)
+            simd.add_product(w, hidden, own, (size + LANES - 1) // LANES)
             out[:, start : start + size] = own[:, :size]
 
 
@@ -149,11 +149,11 @@ def network_backward(given, weights, turned, widths, grad, borders, gradients):
                 inputs, outputs = widths[layer], widths[layer + 1]
                 total = outputs * (inputs + 1)  # numbers, with the biases
                 own = sums[chunk, at : at + total].reshape(outputs, inputs + 1)
-                lanes.add_outer(above[:outputs], rows[first : first + inputs + 1], own, count)
+                simd.add_outer(above[:outputs], rows[first : first + inputs + 1], own, count)
                 if layer or grad_x.shape[0]:
                     w = turned[at : at + inputs * outputs].reshape(inputs, outputs)
                     below[:inputs] = 0.0
-                    lanes.add_product(w, above[:outputs], below, count)
+                    simd.add_product(w, above[:outputs], below, count)
                 if layer:
                     for m in range(inputs):
                         line, lit = below[m], rows[first + m]
@@ -174,7 +174,7 @@ def _add_to_shared(grad, which, units, size, out):
     whole = units // LANES * LANES
     for point in range(0, size, LANES):
         for unit in range(0, whole, LANES):
-            lanes.add_to_shared(grad, out, which, unit, point)
+            simd.add_to_shared(grad, out, which, unit, point)
     for m in range(whole, units):
         for s in range(size):
             out[which[s], m] += grad[m, s]

@@ -1,8 +1,7 @@
-"""What the GPU's kernels share: contraction, hash encoding, density. In Triton.
+"""GPU kernels in Triton: multi-resolution hash encoding.
 
 Samples lie along the first axis of a tile, levels of the encoding along the second, so that all
-corners of all levels are on their way from memory at once. `reference.py` specifies it all. Without
-a GPU Triton's interpreter runs the same code (TRITON_INTERPRET=1): so it is tested.
+corners of all levels are on their way from memory at once. `reference.hash_encode` specifies it.
 
 Kernels are compiled for SIZES: levels of the encoding, the same padded, hidden units padded, hidden
 units; and, of networks whose outputs are not one density, outputs padded, outputs.
@@ -11,37 +10,17 @@ units; and, of networks whose outputs are not one density, outputs padded, outpu
 # Triton's functions have no types that pyright could know.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 # pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportOptionalSubscript=false
 
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from climatenerf.ops.triton.tiles import over, padded, points
+
+SAMPLES = 64  # of a tile of an encoding
 PRIME_Y = tl.constexpr(2654435761)
 PRIME_Z = tl.constexpr(805459861)
-# Products of three tensor-core passes come as near as single precision does.
-EXACT = tl.constexpr("tf32x3")
-FAST = tl.constexpr("tf32")  # one pass: 11 bits, enough for a colour that is shown in 8
-
-
-@triton.jit
-def points(u, tile, n, BLOCK: tl.constexpr):
-    """The rows of u [n,3] in a tile: index, which there are, x, y, z."""
-    i = tile.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    some = i < n
-    ux = tl.load(u + 3 * i, mask=some, other=0.0)
-    uy = tl.load(u + 3 * i + 1, mask=some, other=0.0)
-    return i, some, ux, uy, tl.load(u + 3 * i + 2, mask=some, other=0.0)
-
-
-@triton.jit
-def unit_cube(qx, qy, qz):
-    """Contraction into the unit cube: its coordinates, and the distance from the centre."""
-    m = tl.sqrt(qx * qx + qy * qy + qz * qz)
-    s = 0.25 * tl.where(m <= 1.0, 1.0, (2.0 - 1.0 / m) / m)
-    ux = tl.minimum(tl.maximum(qx * s + 0.5, 0.0), 0.999999)
-    uy = tl.minimum(tl.maximum(qy * s + 0.5, 0.0), 0.999999)
-    uz = tl.minimum(tl.maximum(qz * s + 0.5, 0.0), 0.999999)
-    return ux, uy, uz, m
 
 
 @triton.jit
@@ -107,60 +86,102 @@ def features_at(ux, uy, uz, some, encoding, SIZES: tl.constexpr):
 
 
 @triton.jit
-def first_layer(w1, b1, SIZES: tl.constexpr):
-    """Weights of the first features [levels, hidden], of the second, and biases."""
-    PADDED: tl.constexpr = SIZES[1]
-    H: tl.constexpr = SIZES[2]
-    HIDDEN: tl.constexpr = SIZES[3]
-    level, unit = tl.arange(0, PADDED)[:, None], tl.arange(0, H)[None, :]
-    known = (level < SIZES[0]) & (unit < HIDDEN)
-    at = w1 + 2 * level * HIDDEN + unit
-    even = tl.load(at, mask=known, other=0.0)
-    odd = tl.load(at + HIDDEN, mask=known, other=0.0)
-    bias = tl.load(b1 + tl.arange(0, H), mask=tl.arange(0, H) < HIDDEN, other=0.0)
-    return even, odd, bias
+def both(features, i, n, some, SIZES: tl.constexpr):
+    """Where a level's first and second feature of samples lie in [2L,n], and which there are."""
+    level = tl.arange(0, SIZES[1])[None, :].to(tl.int64)
+    first = features + 2 * level * n + i[:, None]
+    return first, first + n, some[:, None] & (level < SIZES[0])
 
 
-@triton.jit
-def hidden_of(first, second, layer, PRECISION: tl.constexpr):
-    """The hidden layer before its ReLU [samples, hidden]."""
-    even, odd, bias = layer
-    h = tl.dot(first, even, input_precision=PRECISION)
-    return tl.dot(second, odd, h, input_precision=PRECISION) + bias[None, :]
-
-
-@triton.jit
-def density_of(qx, qy, qz, some, encoding, layers, SIZES: tl.constexpr):
-    """Density (1/grid unit) at positions in grid units, where `some`."""
-    ux, uy, uz, m = unit_cube(qx, qy, qz)
+@triton.jit(do_not_specialize=["n"])
+def _hash_encode(u, encoding, out, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    i, some, ux, uy, uz = points(u, tl.program_id(0), n, BLOCK)
     first, second = features_at(ux, uy, uz, some, encoding, SIZES)
-    layer, w2, b2 = layers
-    h = tl.maximum(hidden_of(first, second, layer, EXACT), 0.0)
-    raw = tl.sum(h * w2[None, :], 1) + b2
-    return tl.exp(tl.minimum(raw, 15.0)) / tl.maximum(m * m, 1.0)
+    at_first, at_second, known = both(out, i, n, some, SIZES)
+    tl.store(at_first, first, mask=known)
+    tl.store(at_second, second, mask=known)
+
+
+def hash_encode(u: Tensor, table: Tensor, resolutions: Tensor, out: Tensor) -> None:
+    """Features of n points: u [n,3] in [0,1), table [L,T,2] → out [2L,n]."""
+    n, levels, size = u.shape[0], table.shape[0], table.shape[1]
+    encoding = table, resolutions, size
+    over(_hash_encode, n, SAMPLES)(
+        u, encoding, out, n, SIZES=(levels, padded(levels)), BLOCK=SAMPLES
+    )
+
+
+@triton.jit(do_not_specialize=["n"])
+def _hash_encode_backward(u, grad_out, encoding, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    grad_table, resolutions, size = encoding
+    i, some, ux, uy, uz = points(u, tl.program_id(0), n, BLOCK)
+    at_first, at_second, known = both(grad_out, i, n, some, SIZES)
+    first = tl.load(at_first, mask=known, other=0.0)
+    second = tl.load(at_second, mask=known, other=0.0)
+    scatter(first, second, ux, uy, uz, known, grad_table, resolutions, size, SIZES)
 
 
 @triton.jit
-def density_layers(net, SIZES: tl.constexpr):
-    """The density's network as `density_of` takes it, from (w1, b1, w2, b2) in memory."""
-    w1, b1, w2, b2 = net
-    layer = first_layer(w1, b1, SIZES)
-    unit = tl.arange(0, SIZES[2])
-    return layer, tl.load(w2 + unit, mask=unit < SIZES[3], other=0.0), tl.load(b2)
+def scatter(first, second, ux, uy, uz, known, grad_table, resolutions, size, SIZES: tl.constexpr):
+    """Adds gradients to both features of the levels [samples, levels] to the table's."""
+    cell, place, resolution = lattice(ux, uy, uz, resolutions, SIZES)
+    known = known & ((first != 0.0) | (second != 0.0))
+    for corner in tl.static_range(8):
+        at = grad_table + 2 * rows_of(cell, corner, resolution, size)
+        weight = share_of(place, corner)
+        tl.atomic_add(at, weight * first, mask=known, sem="relaxed")
+        tl.atomic_add(at + 1, weight * second, mask=known, sem="relaxed")
 
 
-def padded(count: int) -> int:
-    """A tile's width for so many levels or units: matrix products want a power of 2 from 16 on."""
-    return max(16, 1 << (count - 1).bit_length())
+def hash_encode_backward(
+    u: Tensor, grad_out: Tensor, resolutions: Tensor, grad_table: Tensor
+) -> None:
+    """Adds the gradient of `hash_encode` to grad_table [L,T,2]; the sum's order is not fixed."""
+    n, levels, size = u.shape[0], grad_table.shape[0], grad_table.shape[1]
+    encoding = grad_table, resolutions, size
+    over(_hash_encode_backward, n, SAMPLES)(
+        u, grad_out, encoding, n, SIZES=(levels, padded(levels)), BLOCK=SAMPLES
+    )
 
 
-def sizes_of(table: Tensor, w1: Tensor, w2: Tensor | None = None) -> tuple[int, ...]:
-    """SIZES of an encoding and the network on it; with its second layer's where that is given."""
-    levels, hidden = table.shape[0], w1.shape[1]
-    own = levels, padded(levels), padded(hidden), hidden
-    return own if w2 is None else (*own, padded(w2.shape[1]), w2.shape[1])
+@triton.jit
+def slopes_of(first, second, ux, uy, uz, known, encoding, SIZES: tl.constexpr):
+    """Gradient to the positions from those to both features of the levels."""
+    table, resolutions, size = encoding
+    cell, place, resolution = lattice(ux, uy, uz, resolutions, SIZES)
+    fx, fy, fz = place
+    tx, ty, tz = tl.zeros_like(fx), tl.zeros_like(fx), tl.zeros_like(fx)
+    for corner in tl.static_range(8):
+        a, b = pair_at(table, rows_of(cell, corner, resolution, size), known)
+        value = first * a + second * b
+        wx = fx if corner & 1 else 1.0 - fx
+        wy = fy if corner >> 1 & 1 else 1.0 - fy
+        wz = fz if corner >> 2 else 1.0 - fz
+        tx += value * wy * wz * (1.0 if corner & 1 else -1.0)
+        ty += value * wx * wz * (1.0 if corner >> 1 & 1 else -1.0)
+        tz += value * wx * wy * (1.0 if corner >> 2 else -1.0)
+    scale = resolution.to(tl.float32)[None, :]
+    return tl.sum(tx * scale, 1), tl.sum(ty * scale, 1), tl.sum(tz * scale, 1)
 
 
-def over(kernel, count: int, block: int):
-    """A kernel ready to be called for `count` items, `block` of them a program."""
-    return kernel[(max(1, triton.cdiv(count, block)),)]
+@triton.jit(do_not_specialize=["n"])
+def _hash_encode_slopes(u, grad_out, encoding, grad_u, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    i, some, ux, uy, uz = points(u, tl.program_id(0), n, BLOCK)
+    at_first, at_second, known = both(grad_out, i, n, some, SIZES)
+    first = tl.load(at_first, mask=known, other=0.0)
+    second = tl.load(at_second, mask=known, other=0.0)
+    gx, gy, gz = slopes_of(first, second, ux, uy, uz, known, encoding, SIZES)
+    tl.store(grad_u + 3 * i, gx, mask=some)
+    tl.store(grad_u + 3 * i + 1, gy, mask=some)
+    tl.store(grad_u + 3 * i + 2, gz, mask=some)
+
+
+def hash_encode_slopes(
+    u: Tensor, grad_out: Tensor, table: Tensor, resolutions: Tensor, grad_u: Tensor
+) -> None:
+    """Gradient of `hash_encode` to the positions: grad_out [2L,n] → grad_u [n,3]."""
+    n, levels, size = u.shape[0], table.shape[0], table.shape[1]
+    encoding = table, resolutions, size
+    over(_hash_encode_slopes, n, SAMPLES)(
+        u, grad_out, encoding, grad_u, n, SIZES=(levels, padded(levels)), BLOCK=SAMPLES
+    )

@@ -14,26 +14,21 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from climatenerf.ops.triton.encoding import (
-    FAST,
-    density_layers,
-    density_of,
-    features_at,
-    first_layer,
-    hidden_of,
-    over,
-    sizes_of,
-    unit_cube,
-)
+from climatenerf.ops.triton.compositing import weight_of
+from climatenerf.ops.triton.encoding import features_at
 from climatenerf.ops.triton.marching import (
     RAYS,
     WARPS,
     begin,
     cells_of,
+    density_layers,
+    density_of,
     middle_of,
     search,
-    weight_of,
+    unit_cube,
 )
+from climatenerf.ops.triton.network import FAST, first_layer, hidden_of, sizes_of
+from climatenerf.ops.triton.tiles import over
 
 SHARPNESS = tl.constexpr(8.0)  # of the softplus; see `field.activations`
 BRIGHT = tl.constexpr(2.4 / 1.055)  # slope beyond white; see `field.colour_space.decode_srgb`

@@ -1,7 +1,8 @@
-"""Marching on a GPU, in Triton: a block of rays looks for occupied cells, and computes densities.
+"""GPU kernels in Triton: the density, and marching, which evaluates it in occupied cells.
 
-Shared by `gpu.march`, which keeps the samples, and `gpu_render.composite`, which does not. Rays of
-a block wait for one another, but only for `TRIES` cells at a time.
+A block of rays looks for occupied cells and computes densities together. `march` keeps the samples;
+`fused_render.composite` shares the search and does not. Rays of a block wait for one another, but
+only for `TRIES` cells at a time.
 """
 
 # Triton's functions have no types that pyright could know.
@@ -15,13 +16,47 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from climatenerf.ops.triton.encoding import density_layers, density_of, over, points, sizes_of
+from climatenerf.ops.triton.encoding import features_at, slopes_of
+from climatenerf.ops.triton.network import EXACT, first_layer, hidden_of, sizes_of
+from climatenerf.ops.triton.tiles import LIST, over, points, ray_lists
 
 SAMPLES = 64  # of a tile of densities
 RAYS = 16  # that march together
 WARPS = 2  # they are marched by
 TRIES = tl.constexpr(4)  # empty cells that a ray crosses while others compute densities
 FOREVER = tl.constexpr(1e30)
+SLOPE_SAMPLES, SLOPE_WARPS = 32, 4  # of a tile of the density's slopes
+
+
+@triton.jit
+def unit_cube(qx, qy, qz):
+    """Contraction into the unit cube: its coordinates, and the distance from the centre."""
+    m = tl.sqrt(qx * qx + qy * qy + qz * qz)
+    s = 0.25 * tl.where(m <= 1.0, 1.0, (2.0 - 1.0 / m) / m)
+    ux = tl.minimum(tl.maximum(qx * s + 0.5, 0.0), 0.999999)
+    uy = tl.minimum(tl.maximum(qy * s + 0.5, 0.0), 0.999999)
+    uz = tl.minimum(tl.maximum(qz * s + 0.5, 0.0), 0.999999)
+    return ux, uy, uz, m
+
+
+@triton.jit
+def density_of(qx, qy, qz, some, encoding, layers, SIZES: tl.constexpr):
+    """Density (1/grid unit) at positions in grid units, where `some`."""
+    ux, uy, uz, m = unit_cube(qx, qy, qz)
+    first, second = features_at(ux, uy, uz, some, encoding, SIZES)
+    layer, w2, b2 = layers
+    h = tl.maximum(hidden_of(first, second, layer, EXACT), 0.0)
+    raw = tl.sum(h * w2[None, :], 1) + b2
+    return tl.exp(tl.minimum(raw, 15.0)) / tl.maximum(m * m, 1.0)
+
+
+@triton.jit
+def density_layers(net, SIZES: tl.constexpr):
+    """The density's network as `density_of` takes it, from (w1, b1, w2, b2) in memory."""
+    w1, b1, w2, b2 = net
+    layer = first_layer(w1, b1, SIZES)
+    unit = tl.arange(0, SIZES[2])
+    return layer, tl.load(w2 + unit, mask=unit < SIZES[3], other=0.0), tl.load(b2)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -37,6 +72,48 @@ def density_at(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
     n, encoding = q.shape[0], (table, resolutions, table.shape[1])
     over(_density_at, n, SAMPLES)(
         q, encoding, tuple(layers), out, n, SIZES=sizes_of(table, layers[0]), BLOCK=SAMPLES
+    )
+
+
+@triton.jit(do_not_specialize=["n"])
+def _slopes(q, encoding, layers, out, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
+    w1, b1, w2, _ = layers
+    i, some, qx, qy, qz = points(q, tl.program_id(0), n, BLOCK)
+    ux, uy, uz, m = unit_cube(qx, qy, qz)
+    layer = first_layer(w1, b1, SIZES)
+    even, odd, _ = layer
+    first, second = features_at(ux, uy, uz, some, encoding, SIZES)
+    unit = tl.arange(0, SIZES[2])
+    own = tl.load(w2 + unit, mask=unit < SIZES[3], other=0.0)[None, :]
+    back = tl.where(hidden_of(first, second, layer, EXACT) > 0.0, own, 0.0)
+    first = tl.dot(back, tl.trans(even), input_precision=EXACT)
+    second = tl.dot(back, tl.trans(odd), input_precision=EXACT)
+    known = some[:, None] & (tl.arange(0, SIZES[1]) < SIZES[0])[None, :]
+    gx, gy, gz = slopes_of(first, second, ux, uy, uz, known, encoding, SIZES)
+    # Back through the contraction, and what thins the density outside the core.
+    outside = m > 1.0
+    far = tl.where(outside, m, 1.0)
+    s = 0.25 * tl.where(outside, (2.0 - 1.0 / far) / far, 1.0)
+    along = (qx * gx + qy * gy + qz * gz) * 0.5 * (1.0 / far - 1.0) / (far * far * far)
+    along = tl.where(outside, along - 2.0 / (far * far), 0.0)
+    tl.store(out + 3 * i, s * gx + along * qx, mask=some)
+    tl.store(out + 3 * i + 1, s * gy + along * qy, mask=some)
+    tl.store(out + 3 * i + 2, s * gz + along * qz, mask=some)
+
+
+def density_slopes(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
+    """Gradient of the density's logarithm at q [n,3] (grid units) → out [n,3]."""
+    table, resolutions, *layers = net
+    n = q.shape[0]
+    over(_slopes, n, SLOPE_SAMPLES)(
+        q,
+        (table, resolutions, table.shape[1]),
+        tuple(layers),
+        out,
+        n,
+        SIZES=sizes_of(table, layers[0]),
+        BLOCK=SLOPE_SAMPLES,
+        num_warps=SLOPE_WARPS,
     )
 
 
@@ -221,9 +298,48 @@ def cells_of(cells: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, tuple[int, i
     return occupied, blocks, (cascades, side, side // blocks.shape[1])
 
 
-@triton.jit
-def weight_of(before, tau):
-    """Rendering weight of a sample of optical depth tau behind so much of it."""
-    # 1 - exp(-tau) loses all digits of a thin sample's; the series has them.
-    thin = tau * (1.0 - tau * (0.5 - tau * (1.0 / 6.0 - tau / 24.0)))
-    return tl.exp(-before) * tl.where(tau < 0.05, thin, 1.0 - tl.exp(-tau))
+@triton.jit(do_not_specialize=["n", "total"])
+def _pack(rows, offsets, out, n, total, capacity, BLOCK: tl.constexpr):
+    r, first, count = ray_lists(offsets, n, BLOCK)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        some = k < count
+        for kind in tl.static_range(3):
+            value = tl.load(rows + (kind * capacity + k) * n + r, mask=some)
+            tl.store(out + kind * total + first + k, value, mask=some)
+        k += 1
+
+
+def pack(rows: Tensor, offsets: Tensor, out: Tensor) -> None:
+    """Packs what `march` has left in rows into out [3, samples]."""
+    n = offsets.shape[0] - 1
+    over(_pack, n, LIST)(rows, offsets, out, n, out.shape[1], rows.shape[1], BLOCK=LIST)
+
+
+@triton.jit(do_not_specialize=["n"])
+def _grid_positions(rays_o, rays_d, offsets, t, out, n, BLOCK: tl.constexpr):
+    r, first, count = ray_lists(offsets, n, BLOCK)
+    some = r < n
+    ox = tl.load(rays_o + 3 * r, mask=some)
+    oy = tl.load(rays_o + 3 * r + 1, mask=some)
+    oz = tl.load(rays_o + 3 * r + 2, mask=some)
+    dx = tl.load(rays_d + 3 * r, mask=some)
+    dy = tl.load(rays_d + 3 * r + 1, mask=some)
+    dz = tl.load(rays_d + 3 * r + 2, mask=some)
+    longest = tl.max(count, 0)
+    k = 0
+    while k < longest:
+        i, own = first + k, k < count
+        far = tl.load(t + i, mask=own, other=0.0)
+        ux, uy, uz, _ = unit_cube(ox + far * dx, oy + far * dy, oz + far * dz)
+        tl.store(out + 3 * i, ux, mask=own)
+        tl.store(out + 3 * i + 1, uy, mask=own)
+        tl.store(out + 3 * i + 2, uz, mask=own)
+        k += 1
+
+
+def grid_positions(rays_o: Tensor, rays_d: Tensor, offsets: Tensor, t: Tensor, u: Tensor) -> None:
+    """Unit-cube coordinates (after contraction) of packed samples: → u [samples,3]."""
+    n = rays_o.shape[0]
+    over(_grid_positions, n, LIST)(rays_o, rays_d, offsets, t, u, n, BLOCK=LIST)

@@ -8,33 +8,50 @@ that go through the tensor cores.
 # Triton's functions have no types that pyright could know.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 # pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
+# pyright: reportOptionalSubscript=false
 
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from climatenerf.ops.triton.encoding import (
-    EXACT,
-    FAST,
-    features_at,
-    first_layer,
-    hidden_of,
-    over,
-    points,
-    sizes_of,
-    unit_cube,
-)
-from climatenerf.ops.triton.kernels import (
     both,
+    features_at,
     hash_encode,
     hash_encode_backward,
     hash_encode_slopes,
-    slopes_of,
 )
+from climatenerf.ops.triton.tiles import over, padded, points
 
 SAMPLES = 32  # of a tile
 WARPS = 4  # of a program
 PROGRAMS = 1024  # of a backward pass, at most: each sums its tiles' gradients to the weights
+# Products of three tensor-core passes come as near as single precision does.
+EXACT = tl.constexpr("tf32x3")
+FAST = tl.constexpr("tf32")  # one pass: 11 bits, enough for a colour that is shown in 8
+
+
+@triton.jit
+def first_layer(w1, b1, SIZES: tl.constexpr):
+    """Weights of the first features [levels, hidden], of the second, and biases."""
+    PADDED: tl.constexpr = SIZES[1]
+    H: tl.constexpr = SIZES[2]
+    HIDDEN: tl.constexpr = SIZES[3]
+    level, unit = tl.arange(0, PADDED)[:, None], tl.arange(0, H)[None, :]
+    known = (level < SIZES[0]) & (unit < HIDDEN)
+    at = w1 + 2 * level * HIDDEN + unit
+    even = tl.load(at, mask=known, other=0.0)
+    odd = tl.load(at + HIDDEN, mask=known, other=0.0)
+    bias = tl.load(b1 + tl.arange(0, H), mask=tl.arange(0, H) < HIDDEN, other=0.0)
+    return even, odd, bias
+
+
+@triton.jit
+def hidden_of(first, second, layer, PRECISION: tl.constexpr):
+    """The hidden layer before its ReLU [samples, hidden]."""
+    even, odd, bias = layer
+    h = tl.dot(first, even, input_precision=PRECISION)
+    return tl.dot(second, odd, h, input_precision=PRECISION) + bias[None, :]
 
 
 @triton.jit
@@ -225,43 +242,8 @@ def network_backward(
     return parts[0].view(inputs, hidden), parts[1], parts[2].view(hidden, outputs), parts[3]
 
 
-@triton.jit(do_not_specialize=["n"])
-def _slopes(q, encoding, layers, out, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
-    w1, b1, w2, _ = layers
-    i, some, qx, qy, qz = points(q, tl.program_id(0), n, BLOCK)
-    ux, uy, uz, m = unit_cube(qx, qy, qz)
-    layer = first_layer(w1, b1, SIZES)
-    even, odd, _ = layer
-    first, second = features_at(ux, uy, uz, some, encoding, SIZES)
-    unit = tl.arange(0, SIZES[2])
-    own = tl.load(w2 + unit, mask=unit < SIZES[3], other=0.0)[None, :]
-    back = tl.where(hidden_of(first, second, layer, EXACT) > 0.0, own, 0.0)
-    first = tl.dot(back, tl.trans(even), input_precision=EXACT)
-    second = tl.dot(back, tl.trans(odd), input_precision=EXACT)
-    known = some[:, None] & (tl.arange(0, SIZES[1]) < SIZES[0])[None, :]
-    gx, gy, gz = slopes_of(first, second, ux, uy, uz, known, encoding, SIZES)
-    # Back through the contraction, and what thins the density outside the core.
-    outside = m > 1.0
-    far = tl.where(outside, m, 1.0)
-    s = 0.25 * tl.where(outside, (2.0 - 1.0 / far) / far, 1.0)
-    along = (qx * gx + qy * gy + qz * gz) * 0.5 * (1.0 / far - 1.0) / (far * far * far)
-    along = tl.where(outside, along - 2.0 / (far * far), 0.0)
-    tl.store(out + 3 * i, s * gx + along * qx, mask=some)
-    tl.store(out + 3 * i + 1, s * gy + along * qy, mask=some)
-    tl.store(out + 3 * i + 2, s * gz + along * qz, mask=some)
-
-
-def density_slopes(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
-    """Gradient of the density's logarithm at q [n,3] (grid units) → out [n,3]."""
-    table, resolutions, *layers = net
-    n = q.shape[0]
-    over(_slopes, n, SAMPLES)(
-        q,
-        (table, resolutions, table.shape[1]),
-        tuple(layers),
-        out,
-        n,
-        SIZES=sizes_of(table, layers[0]),
-        BLOCK=SAMPLES,
-        num_warps=WARPS,
-    )
+def sizes_of(table: Tensor, w1: Tensor, w2: Tensor | None = None) -> tuple[int, ...]:
+    """SIZES of an encoding and the network on it; with its second layer's where that is given."""
+    levels, hidden = table.shape[0], w1.shape[1]
+    own = levels, padded(levels), padded(hidden), hidden
+    return own if w2 is None else (*own, padded(w2.shape[1]), w2.shape[1])

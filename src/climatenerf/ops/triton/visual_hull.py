@@ -8,7 +8,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from climatenerf.ops.triton.encoding import over, points
+from climatenerf.ops.triton.tiles import over, points
 
 PLACES = 128  # of a block
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import UNKNOWN
 from climatenerf.core.device import to_device
-from climatenerf.ops import dispatch
+from climatenerf.ops import visual_hull
 
 VOICES = 64  # views that are asked, at most
 WIDEST = 400  # pixels of the maps that they are asked by
@@ -58,7 +58,7 @@ class VisualHull:
     def consensus(self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
         """Whether enough views see nothing else within `radius` (m) of places x (world m)."""
         least = (MIN_VOICES, self.share, self.apart)
-        return dispatch.label_votes(x, radius, self.views, least)
+        return visual_hull.label_votes(x, radius, self.views, least)
 
 
 def depth_within(

@@ -1,0 +1,290 @@
+"""CPU kernels in Numba: ray marching, and the density that it evaluates.
+
+The slow twins in `ops/reference.py` are the specification. Lengths are in grid units (see
+`reference.contract`). Rays are packed: the samples of ray r are `offsets[r]:offsets[r + 1]`, front
+to back. Arrays are float32 and C-contiguous.
+"""
+
+import numpy as np
+from numba import njit, prange
+
+from climatenerf.ops.cpu import simd
+from climatenerf.ops.cpu.simd import LANES
+
+LANES_DIGEST = "eeeb3e1424f9"  # of `simd.py`, which explains why
+
+BLOCK = 256  # points that one thread takes at once
+RAY_BLOCK = 32  # rays that one thread marches in turn
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _contract_scale(m):
+    """Factor that takes a point at distance m from the centre into the ball of radius 2."""
+    return 1.0 if m <= 1.0 else (2.0 - 1.0 / m) / m
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _place(places, thin, k, qx, qy, qz):
+    """Puts a point in grid units into lane k: its place in the unit cube → places [3, LANES], and
+    what thins it → thin [LANES]."""
+    m = np.sqrt(qx * qx + qy * qy + qz * qz)
+    s = np.float32(_contract_scale(m)) * np.float32(0.25)
+    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
+    places[0, k] = min(max(qx * s + half, low), high)
+    places[1, k] = min(max(qy * s + half, low), high)
+    places[2, k] = min(max(qz * s + half, low), high)
+    # Per contracted length: distance squared thins it, so far space starts out nearly empty.
+    thin[k] = np.float32(1.0) / max(m * m, np.float32(1.0))
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma):
+    """Density (1/grid unit) in all lanes: encoding, one hidden layer, exp → sigma [1, LANES].
+
+    places and thin by `_place`; features [2 levels, LANES] is room for the encoding.
+    """
+    for level in range(table.shape[0]):
+        simd.look_up(places, table, level, resolutions[level], features, 2 * level)
+    simd.network(features, w1, b1, w2, b2, sigma)
+    for k in range(LANES):
+        sigma[0, k] = np.exp(min(sigma[0, k], np.float32(15.0))) * thin[k]
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def density_at(q, net, out):
+    """Density (1/grid unit) at q [n,3] in grid units → out [n]."""
+    table, resolutions, w1, b1, w2, b2 = net
+    n = q.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        features = np.empty((2 * table.shape[0], LANES), np.float32)
+        sigma = np.empty((1, LANES), np.float32)
+        for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
+            count = min(LANES, n - start)
+            for k in range(count):
+                _place(places, thin, k, q[start + k, 0], q[start + k, 1], q[start + k, 2])
+            _densities(places, thin, table, resolutions, w1, b1, w2, b2, features, sigma)
+            for k in range(count):
+                out[start + k] = sigma[0, k]
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def density_slopes(q, net, turned, out):
+    """Gradient of the density's logarithm at q [n,3] in grid units → out [n,3].
+
+    `turned` is w1 the other way round, [features, hidden].
+    """
+    table, resolutions, w1, b1, w2, _ = net
+    n, levels = q.shape[0], table.shape[0]
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        places, thin = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        found = np.empty((8 * levels, LANES), np.float32)  # features, and their slopes
+        hidden = np.empty((w1.shape[0], LANES), np.float32)
+        pull, slope = np.empty((2 * levels, LANES), np.float32), np.empty((3, LANES), np.float32)
+        for start in range(block * BLOCK, min(n, block * BLOCK + BLOCK), LANES):
+            count = min(LANES, n - start)
+            for k in range(count):
+                _place(places, thin, k, q[start + k, 0], q[start + k, 1], q[start + k, 2])
+            for level in range(levels):
+                first = 2 * levels + 6 * level
+                resolution = resolutions[level]
+                simd.look_up_slopes(places, table, level, resolution, found, 2 * level, first)
+            for m in range(hidden.shape[0]):
+                hidden[m] = b1[m]
+            simd.add_product(w1, found, hidden, 1)
+            for m in range(hidden.shape[0]):
+                for k in range(LANES):
+                    hidden[m, k] = w2[0, m] if hidden[m, k] > 0 else np.float32(0.0)
+            pull[:] = 0.0
+            simd.add_product(turned, hidden, pull, 1)
+            slope[:] = 0.0
+            for feature in range(2 * levels):
+                first = 2 * levels + 3 * feature
+                for axis in range(3):
+                    for k in range(LANES):
+                        slope[axis, k] += pull[feature, k] * found[first + axis, k]
+            for k in range(count):
+                x, y, z = q[start + k, 0], q[start + k, 1], q[start + k, 2]
+                m2 = x * x + y * y + z * z
+                # The contraction's u = 1/2 + s·q/4; its slope outside the core: s·I + s'/m·q·qᵀ.
+                s, bend, fall = np.float32(1.0), np.float32(0.0), np.float32(0.0)
+                if m2 > 1.0:
+                    m = np.sqrt(m2)
+                    s = np.float32(_contract_scale(m))
+                    bend = np.float32(2.0) * (np.float32(1.0) - m) / (m2 * m2)
+                    fall = np.float32(2.0) / m2  # of the logarithm of 1/m², too
+                along = bend * (slope[0, k] * x + slope[1, k] * y + slope[2, k] * z)
+                out[start + k, 0] = np.float32(0.25) * (s * slope[0, k] + along * x) - fall * x
+                out[start + k, 1] = np.float32(0.25) * (s * slope[1, k] + along * y) - fall * y
+                out[start + k, 2] = np.float32(0.25) * (s * slope[2, k] + along * z) - fall * z
+
+
+@njit(cache=True, parallel=True)
+def pack_cells(occupied, words):
+    """Cells [K,G,G,G] as bits, 4³ of them a word of 64 bits, x fastest: → words [K,W,W,W]."""
+    for slab in prange(words.shape[0] * words.shape[1]):
+        cascade, wx = slab // words.shape[1], slab % words.shape[1]
+        for wy in range(words.shape[2]):
+            words[cascade, wx, wy] = 0
+        for x in range(4 * wx, min(4 * wx + 4, occupied.shape[1])):
+            for y in range(occupied.shape[2]):
+                row, own = words[cascade, wx, y >> 2], occupied[cascade, x, y]
+                bit = np.int64((x & 3) | (y & 3) << 2)
+                for z in range(occupied.shape[3]):
+                    row[z >> 2] |= np.int64(own[z] != 0) << (bit | np.int64((z & 3) << 4))
+
+
+@njit(cache=True, parallel=True)
+def occupied_blocks(words, out):
+    """Whether each block of 8³ cells, 2³ words, holds an occupied one: → out [K,B,B,B]."""
+    for slab in prange(out.shape[0] * out.shape[1]):
+        cascade, x = slab // out.shape[1], slab % out.shape[1]
+        for y in range(out.shape[2]):
+            for z in range(out.shape[3]):
+                some = np.int64(0)
+                for ix in range(2 * x, 2 * x + 2):
+                    for iy in range(2 * y, 2 * y + 2):
+                        some |= words[cascade, ix, iy, 2 * z] | words[cascade, ix, iy, 2 * z + 1]
+                out[cascade, x, y, z] = some != 0
+
+
+@njit(cache=True, fastmath=True, inline="always")
+def _cell_exit(o, inv, index, cell, half):
+    """Ray length at which the ray leaves the lattice cell of side `cell`, along one axis."""
+    if inv > 1e29 or inv < -1e29:  # the ray runs parallel to this pair of faces
+        return np.float32(1e30)
+    edge = np.float32(index + 1 if inv > 0 else index) * cell - half
+    return (edge - o) * inv
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
+    """Marches rays front to back through occupied space, evaluating density on the way.
+
+    Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
+    cells = (words [K,W,W,W] of `pack_cells`, whether blocks of 8³ cells hold an occupied one, or of
+    one cell each), cascade k covers the cube of half side 2^k;
+    steps = (smallest step, step per length, optical depth below which one counts as empty);
+    stop = transmittance at which a ray ends;
+    net = (table, resolutions, w1 [hidden, features], b1, w2 [1, hidden], b2).
+    rows [3, blocks, RAY_BLOCK * capacity] receive t, dt and sigma: a block of rays writes its
+    samples one after the other, to be packed. counts [n] receive the samples written per ray.
+    """
+    table, resolutions, w1, b1, w2, b2 = net
+    words, blocks = cells
+    n = rays_o.shape[0]
+    # In cells; shifts are quicker than divisions. Where blocks are cells words are not skipped.
+    cascades, side = words.shape[0], words.shape[1] << 2
+    shift, word_shift = (3, 2) if blocks.shape[1] == side >> 3 else (0, 0)
+    side = blocks.shape[1] << shift
+    capacity = rows.shape[2] // RAY_BLOCK
+    far = np.float32(2.0 ** (cascades - 1))
+    dt_min, cone, thin = np.float32(steps[0]), np.float32(steps[1]), np.float32(steps[2])
+    log_stop = np.float32(-np.log(stop))
+    half_cells = np.float32(0.5) * np.float32(side)
+    for block in prange((n + RAY_BLOCK - 1) // RAY_BLOCK):
+        places, thinned = np.zeros((3, LANES), np.float32), np.zeros(LANES, np.float32)
+        features = np.empty((2 * table.shape[0], LANES), np.float32)
+        sigma = np.empty((1, LANES), np.float32)
+        middles, lengths = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+        k = 0
+        for r in range(block * RAY_BLOCK, min(n, block * RAY_BLOCK + RAY_BLOCK)):
+            ox, oy, oz = rays_o[r, 0], rays_o[r, 1], rays_o[r, 2]
+            dx, dy, dz = rays_d[r, 0], rays_d[r, 1], rays_d[r, 2]
+            big = np.float32(1e30)
+            ivx = np.float32(1.0) / dx if dx != 0 else big
+            ivy = np.float32(1.0) / dy if dy != 0 else big
+            ivz = np.float32(1.0) / dz if dz != 0 else big
+            # Clip to the outermost cube.
+            t, end = spans[r, 0], spans[r, 1]
+            for o, d, iv in ((ox, dx, ivx), (oy, dy, ivy), (oz, dz, ivz)):
+                if d == 0:
+                    if o < -far or o > far:
+                        end = np.float32(-1.0)
+                else:
+                    ta, tb = (-far - o) * iv, (far - o) * iv
+                    t = max(t, min(ta, tb))
+                    end = min(end, max(ta, tb))
+            tau = np.float32(0.0)
+            first = k
+            t += spans[r, 2] * max(dt_min, cone * t)
+            while t < end:
+                # The next steps in occupied cells, as many as there are lanes; the ray may end on
+                # the first of them, but together they cost little more than one.
+                count = 0
+                while t < end and count < LANES:
+                    dt = min(max(dt_min, cone * t), end - t)
+                    tm = t + np.float32(0.5) * dt
+                    qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz
+                    m = max(abs(qx), abs(qy), abs(qz))
+                    cascade = 0
+                    half, per_cell = np.float32(1.0), half_cells
+                    while m > half and cascade < cascades - 1:
+                        half *= np.float32(2.0)
+                        per_cell *= np.float32(0.5)
+                        cascade += 1
+                    ix = min(max(np.int64((qx + half) * per_cell), 0), side - 1)
+                    iy = min(max(np.int64((qy + half) * per_cell), 0), side - 1)
+                    iz = min(max(np.int64((qz + half) * per_cell), 0), side - 1)
+                    empty = 0  # so many cells along each side, as a power of two
+                    if not blocks[cascade, ix >> shift, iy >> shift, iz >> shift]:
+                        empty = shift
+                    else:
+                        word = words[cascade, ix >> 2, iy >> 2, iz >> 2]
+                        if word == 0:
+                            empty = word_shift
+                        elif word >> ((ix & 3) | (iy & 3) << 2 | (iz & 3) << 4) & 1:
+                            _place(places, thinned, count, qx, qy, qz)
+                            middles[count], lengths[count] = tm, dt
+                            count += 1
+                            t += dt
+                            continue
+                    cell = np.float32(1 << empty) / per_cell
+                    ix, iy, iz = ix >> empty, iy >> empty, iz >> empty
+                    leave = min(
+                        _cell_exit(ox, ivx, ix, cell, half),
+                        _cell_exit(oy, ivy, iy, cell, half),
+                        _cell_exit(oz, ivz, iz, cell, half),
+                    )
+                    # Whole steps, so that the sampling comb does not depend on the cells crossed.
+                    skip = np.ceil((leave - tm) / dt)
+                    t += dt * max(skip, np.float32(1.0))
+                if count:
+                    _densities(places, thinned, table, resolutions, w1, b1, w2, b2, features, sigma)
+                for i in range(count):
+                    if sigma[0, i] * lengths[i] > thin:
+                        rows[0, block, k] = middles[i]
+                        rows[1, block, k] = lengths[i]
+                        rows[2, block, k] = sigma[0, i]
+                        tau += sigma[0, i] * lengths[i]
+                        k += 1
+                        if tau >= log_stop or k - first == capacity:
+                            end = np.float32(-1.0)
+                            break
+            counts[r] = k - first
+
+
+@njit(cache=True, parallel=True)
+def pack(rows, offsets, out):
+    """Packs what `march` has left in rows [3, blocks, *] into out [3, samples]."""
+    for block in prange((offsets.shape[0] - 2) // RAY_BLOCK + 1):
+        start = offsets[block * RAY_BLOCK]
+        stop = offsets[min(block * RAY_BLOCK + RAY_BLOCK, offsets.shape[0] - 1)]
+        for kind in range(3):
+            out[kind, start:stop] = rows[kind, block, : stop - start]
+
+
+@njit(cache=True, fastmath=True, parallel=True)
+def grid_positions(rays_o, rays_d, offsets, t, u):
+    """Unit-cube coordinates (after contraction) of packed samples: → u [samples,3]."""
+    for r in prange(rays_o.shape[0]):
+        for i in range(offsets[r], offsets[r + 1]):
+            qx = rays_o[r, 0] + t[i] * rays_d[r, 0]
+            qy = rays_o[r, 1] + t[i] * rays_d[r, 1]
+            qz = rays_o[r, 2] + t[i] * rays_d[r, 2]
+            m = np.sqrt(qx * qx + qy * qy + qz * qz)
+            s = np.float32(_contract_scale(m)) * np.float32(0.25)
+            half, low, high = np.float32(0.5), np.float32(0.0), np.float32(0.999999)
+            u[i, 0] = min(max(qx * s + half, low), high)
+            u[i, 1] = min(max(qy * s + half, low), high)
+            u[i, 2] = min(max(qz * s + half, low), high)
