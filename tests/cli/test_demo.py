@@ -51,14 +51,15 @@ def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
             assert (got["snow_share"] > 0.02) == (name == "snow"), name
             assert (got["mean_transmittance"] < 0.95) == (name == "smog"), name
     assert Image.open(out / "contact-sheet.jpg").size[0] >= 2 * 64
-    # Again: it goes on with what is there instead of complaining.
-    assert cli.main(words) == 0
-    assert "Going on" in capsys.readouterr().err
+    written = (out / "flood" / "movie.mp4").stat().st_mtime_ns
+    assert cli.main(words) == 0, "the same command resumes"
+    assert "Continuing the run" in capsys.readouterr().err
+    assert (out / "flood" / "movie.mp4").stat().st_mtime_ns == written, "nothing is rendered again"
     (out / "run" / "optimiser.safetensors").unlink()  # as the documents allow
     assert cli.main(words) == 0
 
 
-def test_ctrl_c_while_fitting_ends_it_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+def test_ctrl_c_while_fitting_names_the_way_to_resume(tmp_path, capsys, monkeypatch):
     from climatenerf.training.trainer import Fitting
 
     step = Fitting.step
@@ -70,6 +71,6 @@ def test_ctrl_c_while_fitting_ends_it_and_says_how_to_go_on(tmp_path, capsys, mo
 
     monkeypatch.setattr(Fitting, "step", stopped)
     assert cli.main(["demo", "-o", str(tmp_path / "demo"), "--size", "64x36"]) == 2
-    assert "run it again to go on" in capsys.readouterr().err
+    assert "re-run the same command to resume" in capsys.readouterr().err
     assert (tmp_path / "demo" / "run" / "field.safetensors").exists()
     assert not (tmp_path / "demo" / "clean").exists()

@@ -16,11 +16,12 @@ from PIL import Image
 
 from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
-from climatenerf.cli.render import LAYER_NAMES, appearance_of
+from climatenerf.cli.render import LAYER_NAMES
 from climatenerf.core.storage import read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.presets import PRESETS
-from climatenerf.output import video as movie
+from climatenerf.output.job import appearance_index
+from climatenerf.output.video import write_png
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import read_rgb
 from climatenerf.training.settings import PAPER, Losses
@@ -271,30 +272,49 @@ def test_a_render_overwrites_nothing_that_it_did_not_make(run_folder, tmp_path, 
     assert [p for p in (tmp_path / "mine").rglob("*") if p.is_file()] == [mine]
 
 
-def test_a_preview_shows_each_frame_early_and_goes(run_folder, tmp_path, monkeypatch):
-    """And the frames are those of a render without one; what a killed render left is none's."""
+def test_a_preview_changes_no_frame_and_is_removed(run_folder, tmp_path):
+    """Also where a killed render left a preview."""
     (tmp_path / "early").mkdir()
-    movie.write_png(tmp_path / "early" / "preview.png", np.zeros((2, 2, 3), np.uint8), "killed")
-    written = []
-    write = movie.write_png
-
-    def noted(path, picture, text):
-        written.append((path.name, path.parent.name, picture.copy()))
-        write(path, picture, text)
-
-    monkeypatch.setattr(movie, "write_png", noted)
+    left_over = tmp_path / "early" / "preview.png"
+    write_png(left_over, np.zeros((2, 2, 3), np.uint8), "killed")
     words = ["render", str(run_folder), *map(str, SMALL)]
     assert cli.main([*words, "-o", str(tmp_path / "early"), "--preview"]) == 0
-    names = [name for name, *_ in written]
-    assert names == ["preview.png"] * 3 + ["0000.png"] + ["preview.png"] * 3 + ["0001.png"]
-    off = [np.abs(each[2].astype(int) - written[3][2]).mean() for each in written[:3]]
-    assert off[0] > off[1] > off[2] == 0
-    assert not (tmp_path / "early" / "preview.png").exists()
+    assert not left_over.exists()
     assert cli.main([*words, "-o", str(tmp_path / "plain")]) == 0
     for index in range(2):
         frame = f"frames/{index:04d}.png"
         same = [read_rgb(tmp_path / folder / frame) for folder in ("early", "plain")]
         assert np.array_equal(*same)
+
+
+def test_parts_in_any_order_are_joined_to_the_movie_of_one_render(run_folder, tmp_path, capsys):
+    words = ["render", run_folder, "--size", "48x27", "--frames", "5", "--layers", "depth"]
+    words += ["--flood.level", "0.3 m"]
+    assert status(*words, "-o", tmp_path / "whole") == 0
+    parts = [*words, "-o", tmp_path / "parts"]
+    assert status(*parts, "--part", "2/2") == 0
+    out, err = capsys.readouterr()
+    assert f"frames: {tmp_path / 'parts' / 'frames'}" in out and "2 of 5 frames are finished" in err
+    made = sorted(p.name for p in (tmp_path / "parts" / "frames").iterdir())
+    assert made == ["0001.png", "0003.png"]
+    said = complaint(capsys, *parts, "--join")
+    assert "3 of 5 frames" in said and "0000, 0002, 0004" in said
+    assert not (tmp_path / "parts" / "movie.json").exists()
+    assert status(*parts, "--part", "1/2") == status(*parts, "--join") == 0
+    for path in (tmp_path / "whole").rglob("*"):
+        if path.is_file():
+            same = tmp_path / "parts" / path.relative_to(tmp_path / "whole")
+            assert same.read_bytes() == path.read_bytes(), path
+
+
+def test_a_part_with_other_flags_leaves_an_unfinished_render_alone(run_folder, tmp_path, capsys):
+    words = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--frames", "2"]
+    assert status(*words, "--part", "1/2") == 0
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    for flags in (["--part", "2/2"], []):
+        said = complaint(capsys, *words, "--smog.visibility", "50 m", *flags)
+        assert "unfinished render with other settings" in said
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
 def test_a_path_that_asks_for_huge_frames(run_folder, tmp_path, capsys):
@@ -517,6 +537,11 @@ def test_unknown_names_to_hold_out(tmp_path, capsys):
         (["--smog.visibility", "1 mm"], "smog.visibility"),
         (["--layers", "label"], "without class labels"),
         (["--appearance", "nobody.jpg"], "no training photo"),
+        (["--part", "17/16"], "from 1/N to N/N"),
+        (["--part", "0/4"], "from 1/N to N/N"),
+        (["--part", "x"], "from 1/N to N/N"),
+        (["--part", "1/2", "--join"], "render all parts, then use --join"),
+        (["--join"], "2 of 2 frames of this render are missing"),
     ],
 )
 def test_render_mistakes(run_folder, tmp_path, capsys, words, expected):
@@ -529,8 +554,8 @@ def test_appearances_are_counted_among_the_training_photos(run_folder):
     scene = load_scene(run_folder)
     names = [view.name for view in scene.of_split("train")]
     assert scene.views[0].name not in names, "held out, so that places differ"
-    assert [appearance_of(name, scene) for name in names] == list(range(len(names)))
-    assert appearance_of("mean", scene) is None
+    assert [appearance_index(name, scene) for name in names] == list(range(len(names)))
+    assert appearance_index("mean", scene) is None
 
 
 def test_frames_are_in_the_appearance_of_the_photo_that_is_named(run_folder, tmp_path):

@@ -1,7 +1,5 @@
 import importlib.util
-import json
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from PIL import Image
 
 from climatenerf.core.errors import UserError
 from climatenerf.output import layers
-from climatenerf.scene import Camera, Scene
 
 RNG = np.random.default_rng(0)
 H, W = 6, 8
@@ -91,52 +88,3 @@ def test_exr_holds_the_values_exactly(tmp_path):
     with OpenEXR.File(str(tmp_path / files["normal"][0]), separate_channels=True) as file:
         for i, axis in enumerate("XYZ"):
             assert np.array_equal(file.channels()[axis].pixels, given["normal"][..., i])
-
-
-def test_sidecar_tells_everything(tmp_path):
-    world_from_input = np.eye(4)
-    world_from_input[:3, :3] = 2.0 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
-    world_from_input[:3, 3] = [5, 6, 7]
-    camera = Camera(W, H, 9.0, 9.0, 4.0, 3.0)
-    scene = Scene(
-        Path("/none"),
-        "colmap",
-        (camera,),
-        (),
-        None,
-        world_from_input,
-        "camera-height-assumed",
-        0.3,
-        ground_z=-1.5,
-    )
-    c2w = np.eye(4)
-    c2w[:3, 3] = [5, 8, 7]
-    files = layers.save_layers(tmp_path, "0000", {"depth": np.ones((H, W))})
-    record = layers.FrameRecord("0000.png", 0.0, camera, c2w, files, measured={"water": 0.25})
-    layers.write_sidecar(
-        tmp_path / "movie.json",
-        scene,
-        [record],
-        {"flood": {"level": "0.5 m"}},
-        seed=3,
-        about={"fps": 24, "camera_path": "orbit"},
-    )
-    data = json.loads((tmp_path / "movie.json").read_text())
-    assert data["simulated"] is True and "simulated" in data["note"]
-    assert data["weather"]["flood"]["level"] == "0.5 m" and data["seed"] == 3
-    assert data["scale"] == {
-        "source": "camera-height-assumed",
-        "relative_error": 0.3,
-        "metres_per_input_unit": pytest.approx(2.0),
-        "assumed": True,
-    }
-    assert set(data["versions"]) == {"climatenerf", "torch", "numpy", "numba"}
-    assert data["versions"]["numpy"] == np.__version__
-    assert data["layers"]["depth"]["unit"] == "m" and data["fps"] == 24
-    frame = data["frames"][0]
-    assert frame["camera"]["fx"] == 9.0 and frame["layers"]["depth"] == ["depth/0000.npz"]
-    assert frame["c2w_world"] == c2w.tolist() and frame["measured"] == {"water": 0.25}
-    pose = np.array(frame["c2w_input"])
-    assert np.allclose(world_from_input @ pose[:, 3], c2w[:, 3])
-    assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
-    assert np.allclose(pose[:3, 3], [1, 0, 0])

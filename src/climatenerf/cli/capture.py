@@ -255,8 +255,8 @@ def poses_by_motion(options: Capture, new: Path):
     for name, reason in intake.unusable.items():
         progress.warn(f"{name} is left out: {reason}")
     flat = new / "flat"
-    with Stages() as tell:
-        model = reconstruct_apart(intake, work, flat, options.features, options.seed, tell)
+    with progress.StageBars() as report:
+        model = reconstruct_apart(intake, work, flat, options.features, options.seed, report)
     if len(model.groups) > 1:
         progress.warn(
             f"the pictures fall into {len(model.groups)} groups that do not fit together"
@@ -277,8 +277,8 @@ def poses_of_colmap(options: Capture, new: Path):
     from climatenerf.sfm.from_colmap import take_posed
 
     assert options.from_colmap is not None
-    with Stages() as tell:
-        found = take_posed(options.photos, options.from_colmap, new, no_photos(options), tell)
+    with progress.StageBars() as report:
+        found = take_posed(options.photos, options.from_colmap, new, no_photos(options), report)
     for note in found[0].notes:
         progress.say(note)
     return found
@@ -336,31 +336,6 @@ def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
         progress.say("The depth files have no one scale; they say nothing of the scene's size.")
         return scene
     return with_scale_evidence(scene, "depth files", *said)
-
-
-class Stages:
-    """A progress bar for each stage as it is told of."""
-
-    def __init__(self) -> None:
-        self.bar: progress.Bar | None = None
-
-    def __enter__(self) -> "Stages":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self.bar is not None:
-            self.bar.__exit__(None, None, None)  # gives the terminal its cursor back
-            self.bar = None
-
-    def __call__(self, stage: str, share: float) -> None:
-        """Tells that `share` of a stage is done."""
-        if self.bar is None or self.bar.title != stage:
-            self.bar = progress.Bar(stage, 1.0)
-            self.bar.__enter__()
-        self.bar.update(share)
-        if share >= 1:
-            self.bar.__exit__(None, None, None)
-            self.bar = None
 
 
 def peak_gigabytes() -> float:

@@ -1,4 +1,4 @@
-"""``climatenerf demo``: the whole job on the street that comes with the package."""
+"""``climatenerf demo``: fit and render the street that comes with the package."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files
@@ -9,10 +9,9 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.cli.fit import Fit, fit_with_bars, summary
-from climatenerf.cli.render import parse_size, prepare_stage, render_movie
+from climatenerf.cli.render import parse_size
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json
-from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
 
 WEATHERS = {
@@ -22,24 +21,26 @@ WEATHERS = {
     "snow": Weather(snow=Snow(depth=0.15)),
 }
 SHEET_COLUMNS = 4
+FPS = 12.0
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Fit the street that comes with the package and render it clean, flooded, in smog, snowed."""
+    """Fit the street that comes with the package, and render it clean, flooded, in smog and under
+    snow. Re-run the same command to resume."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("climatenerf-demo")
     """Folder for the run, the movies and the contact sheet."""
     minutes: float = 3.0
-    """Time for fitting."""
+    """Time for fitting, minutes."""
     frames: int = 24
-    """Frames of each movie."""
+    """Number of frames of each movie."""
     size: str = "320x180"
-    """Size of the frames."""
+    """Size of the frames, such as 320x180."""
 
 
 def run(options: Demo) -> int:
-    """Fits, renders four movies and a contact sheet, and says where they are."""
+    """Fit, render four movies and a contact sheet, and print where they are."""
     if not options.minutes > 0 or options.frames < 1:
         raise UserError("--minutes and --frames must be above 0")
     size = parse_size(options.size)
@@ -51,26 +52,26 @@ def run(options: Demo) -> int:
         metrics = finished(run_folder)
         begun = (run_folder / "optimiser.safetensors").exists()
         if begun or metrics:
-            progress.say(f"Going on with the run in {run_folder}; remove it to begin anew")
+            progress.say(f"Continuing the run in {run_folder}; remove it to begin anew")
         if metrics is None:
             metrics = fit_with_bars(scene, Fit(street, run_folder, options.minutes, resume=begun))
     if metrics["interrupted"]:
         raise UserError(
-            f"stopped while fitting; run it again to go on, the fit so far is in {run_folder}"
+            f"stopped while fitting; re-run the same command to resume the run in {run_folder}"
         )
 
-    from climatenerf.field.checkpoint import load_field
+    from climatenerf.api import load_run, render_movie
     from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
-    from climatenerf.paths.camera_path import camera_path
 
-    field = load_field(run_folder)
-    fps = 12.0
-    path = camera_path("training", scene, options.frames, size)
-    movies, rows = [], []
+    fitted, movies, rows = load_run(run_folder), [], []
     for name, weather in WEATHERS.items():
-        stage = prepare_stage(field, scene, KeyframedWeather(weather, {}), path, fps)
-        movies.append(render_movie(stage, path, fps, options.out / name, title=name))
-        rows.append((name, _frames(options.out / name / "frames")))
+        out = options.out / name
+        with progress.StageBars(f"{name}: ") as bars:
+            movie = render_movie(
+                fitted, out, weather, frames=options.frames, fps=FPS, size=size, progress=bars
+            )
+        movies.append(movie)
+        rows.append((name, _frames(out / "frames")))
     sheet = contact_sheet(rows, SHEET_COLUMNS)
     write_jpeg(options.out / "contact-sheet.jpg", sheet, max_bytes=150_000)
     progress.result(summary(metrics))
@@ -82,7 +83,7 @@ def run(options: Demo) -> int:
 
 
 def finished(run_folder: Path) -> dict | None:
-    """The metrics of a fit that came to its end, or None."""
+    """Return the metrics of a complete fit, or None."""
     if not (run_folder / "metrics.json").is_file():
         return None
     metrics = read_json(run_folder / "metrics.json", "the run's metrics")

@@ -116,6 +116,46 @@ class Bar:
         say("  ".join(part for part in parts if part))
 
 
+class StageBars:
+    """A progress bar for each stage of a task, as a progress callback reports them.
+
+    ``with StageBars() as bars: bars("snowfall", 0.3)``. A stage that first reports a fraction above
+    0 was begun earlier; that fraction does not count in its pace.
+    """
+
+    def __init__(self, prefix: str = "") -> None:
+        """Prepare the bars.
+
+        Args:
+            prefix: text before the name of each stage.
+        """
+        self.prefix = prefix
+        self._bar: Bar | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(None, None, None)  # shows the terminal's cursor again
+            self._bar = None
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Report that a fraction of a stage is done."""
+        title = self.prefix + stage
+        if self._bar is None or self._bar.title != title:
+            if self._bar is not None:  # the stages follow one another
+                self._bar.update(1.0)
+            self.__exit__()
+            self._bar = Bar(title, 1.0)
+            self._bar.__enter__()
+            if fraction > 0:
+                self._bar.prepared(fraction)
+        self._bar.update(fraction)
+        if fraction >= 1:
+            self.__exit__()
+
+
 def track(title: str, items: Iterable[Item], quiet: bool = False) -> Iterator[Item]:
     """Yields the items of a sized collection under a bar that counts them."""
     total = len(items) if isinstance(items, Sized) else 0

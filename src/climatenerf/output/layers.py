@@ -1,10 +1,9 @@
-"""Measured layers of a frame (depth, normals, water depth, ...) as files, and the JSON sidecar.
+"""Measured layers of a frame (depth, normals, water depth, ...) as files.
 
 Layers are float32 arrays of the frame's size. NPZ and EXR hold them as they are; PNG holds them
 rounded to the step in `LAYERS`. No surface is +inf in the depth of NPZ and EXR, and 0 in PNG.
 """
 
-import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,18 +12,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-import climatenerf
 from climatenerf.core.classes import CLASS_NAMES
 from climatenerf.core.errors import UserError
-from climatenerf.core.storage import atomic_path, write_json
-from climatenerf.output.video import write_png
-from climatenerf.scene import Camera, Scene
+from climatenerf.core.storage import atomic_path
+from climatenerf.output.video import SIMULATED, write_png
 
-SIDECAR_SCHEMA = 1
-SIMULATED = (
-    "simulated: weather was computed into a model fitted to photographs; this is no photograph and"
-    " no forecast"
-)
 LayerFormat = Literal["npz", "png", "exr"]
 
 
@@ -145,124 +137,3 @@ def _write_exr(path: Path, name: str, array: np.ndarray) -> None:
 
 def _planes(array: np.ndarray) -> list[np.ndarray]:
     return [np.ascontiguousarray(array[..., i]) for i in range(array.shape[-1])]
-
-
-@dataclass(frozen=True)
-class FrameRecord:
-    """What the sidecar says about one frame.
-
-    Attributes:
-        file: The picture, relative to the sidecar.
-        time: Time in the movie, s.
-        camera: Intrinsics, pixels.
-        c2w: Camera-to-world pose, world metres, OpenCV axes.
-        layers: Layer files by name, as `save_layers` returns them.
-        weather: Parameters at this frame's time, where they change over time.
-        measured: Numbers measured on this frame, e.g. the share of water.
-    """
-
-    file: str
-    time: float
-    camera: Camera
-    c2w: Float[np.ndarray, "4 4"]
-    layers: Mapping[str, list[str]]
-    weather: Mapping[str, Any] | None = None
-    measured: Mapping[str, float] | None = None
-
-
-def write_sidecar(
-    path: Path | str,
-    scene: Scene,
-    records: Sequence[FrameRecord],
-    weather: Mapping[str, Any],
-    seed: int,
-    about: Mapping[str, Any] | None = None,
-) -> None:
-    """Writes the JSON that lies beside a movie: everything needed to use the frames as data.
-
-    Args:
-        path: the JSON file.
-        scene: the capture, for the frame of reference, the scale and its error.
-        records: one for each frame.
-        weather: all weather parameters with their units.
-        seed: of every random number used.
-        about: further entries (movie file, camera path and its notes, fps, run folder).
-
-    Raises:
-        UserError: the disk is full, or the place cannot be written.
-    """
-    used = {name for record in records for name in record.layers}
-    write_json(
-        path,
-        {
-            "schema_version": SIDECAR_SCHEMA,
-            "simulated": True,
-            "note": SIMULATED,
-            "weather": weather,
-            "seed": seed,
-            **(about or {}),
-            "versions": versions(),
-            "units": {
-                "length": "m",
-                "angle": "deg",
-                "colour": "8-bit sRGB",
-                "pixels": "centre of the top-left pixel at (0.5, 0.5)",
-                "world": "right-handed, z up",
-                "camera": "camera-to-world, +x right, +y down, +z forward",
-            },
-            "scale": {
-                "source": scene.scale_source,
-                "relative_error": scene.scale_error,
-                "metres_per_input_unit": scene.scale,
-                "assumed": "assumed" in scene.scale_source,
-            },
-            "ground_z": scene.ground_z,
-            "lowest_ground_z": scene.lowest_ground_z,
-            "world_from_input": scene.world_from_input,
-            "layers": {
-                name: {
-                    "unit": LAYERS[name].unit,
-                    "meaning": LAYERS[name].meaning,
-                    "png": "(n + 1) / 2 * 255"
-                    if LAYERS[name].png_step is None
-                    else {"bits": LAYERS[name].png_bits, "value_of_one": LAYERS[name].png_step},
-                }
-                for name in sorted(used)
-            },
-            "frames": [_frame_entry(record, scene) for record in records],
-        },
-    )
-
-
-def c2w_in_input_frame(c2w: Float[np.ndarray, "4 4"], scene: Scene) -> Float[np.ndarray, "4 4"]:
-    """A world pose in the capture's own frame: its units for the position, a pure rotation."""
-    back = np.linalg.inv(scene.world_from_input) @ c2w
-    back[:3, :3] *= scene.scale
-    return back
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of what computes the pictures, without importing it; None where absent."""
-    found: dict[str, str | None] = {"climatenerf": climatenerf.__version__}
-    for package in ("torch", "numpy", "numba"):
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = None
-    return found
-
-
-def _frame_entry(record: FrameRecord, scene: Scene) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "file": record.file,
-        "time": record.time,
-        "camera": record.camera,
-        "c2w_world": record.c2w,
-        "c2w_input": c2w_in_input_frame(record.c2w, scene),
-        "layers": record.layers,
-    }
-    if record.weather is not None:
-        entry["weather"] = record.weather
-    if record.measured is not None:
-        entry["measured"] = record.measured
-    return entry

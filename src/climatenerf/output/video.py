@@ -14,27 +14,37 @@ from PIL import Image, PngImagePlugin
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path
 
+SIMULATED = (
+    "simulated: weather was computed into a model fitted to photographs; this is no photograph and"
+    " no forecast"
+)
 CRF = 18
 """x264's constant quality: 18 can hardly be told from the frames."""
 
 
 def write_png(
-    path: Path | str, picture: UInt8[np.ndarray, "h w 3"] | np.ndarray, simulated: str
+    path: Path | str,
+    picture: UInt8[np.ndarray, "h w 3"] | np.ndarray,
+    simulated: str,
+    key: str | None = None,
 ) -> None:
-    """Writes a PNG whose text chunk ``simulated`` says that this is no photograph, atomically.
+    """Write a PNG atomically; its text chunk ``simulated`` states that it is no photograph.
 
     Args:
         path: the file.
         picture: 8-bit RGB or grey, or 16-bit grey.
         simulated: what was simulated, e.g. "clean render" or "flood 0.5 m".
+        key: content of a text chunk ``key``, by which a frame is recognised.
 
     Raises:
-        UserError: the disk is full, or the place cannot be written.
+        UserError: the disk is full, or the file cannot be written.
     """
     text = PngImagePlugin.PngInfo()
     text.add_itxt("simulated", simulated) if not simulated.isascii() else text.add_text(
         "simulated", simulated
     )
+    if key is not None:
+        text.add_text("key", key)
     with atomic_path(path) as temporary:
         # Level 4 is half the time of the default 6 for 3 % more bytes.
         Image.fromarray(picture).save(temporary, format="PNG", pnginfo=text, compress_level=4)
@@ -55,6 +65,19 @@ def find_ffmpeg() -> str:
             "the movie needs ffmpeg and none was found; run `pip install imageio-ffmpeg`, or"
             " install ffmpeg and set IMAGEIO_FFMPEG_EXE to its path"
         ) from error
+
+
+def padding_note(name: str, size: tuple[int, int]) -> str | None:
+    """Return a sentence about the even size that a movie is padded to; None if it needs no padding.
+
+    Args:
+        name: file name of the movie.
+        size: width and height of the frames, pixels.
+    """
+    if size[0] % 2 == size[1] % 2 == 0:
+        return None
+    even = f"{size[0] + size[0] % 2}x{size[1] + size[1] % 2}"
+    return f"{name} is padded to {even} pixels: H.264 needs even sizes"
 
 
 class MovieWriter:
@@ -83,11 +106,8 @@ class MovieWriter:
         self.size = size
         self.fps = fps
         self.problem: UserError | None = None
-        self.note: str | None = None
+        self.note = padding_note(self.path.name, size)
         self._padding = (size[1] % 2, size[0] % 2)
-        if any(self._padding):
-            even = f"{size[0] + self._padding[1]}x{size[1] + self._padding[0]}"
-            self.note = f"{self.path.name} is padded to {even} pixels: H.264 needs even sizes"
         self._process: subprocess.Popen[bytes] | None = None
         self._log: IO[bytes] | None = None
         self._exit = contextlib.ExitStack()

@@ -1,0 +1,527 @@
+"""A render job: plan the frames of a movie, render any of them in any process, join them.
+
+    job = plan(run_folder, path, 24.0, weather)
+    render_frames(job, out, lambda: frame_source(job, field, scene), frames_of_part(job, (3, 16)))
+    movie = join(job, scene, out)
+
+A finished frame is known by a hash of everything that it depends on, so a stopped job resumes with
+the same call, and parts that several processes or machines render fit together.
+"""
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+import climatenerf
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import explain, plain, read_json, write_json
+from climatenerf.output import render_folder
+from climatenerf.output.layers import LAYERS, LayerFormat, require_exr, save_layers
+from climatenerf.output.render_folder import MOVIE, PREVIEW, SIDECAR
+from climatenerf.output.sidecar import FrameRecord, sidecar
+from climatenerf.output.video import (
+    SIMULATED,
+    MovieWriter,
+    find_ffmpeg,
+    padding_note,
+    write_png,
+)
+from climatenerf.paths.camera_path import CameraPath
+from climatenerf.scene import Scene
+from climatenerf.scene.images import read_rgb
+from climatenerf.weather.description import KeyframedWeather, weather_to_table
+
+MAX_SIDE = 8192
+MAX_RAYS = 2**26
+"""Rays of one frame; that many need 6 GB."""
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the fraction of it that is done."""
+Preview = Callable[[UInt8[np.ndarray, "h w 3"]], None]
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """One rendered frame.
+
+    Attributes:
+        picture: 8-bit sRGB.
+        layers: all measured layers, (h, w) or (h, w, 3) each; `LAYERS` gives their units.
+        facts: numbers about the whole render, for the sidecar.
+    """
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    layers: dict[str, Float[np.ndarray, "h w *c"]]
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+FrameSource = Callable[[int, Preview | None], RenderedFrame]
+"""Renders the frame of an index; a preview is called with coarser pictures first."""
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Everything that the frames of a movie depend on.
+
+    Attributes:
+        run: Hash of the run, from `hash_of_run`.
+        path: Camera of each frame.
+        fps: Frames per second; frame i shows the moment i / fps, s.
+        weather: Weather over time.
+        supersample: Rays per pixel along each side.
+        layers: Names of the layers to write, keys of `LAYERS`.
+        formats: File formats of the layers.
+        appearance: Index of the training view whose exposure and light the frames have; None takes
+            the mean.
+    """
+
+    run: str
+    path: CameraPath
+    fps: float
+    weather: KeyframedWeather
+    supersample: int = 1
+    layers: tuple[str, ...] = ()
+    formats: tuple[LayerFormat, ...] = ("npz",)
+    appearance: int | None = None
+
+    def __len__(self) -> int:
+        return len(self.path)
+
+    def time(self, index: int) -> float:
+        """Return the moment that a frame shows, s."""
+        return index / self.fps
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of the whole job, of which every frame depends on every part.
+
+        Light, waves and snow are prepared from the weather at all moments and from all camera
+        positions. Poses are rounded to 1e-6 (m, or a matrix entry): two machines may differ in
+        the last bits, and that must not make two renders of one.
+        """
+        described = {
+            "version": climatenerf.__version__,
+            "run": self.run,
+            "weather": weather_to_table(self.weather),
+            "fps": self.fps,
+            "cameras": self.path.cameras,
+            "c2w": (np.round(self.path.c2w, 6) + 0.0),
+            "supersample": self.supersample,
+            "layers": self.layers,
+            "formats": self.formats,
+            "appearance": self.appearance,
+        }
+        return _hash(described)
+
+    def frame_key(self, index: int) -> str:
+        """Return the hash by which a finished frame is recognised."""
+        return _hash([self.key, index])
+
+    def files(self, index: int) -> list[str]:
+        """Return the files of a frame, relative to the movie's folder, the picture first."""
+        return render_folder.frame_files(index, self.layers, self.formats)
+
+
+def plan(
+    run: Path,
+    path: CameraPath,
+    fps: float,
+    weather: KeyframedWeather,
+    *,
+    supersample: int = 1,
+    layers: Sequence[str] = (),
+    formats: Sequence[LayerFormat] = ("npz",),
+    appearance: int | None = None,
+) -> RenderJob:
+    """Return the job that renders a fitted run along a path.
+
+    Args:
+        run: folder of the run.
+        path: camera of each frame.
+        fps: frames per second, 0.1 to 240.
+        weather: weather over time.
+        supersample: rays per pixel along each side, 1 to 8.
+        layers: names of the layers to write.
+        formats: file formats of the layers.
+        appearance: index of a training view, from `appearance_index`; None takes the mean.
+
+    Raises:
+        UserError: a value is out of range, the frames are too large, the run is incomplete, or EXR
+            is wanted without its package.
+    """
+    if not 1 <= supersample <= 8:
+        raise UserError(f"--supersample must be from 1 to 8; got {supersample}")
+    check_fps(fps)
+    check_size(path.size, supersample)
+    layers = tuple(name for name in LAYERS if name in layers)
+    formats = tuple(dict.fromkeys(formats))
+    if layers and "exr" in formats:
+        require_exr()
+    return RenderJob(
+        hash_of_run(run), path, float(fps), weather, supersample, layers, formats, appearance
+    )
+
+
+def check_fps(fps: float) -> float:
+    """Return the frame rate, in frames per second, if a movie can have it.
+
+    Raises:
+        UserError: it is outside 0.1 to 240.
+    """
+    if not 0.1 <= fps <= 240:
+        raise UserError(f"the frame rate must lie between 0.1 and 240 per second; got {fps:g}")
+    return fps
+
+
+def check_size(size: tuple[int, int], supersample: int) -> None:
+    """Refuse frames that would not fit into memory.
+
+    Args:
+        size: width and height, pixels.
+        supersample: rays per pixel along each side.
+
+    Raises:
+        UserError: the frames are too large.
+    """
+    rays = size[0] * size[1] * supersample**2
+    if max(size) > MAX_SIDE or rays > MAX_RAYS:
+        raise UserError(
+            f"a frame of {size[0]}x{size[1]} pixels with {supersample}x{supersample} rays each is"
+            f" too large; at most {MAX_SIDE} pixels a side and {MAX_RAYS / 1e6:.0f} million rays"
+        )
+
+
+def appearance_index(name: str, scene: Scene) -> int | None:
+    """Return the index of a training photo among the training views; None for the name "mean".
+
+    Args:
+        name: "mean", or the photo's name with or without folder and suffix.
+        scene: the capture.
+
+    Raises:
+        UserError: no training photo, or more than one, has the name.
+    """
+    if name == "mean":
+        return None
+    views = scene.of_split("train")
+    names = [(view.name, Path(view.name).name, Path(view.name).stem) for view in views]
+    found = [i for i, forms in enumerate(names) if name == forms[0]] or [
+        i for i, forms in enumerate(names) if name in forms
+    ]
+    if len(found) > 1:
+        raise UserError(
+            f'"{name}" means {len(found)} photos; give the whole name, such as {names[found[0]][0]}'
+        )
+    if found:
+        return found[0]
+    raise UserError(
+        f'the run has no training photo "{name}" to take the appearance of; give "mean" or a name'
+        f" such as {views[0].name}"
+    )
+
+
+def hash_of_run(run: Path) -> str:
+    """Return the hash of a run's field and scene.
+
+    Raises:
+        UserError: the run lacks one of them.
+    """
+    digest = hashlib.sha256()
+    for name in ("field.safetensors", "scene.json"):
+        try:
+            with (run / name).open("rb") as file:
+                digest.update(hashlib.file_digest(file, "sha256").digest())
+        except OSError as error:
+            raise explain(error, run / name) from error
+    return digest.hexdigest()
+
+
+def frames_of_part(job: RenderJob, part: tuple[int, int] | None = None) -> range:
+    """Return the indices of the frames of a part (number from 1, of how many); None takes all."""
+    number, count = part or (1, 1)
+    return range(number - 1, len(job), count)
+
+
+def missing_frames(job: RenderJob, out: Path, indices: Iterable[int] | None = None) -> list[int]:
+    """Return which frames are not finished in a folder, of the indices or of all."""
+    indices = range(len(job)) if indices is None else indices
+    return [i for i in indices if render_folder.frame_record(out, i, job.frame_key(i)) is None]
+
+
+def check_folder(job: RenderJob, out: Path, preview: bool = False) -> None:
+    """Refuse a folder that cannot receive the job; write nothing.
+
+    Args:
+        job: the job.
+        out: folder of the movie; it need not exist.
+        preview: whether `preview.png` will be written.
+
+    Raises:
+        UserError: files that no render made would be overwritten, or the folder holds an unfinished
+            render with other settings.
+    """
+    planned = [name for index in range(len(job)) for name in job.files(index)]
+    render_folder.check_place(out, planned, list(LAYERS), preview)
+    render_folder.working_folder(out, job.key)
+
+
+def render_frames(
+    job: RenderJob,
+    out: Path,
+    prepare: Callable[[], FrameSource],
+    indices: Iterable[int],
+    *,
+    preview: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Render the frames that are not finished yet; other processes may render others of the job.
+
+    Args:
+        job: the job.
+        out: folder of the movie.
+        prepare: makes what renders the frames; called once, and only if one is missing.
+        indices: the frames to render.
+        preview: show the frame at work in `preview.png`, coarse at first.
+        progress: called with "frames" and the fraction that is finished.
+
+    Raises:
+        UserError: see `check_folder`; or a disk error.
+    """
+    indices = list(indices)
+    check_folder(job, out, preview)
+    missing = missing_frames(job, out, indices)
+    if not missing:
+        return
+    render = prepare()
+    with render_folder.locked(out):
+        described = render_folder.describe(job.key, len(job), job.layers, job.formats, ())
+        render_folder.claim(out, described)
+    show = (lambda seen: write_png(out / PREVIEW, seen, SIMULATED)) if preview else None
+    done = len(indices) - len(missing)
+    try:
+        for index in missing:
+            _report(progress, done / len(indices))
+            if missing_frames(job, out, [index]):  # another process may have rendered it
+                _save(job, out, index, render(index, show))
+            done += 1
+        _report(progress, 1.0)
+    finally:
+        if preview:
+            (out / PREVIEW).unlink(missing_ok=True)
+
+
+def join(
+    job: RenderJob,
+    scene: Scene,
+    out: Path,
+    *,
+    note: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write movie and sidecar from finished frames, and return the path of the movie.
+
+    A complete earlier render in the folder is replaced now. If nothing is to be done, nothing is
+    written. If the movie fails, the sidecar is written all the same.
+
+    Args:
+        job: the job.
+        scene: its capture, for the frame of reference and the scale in the sidecar.
+        out: folder of the movie.
+        note: called with a sentence if the movie differs from the frames.
+        progress: called with "movie" and the fraction that is encoded.
+
+    Raises:
+        UserError: frames are missing, ffmpeg fails, or a disk error.
+    """
+    missing = missing_frames(job, out)
+    if missing:
+        first = ", ".join(f"{index:04d}" for index in missing[:5])
+        raise UserError(
+            f"{len(missing)} of {len(job)} frames of this render are missing in {out} ({first}"
+            f"{', ...' if len(missing) > 5 else ''}); render them with the same flags, then join"
+        )
+    with render_folder.locked(out):
+        render_folder.promote(out, job.key)
+        render_folder.remove_abandoned(out)
+        sidecar = _sidecar(job, scene, out)
+        if _joined(out, sidecar):
+            return out / MOVIE
+        try:
+            _encode(job, out, note, progress)
+        finally:
+            write_json(out / SIDECAR, sidecar)
+    return out / MOVIE
+
+
+def render_movie(
+    job: RenderJob,
+    scene: Scene,
+    out: Path,
+    prepare: Callable[[], FrameSource],
+    *,
+    preview: bool = False,
+    note: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Render the frames that are missing, join them, and return the path of the movie.
+
+    A stopped render leaves a sidecar of the frames that are finished, and resumes with the same
+    call. Arguments and errors are those of `render_frames` and `join`.
+    """
+    check_folder(job, out, preview)
+    if note is not None:  # before hours of rendering
+        _note_about_movie(job, note)
+    try:
+        render_frames(job, out, prepare, range(len(job)), preview=preview, progress=progress)
+    except BaseException:
+        _write_partial_sidecar(job, scene, out)
+        raise
+    return join(job, scene, out, progress=progress)
+
+
+def frame_source(
+    job: RenderJob, field: Any, scene: Scene, progress: Progress | None = None
+) -> FrameSource:
+    """Prepare light, waves and snow for a job, and return what renders its frames.
+
+    Args:
+        job: the job.
+        field: the fitted field of its run.
+        scene: the capture of its run.
+        progress: called with what is being prepared and the fraction that is done.
+
+    Raises:
+        UserError: the weather does not fit the scene.
+    """
+    from climatenerf.render.frame import render_frame
+    from climatenerf.render.session import prepare
+
+    appearance = None if job.appearance is None else field.embeddings[[job.appearance]].detach()
+    times = np.array([job.time(index) for index in range(len(job))])
+    report = progress or (lambda what, fraction: None)
+    positions = job.path.c2w[:, :3, 3]
+    stage = prepare(field, scene, job.weather, positions, times, report, appearance)
+    facts = {}
+    if stage.waves is not None:
+        facts["significant_wave_height_m"] = float(stage.waves.significant_height)
+    options = job.supersample, "normal" in job.layers, "label" in job.layers
+
+    def render(index: int, preview: Preview | None) -> RenderedFrame:
+        world, camera = stage.at(job.time(index)), job.path.cameras[index]
+        picture, layers = render_frame(world, camera, job.path.c2w[index], *options, preview)
+        return RenderedFrame(picture, layers, facts)
+
+    return render
+
+
+def measured(layers: dict[str, Float[np.ndarray, "h w *c"]]) -> dict[str, float]:
+    """Return a few numbers that describe a frame: fractions of the picture, and means in m."""
+    snow, water = layers["mask_snow"], layers["mask_water"]
+    return {
+        "water_share": float(water.mean()),
+        "mean_water_depth_m": _mean(layers["water_depth"], water > 0.5),
+        "mean_transmittance": float(layers["transmittance"].mean()),
+        "snow_share": float(snow.mean()),
+        "mean_snow_thickness_m": _mean(layers["snow_thickness"], snow > 0.5),
+    }
+
+
+def _mean(values: np.ndarray, where: np.ndarray) -> float:
+    return float(values[where].mean()) if where.any() else 0.0
+
+
+def _save(job: RenderJob, out: Path, index: int, frame: RenderedFrame) -> None:
+    """Write a frame's files and its record."""
+    layers = {name: frame.layers[name] for name in job.layers}
+    keys = job.key, job.frame_key(index)
+    with render_folder.unfinished_files(out) as scratch:
+        picture = job.files(index)[0]
+        write_png(scratch / picture, frame.picture, SIMULATED, keys[1])
+        written = save_layers(scratch, f"{index:04d}", layers, job.formats)
+        record = {
+            "files": [picture, *sum(written.values(), [])],
+            "layers": written,
+            "measured": measured(frame.layers),
+            "facts": frame.facts,
+        }
+        render_folder.commit_frame(out, scratch, index, keys, record)
+
+
+def _sidecar(job: RenderJob, scene: Scene, out: Path) -> dict[str, Any]:
+    """Return the sidecar of the frames that are finished, as JSON holds it."""
+    records, facts = [], {}
+    for index in range(len(job)):
+        record = render_folder.frame_record(out, index, job.frame_key(index))
+        if record is None:
+            continue
+        facts = record["facts"]
+        camera, c2w, time = job.path.cameras[index], job.path.c2w[index], job.time(index)
+        weather = weather_to_table(job.weather.at(time))
+        layers, numbers = record["layers"], record["measured"]
+        file = job.files(index)[0]
+        records.append(FrameRecord(file, time, camera, c2w, layers, weather, numbers))
+    about: dict[str, Any] = {"path": job.path.name, "notes": list(job.path.notes), "fps": job.fps}
+    about["appearance_of_training_view"] = job.appearance  # null: the mean
+    about |= {"supersample": job.supersample, "frames_wanted": len(job), "render": job.key, **facts}
+    seed = job.weather.base.seed
+    return plain(sidecar(scene, records, weather_to_table(job.weather), seed, about))
+
+
+def _joined(out: Path, wanted: dict[str, Any]) -> bool:
+    """Return whether movie and sidecar are there and up to date."""
+    try:
+        return (out / MOVIE).is_file() and read_json(out / SIDECAR) == wanted
+    except UserError:
+        return False
+
+
+def _encode(
+    job: RenderJob, out: Path, note: Callable[[str], None] | None, progress: Progress | None
+) -> None:
+    """Write the movie from the pictures."""
+    with MovieWriter(out / MOVIE, job.path.size, job.fps) as writer:
+        if note is not None and writer.note is not None:
+            note(writer.note)
+        for index in range(len(job)):
+            writer.add(read_rgb(out / job.files(index)[0]))
+            _report(progress, (index + 1) / len(job), "movie")
+
+
+def _write_partial_sidecar(job: RenderJob, scene: Scene, out: Path) -> None:
+    """Describe the frames that a stopped render leaves: without a sidecar they are no data."""
+    with contextlib.suppress(UserError):
+        folder = render_folder.working_folder(out, job.key)
+        held = render_folder.held_render(folder)
+        if held is not None and held["render"] == job.key:
+            found = _sidecar(job, scene, out)
+            if found["frames"]:
+                write_json(folder / SIDECAR, found)
+
+
+def _note_about_movie(job: RenderJob, note: Callable[[str], None]) -> None:
+    """Report at once why there will be no movie, or why it will differ from the frames."""
+    try:
+        find_ffmpeg()
+    except UserError as error:
+        note(f"the frames will be rendered without a movie: {error}")
+    padded = padding_note(MOVIE, job.path.size)
+    if padded is not None:
+        note(padded)
+
+
+def _report(progress: Progress | None, fraction: float, what: str = "frames") -> None:
+    if progress is not None:
+        progress(what, fraction)
+
+
+def _hash(value: Any) -> str:
+    text = json.dumps(plain(value), sort_keys=True, ensure_ascii=False)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,322 @@
+"""Files of a rendered movie: who owns them, which frames are finished, and how they are replaced.
+
+    OUT/frames/0000.png          pictures
+    OUT/depth/0000.npz           layers, a folder each
+    OUT/movie.mp4, movie.json    written when the frames are joined
+    OUT/.frames/render.json      the render that OUT holds
+    OUT/.frames/0000.json        one record for each finished frame
+    OUT/.frames/next/            frames that will replace a finished render, laid out like OUT
+
+A frame is finished when its record exists. The record is written last, it holds the frame's key and
+the sizes of its files, and the picture carries the same key. Files move to their final names under
+an advisory lock of the operating system, so a killed process leaves neither a torn file nor a lock.
+"""
+
+import contextlib
+import errno
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import atomic_path, explain, make_folder, read_json, write_json
+
+SCHEMA_VERSION = 1
+STATE = ".frames"
+NEXT = f"{STATE}/next"
+MOVIE, SIDECAR, PREVIEW = "movie.mp4", "movie.json", "preview.png"
+ABANDONED_AFTER = 3600.0
+"""Seconds after which unfinished files of a killed process are removed."""
+
+
+def frame_files(index: int, layers: Sequence[str], formats: Sequence[str]) -> list[str]:
+    """Return the paths of a frame's picture and layers, relative to the folder of the render."""
+    stem = f"{index:04d}"
+    found = [f"{name}/{stem}.{kind}" for name in layers for kind in formats]
+    return [f"frames/{stem}.png", *found]
+
+
+def held_render(folder: Path) -> dict[str, Any] | None:
+    """Return the description of the render that a folder holds, or None if there is no sound one.
+
+    The keys are `render` (its hash), `frames` (how many), `layers`, `formats` and `replaces`: files
+    of an earlier render, relative to the folder, that are removed when this one is complete.
+    """
+    try:
+        held = read_json(folder / STATE / "render.json")
+        wanted = {"render": str, "frames": int, "layers": list, "formats": list, "replaces": list}
+        sound = all(isinstance(held.get(name), kind) for name, kind in wanted.items())
+    except (UserError, OSError):
+        return None
+    return held if sound else None
+
+
+def describe(
+    key: str, frames: int, layers: Sequence[str], formats: Sequence[str], replaces: Sequence[str]
+) -> dict[str, Any]:
+    """Return the content of `render.json`; `held_render` reads it back."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "render": key,
+        "frames": frames,
+        "layers": list(layers),
+        "formats": list(formats),
+        "replaces": list(replaces),
+    }
+
+
+def files_of_render(out: Path) -> set[Path]:
+    """Return the resolved paths of all files that belong to the render in a folder.
+
+    They are named by `render.json`, and by the sidecar of a version that wrote no `render.json`.
+    """
+    names: list[str] = []
+    with contextlib.suppress(UserError, OSError, KeyError, TypeError, AttributeError):
+        frames = read_json(out / SIDECAR)["frames"]
+        for frame in frames:
+            names += [frame["file"], *sum(frame["layers"].values(), [])]
+    held = held_render(out)
+    if held is not None:
+        for index in range(held["frames"]):
+            names += frame_files(index, held["layers"], held["formats"])
+        names += held["replaces"]
+    if names:
+        names += [MOVIE, SIDECAR]
+    paths = {(out / name).resolve() for name in names}
+    return {path for path in paths if path.is_relative_to(out.resolve())}
+
+
+def check_place(
+    out: Path, planned: Sequence[str], layer_names: Sequence[str], preview: bool = False
+) -> None:
+    """Refuse a folder in which a render would overwrite files that no render made.
+
+    Args:
+        out: the folder; it need not exist.
+        planned: files that will be written, relative to `out`.
+        layer_names: names of all layers. A numbered file in one of their folders is refused too,
+            because a reader could take it for a layer of the new render.
+        preview: whether `preview.png` will be written.
+
+    Raises:
+        UserError: such a file exists.
+    """
+    ours = files_of_render(out)
+    paths = [out / name for name in (*planned, MOVIE, SIDECAR)]
+    paths += [out / PREVIEW] if preview and not is_simulated(out / PREVIEW) else []
+    for name in layer_names:
+        paths += [path for path in (out / name).glob("*") if path.stem.isdecimal()]
+    for path in paths:
+        if path.exists() and path.resolve() not in ours:
+            raise UserError(
+                f"{path} was not made by the render that {out} holds, and would be overwritten;"
+                " choose another folder with -o, or remove it"
+            )
+
+
+def is_simulated(path: Path) -> bool:
+    """Return whether a file is a PNG that this program wrote, such as a killed render's preview."""
+    return _png_text(path, "simulated") is not None
+
+
+def working_folder(out: Path, key: str) -> Path:
+    """Return the folder that receives the frames of a render: `out`, or `next` inside its state.
+
+    A finished render in `out` stays until the new one is complete, so new frames wait in `next`.
+
+    Args:
+        out: the folder of the movie.
+        key: hash of the render.
+
+    Raises:
+        UserError: the folder holds an unfinished render with other settings.
+    """
+    held, waiting = held_render(out), held_render(out / NEXT)
+    if held is not None and held["render"] == key:
+        return out
+    if (held is not None and not is_complete(out, held)) or (
+        waiting is not None and waiting["render"] != key
+    ):
+        raise UserError(
+            f"{out} holds an unfinished render with other settings; finish that one with the flags"
+            " it was begun with, choose another folder with -o, or remove the folder"
+        )
+    return out / NEXT if files_of_render(out) else out
+
+
+def is_complete(out: Path, held: Mapping[str, Any]) -> bool:
+    """Return whether the frames of a folder's render have all been joined."""
+    try:
+        sidecar = read_json(out / SIDECAR)
+        return sidecar["render"] == held["render"] and len(sidecar["frames"]) == held["frames"]
+    except (UserError, OSError, KeyError, TypeError):
+        return False
+
+
+def claim(out: Path, described: Mapping[str, Any]) -> None:
+    """Record in a folder which render it holds from now on; call it with the lock held.
+
+    Raises:
+        UserError: the folder holds an unfinished render with other settings.
+    """
+    folder = working_folder(out, described["render"])
+    if held_render(folder) is None:
+        if folder != out:  # files that a process left after the render was complete
+            shutil.rmtree(folder, ignore_errors=True)
+        write_json(folder / STATE / "render.json", described)
+
+
+def frame_record(out: Path, index: int, key: str) -> dict[str, Any] | None:
+    """Return the record of a finished frame, or None if it is missing, damaged or another's.
+
+    Args:
+        out: the folder of the movie.
+        index: number of the frame, from 0.
+        key: hash of the frame; a frame with another hash does not count.
+    """
+    for folder in (out, out / NEXT):
+        try:
+            record = read_json(folder / STATE / f"{index:04d}.json")
+            picture, *_ = files = record["files"]
+            sizes = [(folder / name).stat().st_size for name in files]
+            sound = record["key"] == key and sizes == list(files.values())
+        except (UserError, OSError, KeyError, TypeError, ValueError, AttributeError):
+            continue
+        if sound and _png_text(folder / picture, "key") == key:
+            return record
+    return None
+
+
+@contextlib.contextmanager
+def unfinished_files(out: Path) -> Iterator[Path]:
+    """Yield a scratch folder inside `out` that is removed when the block ends."""
+    scratch = make_folder(out / STATE / f"unfinished-{secrets.token_hex(6)}")
+    try:
+        yield scratch
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def commit_frame(
+    out: Path, scratch: Path, index: int, keys: tuple[str, str], record: Mapping[str, Any]
+) -> None:
+    """Move a frame's files to their final names and write its record, unless it is finished.
+
+    Args:
+        out: the folder of the movie.
+        scratch: holds the files under the names of `frame_files`.
+        index: number of the frame, from 0.
+        keys: hash of the render, hash of the frame.
+        record: what the sidecar needs; `files` and `key` are added. `files` lists the picture
+            first.
+
+    Raises:
+        UserError: a disk error, or another render has taken the folder.
+    """
+    files = {name: (scratch / name).stat().st_size for name in record["files"]}
+    with locked(out):
+        if frame_record(out, index, keys[1]) is not None:
+            return
+        folder = working_folder(out, keys[0])
+        for name in files:
+            move(scratch / name, folder / name)
+        complete = {**record, "key": keys[1], "files": files}
+        write_json(folder / STATE / f"{index:04d}.json", complete)
+
+
+def promote(out: Path, key: str) -> None:
+    """Move a complete render from `next` into `out`; call it with the lock held.
+
+    An interrupted move continues with the next call: `out` then holds the new render already, and
+    `next` the rest of its files.
+    """
+    source = out / NEXT
+    waiting = held_render(source)
+    if waiting is not None and waiting["render"] == key:
+        held = held_render(out)
+        if held is None or held["render"] != key:
+            root = out.resolve()
+            old = sorted(path.relative_to(root).as_posix() for path in files_of_render(out))
+            write_json(out / STATE / "render.json", {**waiting, "replaces": old})
+        for name in (SIDECAR, MOVIE):  # they describe the earlier frames
+            (out / name).unlink(missing_ok=True)
+        for path in sorted(source.rglob("*")):
+            if path.is_file() and path != source / STATE / "render.json":
+                move(path, out / path.relative_to(source))
+        shutil.rmtree(source, ignore_errors=True)
+    held = held_render(out)
+    if held is None or held["render"] != key or not held["replaces"]:
+        return
+    wanted = {MOVIE, SIDECAR}
+    for index in range(held["frames"]):
+        wanted.update(frame_files(index, held["layers"], held["formats"]))
+    for name in set(held["replaces"]) - wanted:
+        (out / name).unlink(missing_ok=True)
+    for path in (out / STATE).glob("*.json"):
+        if path.stem.isdecimal() and int(path.stem) >= held["frames"]:
+            path.unlink(missing_ok=True)
+    write_json(out / STATE / "render.json", {**held, "replaces": []})
+
+
+def remove_abandoned(out: Path) -> None:
+    """Remove scratch folders of processes that were killed long ago."""
+    for path in (out / STATE).glob("unfinished-*"):
+        with contextlib.suppress(OSError):
+            if time.time() - path.stat().st_mtime > ABANDONED_AFTER:
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def move(source: Path, target: Path) -> None:
+    """Rename a file over another atomically, creating the folder of the target.
+
+    Raises:
+        UserError: the disk is full, or the target cannot be written.
+    """
+    make_folder(target.parent)
+    try:
+        os.replace(source, target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise explain(error, target) from error
+        with atomic_path(target) as temporary:  # the user has linked the folder to another disk
+            shutil.copyfile(source, temporary)
+        source.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Hold the folder's lock; other processes wait. The system frees it when a process dies.
+
+    A file system without locks gets none: every file is still replaced atomically, and the frames
+    of one render are the same whichever process writes them.
+    """
+    from filelock import FileLock
+
+    make_folder(out / STATE)
+    lock = FileLock(out / STATE / "lock")
+    try:
+        lock.acquire()
+    except NotImplementedError:
+        pass
+    except OSError as error:
+        raise explain(error, out / STATE / "lock") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _png_text(path: Path, name: str) -> str | None:
+    """Return a text chunk of a PNG; None where there is no such file or chunk."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return picture.info.get(name)
+    # Pillow refuses to open a picture that is suspiciously large.
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
