@@ -28,9 +28,9 @@ from engine import drawn, our_step, time_to_psnr, twin_step
 from frame_time import frames
 
 from climatenerf.cli.render import parse_size
+from climatenerf.core.device import on
 from climatenerf.core.errors import UserError
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.device import on
 from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.volume import RENDER_STEP, camera_rays, rays_at_once
 from climatenerf.scene import load_scene, read_scene

@@ -11,11 +11,10 @@ from support.toy_photos import BENT, pattern, photos
 from support.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
-from climatenerf.core.device import to_numpy
+from climatenerf.core.device import check_triton, on, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.device import check_triton, on
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
 from climatenerf.field.presets import PRESETS

@@ -141,7 +141,7 @@ def fit(
         UserError: a value is out of range, the folder holds a run (without `resume`) or none (with
             it), or the photos cannot be fitted.
     """
-    from climatenerf.field.device import on
+    from climatenerf.core.device import on
     from climatenerf.training.run import fit_scene
     from climatenerf.training.settings import Losses, settings_of
 

@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 import torch
 
 from climatenerf.core.colour import decode_srgb, encode_srgb, luma
+from climatenerf.core.srgb import linear_colour, to_display, to_linear
 
 
 def test_known_values():
@@ -55,6 +57,16 @@ def test_linear_above_one_with_the_slope_it_has_there(curve):
     (slope,) = torch.autograd.grad(curve(x).sum(), x)
     assert torch.allclose(slope[1:], slope[4].expand(4), atol=1e-12)
     assert abs(slope[0] - slope[4]) < 1e-4
+
+
+def test_arrays_floats_and_tensors_follow_one_curve():
+    x = np.linspace(0.0, 1.0, 1001)
+    tensor = torch.from_numpy(x)
+    assert np.allclose(to_linear(x), decode_srgb(tensor).numpy(), rtol=1e-12, atol=0)
+    assert np.allclose(to_display(x), encode_srgb(tensor).numpy(), rtol=1e-12, atol=1e-15)
+    assert np.allclose(to_display(np.array([-0.5, 1.5])), [0.0, 1.0], atol=1e-15)
+    for colour in x[:999].reshape(-1, 3):
+        assert np.allclose(linear_colour(tuple(colour)), to_linear(colour), rtol=1e-12, atol=0)
 
 
 def test_luma_of_white_is_one():

@@ -10,13 +10,13 @@ import torch
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
+from climatenerf.core.srgb import to_display
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
 from climatenerf.evaluation.scores import depth_spread
 from climatenerf.scene import Camera
-from climatenerf.scene.srgb import to_display
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
 ROAD, TERRAIN, LEAVES, SKY = 0, 9, 8, 10  # Cityscapes train ids

@@ -9,6 +9,7 @@ import pytest
 import tyro
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.srgb import linear_colour
 from climatenerf.weather import parameters, units
 from climatenerf.weather.parameters import Flood, Smog, Snow, Sun, Weather, check
 
@@ -124,7 +125,7 @@ def test_every_value_has_a_range_and_no_section_is_too_long():
 
 
 def test_colours_are_decoded():
-    assert parameters.linear_colour((0, 0.5, 1)) == pytest.approx((0, 0.21404, 1), abs=1e-5)
+    assert linear_colour((0, 0.5, 1)) == pytest.approx((0, 0.21404, 1), abs=1e-5)
 
 
 def test_imports_stay_light():

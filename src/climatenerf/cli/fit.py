@@ -123,7 +123,7 @@ def run(options: Fit) -> int:
 def check_device(device: str) -> None:
     """Refuses a device that is not there; imports torch for others than the CPU only."""
     if device != "cpu":
-        from climatenerf.field.device import on
+        from climatenerf.core.device import on
 
         with on(device):
             pass
@@ -231,7 +231,7 @@ def fit_with_bars(scene, options: Fit) -> dict:
         "Preparing: photos are matched, up to half a minute; so long again where kernels are to be"
         " compiled, once on a machine"
     )
-    from climatenerf.field.device import on
+    from climatenerf.core.device import on
     from climatenerf.training.run import fit_scene
     from climatenerf.training.trainer import Report
 

@@ -85,7 +85,7 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
         progress.warn(f"--{name} changes nothing without {absent}")
 
     from climatenerf.api import render_movie
-    from climatenerf.field.device import on
+    from climatenerf.core.device import on
 
     with on(options.device), progress.StageBars() as bars:
         made = render_movie(

@@ -1,41 +1,99 @@
-"""On which device numbers lie.
+"""The device in use, and transfers to and from it.
 
-Work is done on the device of the `with torch.device(...)` block around it: what torch makes lies
-there by itself, and this brings the rest. A fit's random numbers (but for its networks' first
-values and the order of occupied cells) are drawn on the CPU, so that a seed means much the same on
-every device.
+Work runs on the device of the `with torch.device(...)` block around it (`on`): torch creates new
+tensors there, and `to_device` and `upload` move the rest. A fit draws its random numbers on the
+CPU, except the initial values of networks and the order of occupied cells, so that one seed gives
+much the same fit on every device.
 """
+
+import contextlib
+import importlib.metadata
+import os
+import re
+import shutil
+import sysconfig
+from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.core.errors import UserError
+
+MIN_TRITON = (3, 4)  # the first version that compiles these kernels; PyTorch 2.8 includes it
+
 
 def to_device(array: np.ndarray) -> Tensor:
-    """An array's numbers on the device in use; on a CPU they share its memory."""
+    """Return an array as a tensor on the device in use; on a CPU it shares the array's memory."""
     return torch.from_numpy(array).to(torch.get_default_device())
 
 
 def to_numpy(tensor: Tensor) -> np.ndarray:
-    """A tensor's numbers on the CPU; it shares the memory of one that is there."""
+    """Return a tensor as an array; it shares the memory of a tensor on the CPU."""
     return tensor.detach().cpu().numpy()
 
 
-def uniform(generator: torch.Generator, *shape: int) -> Float[Tensor, "..."]:
-    """Random numbers in [0,1)."""
-    return upload(torch.rand(shape, generator=generator, device="cpu"))
-
-
-def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> Int[Tensor, "..."]:
-    """Random whole numbers from low to high - 1."""
-    drawn = torch.randint(low, high, shape, generator=generator, device="cpu")
-    return upload(drawn)
-
-
 def upload(tensor: Tensor) -> Tensor:
-    """Numbers of the CPU on the device in use; on a GPU they arrive before they are asked for."""
+    """Copy a tensor of the CPU to the device in use; to a GPU without waiting for the copy."""
     device = torch.get_default_device()
     if device.type != "cuda":
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+def uniform(generator: torch.Generator, *shape: int) -> Float[Tensor, "..."]:
+    """Return random numbers in [0,1) on the device in use, drawn on the CPU."""
+    return upload(torch.rand(shape, generator=generator, device="cpu"))
+
+
+def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> Int[Tensor, "..."]:
+    """Return random integers from low to high - 1 on the device in use, drawn on the CPU."""
+    drawn = torch.randint(low, high, shape, generator=generator, device="cpu")
+    return upload(drawn)
+
+
+def check_triton() -> None:
+    """Check for what the GPU kernels need besides PyTorch: Triton, a C compiler, Python's headers.
+
+    Raises:
+        UserError: one of them is missing.
+    """
+    try:
+        version = importlib.metadata.version("triton")
+    except importlib.metadata.PackageNotFoundError:
+        version = "0"
+    if tuple(map(int, re.findall(r"\d+", version)[:2])) < MIN_TRITON:
+        raise UserError(
+            "--device cuda needs Triton 3.4, which comes with PyTorch 2.8 for CUDA on Linux;"
+            " install that PyTorch or a newer one, or leave --device out"
+        )
+    # Triton compiles a launcher for each kernel, and looks for a compiler in this order.
+    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+    headers = Path(sysconfig.get_path("include"), "Python.h")
+    if compiler is None or shutil.which(compiler) is None or not headers.is_file():
+        raise UserError(
+            "Triton needs a C compiler and Python's headers, and one of them is missing; install"
+            " both (apt install gcc python3-dev), or leave --device out"
+        )
+
+
+@contextlib.contextmanager
+def on(device: str) -> Iterator[None]:
+    """Make `device`, "cpu" or "cuda", the default device of torch within the block.
+
+    Raises:
+        UserError: there is no such device, or something that its kernels need is missing.
+    """
+    if device == "cpu":
+        yield
+        return
+    if not torch.cuda.is_available():
+        raise UserError(
+            "PyTorch finds no NVIDIA GPU; install the card's driver and PyTorch with CUDA, or leave"
+            " --device out"
+        )
+    check_triton()
+    with torch.device(device):
+        yield

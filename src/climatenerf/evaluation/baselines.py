@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from climatenerf.core.srgb import to_display, to_linear
 from climatenerf.evaluation.geometry import nearest_pixels
 from climatenerf.scene import Camera
-from climatenerf.scene.srgb import to_display, to_linear
 
 SNOW_EDGE, SNOW_SLOPE = 50.0, np.cos(np.deg2rad(37.0))  # as the paper's snow
 REACHES = np.geomspace(0.05, 60.0, 64)  # m along a reflected ray

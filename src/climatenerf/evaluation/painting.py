@@ -6,13 +6,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from climatenerf.core.srgb import linear_colour, to_display
 from climatenerf.evaluation import baselines
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.reference import WeatherTruth
-from climatenerf.scene.srgb import to_display
 from climatenerf.weather.flood import optics as water_physics
 from climatenerf.weather.flood import waves
-from climatenerf.weather.parameters import linear_colour
 from climatenerf.weather.smog import medium as smog
 
 Picture = UInt8[np.ndarray, "h w 3"]

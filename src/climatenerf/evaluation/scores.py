@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU
+from climatenerf.core.srgb import to_display
 from climatenerf.evaluation import baselines, geometry, weather_scores
 from climatenerf.evaluation.baselines import Dry
 from climatenerf.evaluation.consistency import Frame, warp_error
@@ -29,7 +30,6 @@ from climatenerf.render.heads import see_surface
 from climatenerf.render.session import Stage, prepare
 from climatenerf.render.volume import RENDER_STEP, camera_rays
 from climatenerf.scene import Camera, Scene, View
-from climatenerf.scene.srgb import to_display
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.parameters import Flood, Weather
 from climatenerf.weather.world import World

@@ -13,9 +13,9 @@ from PIL import Image
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.srgb import to_linear
 from climatenerf.scene.label_spaces import to_train_ids
 from climatenerf.scene.scene import Scene, View
-from climatenerf.scene.srgb import to_linear
 
 RELATIVE_DEPTH = "depth_relative"
 _ORIENTATION_TAG = 0x0112

@@ -167,14 +167,6 @@ _RANGES: dict[str, tuple[float, float]] = {
 }
 
 
-def linear_colour(display: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Decode a display sRGB colour to linear radiance (IEC 61966-2-1)."""
-    red, green, blue = (
-        c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in display
-    )
-    return red, green, blue
-
-
 def kind_of(annotation: object) -> Kind | None:
     """Dimension that a field's annotation asks for; None for a plain number or a colour."""
     return next((m for m in getattr(annotation, "__metadata__", ()) if isinstance(m, Kind)), None)

@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from climatenerf.core.srgb import linear_colour
 from climatenerf.weather.flood.fresnel import diffuse_reflectances, slope_averaged
-from climatenerf.weather.parameters import Flood, linear_colour
+from climatenerf.weather.parameters import Flood
 
 # Koschmieder's law for the path down and up: a white disc at the depth `clarity` keeps 2 % of its
 # contrast.

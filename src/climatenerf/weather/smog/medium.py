@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.weather.parameters import Smog, linear_colour
+from climatenerf.core.srgb import linear_colour
+from climatenerf.weather.parameters import Smog
 
 # Rays with a smaller |dz| count as horizontal. The gradient of a division by dz contains 1/dz^2,
 # which still fits float32 at this bound.
