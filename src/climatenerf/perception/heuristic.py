@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from climatenerf.core.cameras import Camera
+from climatenerf.core.morphology import connected_to, dilated
 from climatenerf.perception.heuristic_ground import GroundPoints, find_ground_in
 from climatenerf.scene.images import load_image
 from climatenerf.scene.label_spaces import UNKNOWN
@@ -102,21 +103,21 @@ def find_sky(
     if not seeds.any():
         return nothing
     # Not stopped at the horizon: what looks like sky and goes on below it is a wall or a road.
-    sky = _spread(seeds, coloured & smooth)
+    sky = connected_to(seeds, coloured & smooth)
     if sky.mean() < _MIN_AREA:
         return nothing
     for _ in range(2):  # the second time knowing how the sky goes on behind wires and twigs
         alike = coloured & _fits(values, sky)
-        sky = _spread(sky & alike, _grown(alike, _GAP)) & alike
+        sky = connected_to(sky & alike, dilated(alike, _GAP)) & alike
     if not sky.any() or (upward[sky] < _BELOW).mean() > 0.05 or not _outshines(values, sky):
         return nothing
     # Clouds and birds: what sky surrounds, or sky and the photo's top.
-    outside = _spread(_border(sky.shape) & ~_top_border(upward), ~sky)
+    outside = connected_to(_border(sky.shape) & ~_top_border(upward), ~sky)
     sky |= coloured & ~outside
     sky &= upward > _HORIZON
     if (solid & sky).sum() > 0.3 * sky.sum():
         return nothing
-    sky = ~_grown(~sky, _EDGE) & ~solid
+    sky = ~dilated(~sky, _EDGE) & ~solid
     return sky if sky.mean() >= _MIN_AREA else nothing
 
 
@@ -186,31 +187,6 @@ def _top_border(upward: Float[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     return top
 
 
-def _spread(
-    seeds: Bool[np.ndarray, "h w"], allowed: Bool[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """The allowed pixels that are joined to a seed, along rows and columns."""
-    reached = seeds & allowed
-    while True:
-        before = np.count_nonzero(reached)
-        reached = _along_rows(reached, allowed)
-        reached = _along_rows(reached.T, allowed.T).T
-        if np.count_nonzero(reached) == before:
-            return reached
-
-
-def _along_rows(
-    reached: Bool[np.ndarray, "h w"], allowed: Bool[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """All of each unbroken run of allowed pixels in a row of which one is reached."""
-    breaks = ~allowed
-    breaks[:, 0] = True
-    run = np.cumsum(breaks.ravel(), dtype=np.int32)
-    hit = np.zeros(int(run[-1]) + 1, bool)
-    hit[run[reached.ravel()]] = True
-    return hit[run].reshape(allowed.shape) & allowed
-
-
 def _fits(
     values: Float[np.ndarray, "h w 3"], sky: Bool[np.ndarray, "h w"]
 ) -> Bool[np.ndarray, "h w"]:
@@ -242,19 +218,6 @@ def _outshines(values: Float[np.ndarray, "h w 3"], sky: Bool[np.ndarray, "h w"])
     return not len(rest) or bool(colour[1] > np.quantile(rest, 0.9))
 
 
-def _grown(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
-    """The mask and all that is within a square of so many pixels around it."""
-    grown = mask
-    for _ in range(pixels):
-        wider = grown.copy()
-        wider[:, 1:] |= grown[:, :-1]
-        wider[:, :-1] |= grown[:, 1:]
-        grown = wider.copy()
-        grown[1:] |= wider[:-1]
-        grown[:-1] |= wider[1:]
-    return grown
-
-
 def _solid(scene: Scene, view: View, camera: Camera) -> Bool[np.ndarray, "h w"]:
     """True around the sparse points that a view shows: they are matter, not sky."""
     near = np.zeros((camera.height, camera.width), bool)
@@ -265,4 +228,4 @@ def _solid(scene: Scene, view: View, camera: Camera) -> Bool[np.ndarray, "h w"]:
     pixels = pixels[np.isfinite(pixels).all(axis=-1)].astype(np.int64)
     inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
     near[pixels[inside, 1], pixels[inside, 0]] = True
-    return _grown(near, round(_POINT_SPACE * max(camera.width, camera.height) / 2))
+    return dilated(near, round(_POINT_SPACE * max(camera.width, camera.height) / 2))

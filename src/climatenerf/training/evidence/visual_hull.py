@@ -14,6 +14,7 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import UNKNOWN
 from climatenerf.core.device import to_device
+from climatenerf.core.morphology import depth_inside, eroded
 from climatenerf.ops import visual_hull
 
 VOICES = 64  # views that are asked, at most
@@ -79,15 +80,5 @@ def depth_within(
     for _ in range(camera.width // width // 2):  # a wire thinner than a small pixel stays
         whole = eroded(whole)
     part = inside & whole[place[..., 1], place[..., 0]]
-    depth = np.zeros(part.shape, np.float32)
-    for _ in range(REACH):
-        depth += part
-        part = eroded(part)
+    depth = np.minimum(depth_inside(part), REACH).astype(np.float32)
     return depth, (small.fx, small.fy, small.cx, small.cy)
-
-
-def eroded(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """What of a mask has no neighbour outside it; beyond the picture's border nothing is known."""
-    padded = np.pad(mask, 1)
-    rows = padded[:-2] & padded[1:-1] & padded[2:]
-    return rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]
