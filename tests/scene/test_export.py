@@ -9,7 +9,7 @@ from support.scene_builders import names_of, ring, write_images
 
 from climatenerf.core.errors import UserError
 from climatenerf.scene import Camera, Scene, View, read_scene
-from climatenerf.scene.export import export_colmap, export_transforms, quaternion
+from climatenerf.scene.export import export_colmap, export_transforms
 from climatenerf.scene.readers.colmap import read_colmap
 from climatenerf.scene.readers.transforms_json import read_transforms
 
@@ -91,16 +91,3 @@ def test_pictures_elsewhere_are_named_in_full_and_nothing_is_overwritten(scene, 
     export_colmap(scene, tmp_path / "out")
     with pytest.raises(UserError, match="already exists"):
         export_colmap(scene, tmp_path / "out")
-
-
-def test_quaternions_of_any_rotation():
-    rng = np.random.default_rng(1)
-    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(50)]
-    turns = [t * np.sign(np.linalg.det(t)) for t in turns]
-    turns += [np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1.0, 1, 1])]
-    for turn in turns:
-        w, x, y, z = quaternion(turn)
-        v = np.array([x, y, z])
-        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        back = np.eye(3) * (w * w - v @ v) + 2 * np.outer(v, v) + 2 * w * k
-        np.testing.assert_allclose(back, turn, atol=1e-12)

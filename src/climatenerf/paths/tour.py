@@ -6,6 +6,8 @@ Poses are camera-to-world, OpenCV axes, any one unit of length, with z up.
 import numpy as np
 from jaxtyping import Float, Int
 
+from climatenerf.core.rotations import quaternions, rotation_matrices
+
 TURN_SHARE = 0.1
 """A turn by 1 rad counts as this share of the cameras' spread, so that turning takes time too."""
 
@@ -60,7 +62,7 @@ def smooth_and_resample(
         frames: how many, ≥ 1; one frame is the middle of the path.
     """
     reach = _spread(poses)
-    where = _travelled(poses[:, :3, 3], _quaternions(poses[:, :3, :3]), reach)
+    where = _travelled(poses[:, :3, 3], quaternions(poses[:, :3, :3]), reach)
     if len(poses) == 1 or where[-1] <= 0:
         return level(np.repeat(poses[:1], frames, axis=0))
     # Poses in one place twice would make the interpolation ambiguous.
@@ -69,7 +71,7 @@ def smooth_and_resample(
     count = min(24 * len(poses), 20000)
     dense = np.linspace(0, where[-1], count)
     position = _interpolated(dense, where, poses[:, :3, 3])
-    quaternion = _interpolated(dense, where, _aligned(_quaternions(poses[:, :3, :3])))
+    quaternion = _interpolated(dense, where, _aligned(quaternions(poses[:, :3, :3])))
     sigma = min(2.0, len(poses) / 8) * count / max(len(poses) - 1, 1)
     position = _smoothed(position, sigma, keep_ends=True)
     quaternion = _smoothed(_unit(quaternion), sigma, keep_ends=False)
@@ -78,7 +80,7 @@ def smooth_and_resample(
     even = np.linspace(0, where[-1], frames) if frames > 1 else np.array([where[-1] / 2])
     out = np.repeat(np.eye(4)[None], frames, axis=0)
     out[:, :3, 3] = _interpolated(even, where, position)
-    out[:, :3, :3] = _rotations(_unit(_interpolated(even, where, quaternion)))
+    out[:, :3, :3] = rotation_matrices(_unit(_interpolated(even, where, quaternion)))
     return level(out)
 
 
@@ -191,29 +193,3 @@ def _aligned(quaternions: np.ndarray) -> np.ndarray:
     """Each quaternion with the sign nearer to its predecessor: q and -q are one rotation."""
     signs = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0, -1.0, 1.0)
     return quaternions * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
-
-
-def _quaternions(r: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 4"]:
-    """(w, x, y, z) of rotation matrices: the largest eigenvector of Bar-Itzhack's matrix (2000)."""
-    k = np.empty((len(r), 4, 4))
-    k[:, 0, 0] = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
-    k[:, 1, 1] = r[:, 0, 0] - r[:, 1, 1] - r[:, 2, 2]
-    k[:, 2, 2] = r[:, 1, 1] - r[:, 0, 0] - r[:, 2, 2]
-    k[:, 3, 3] = r[:, 2, 2] - r[:, 0, 0] - r[:, 1, 1]
-    k[:, 0, 1] = k[:, 1, 0] = r[:, 2, 1] - r[:, 1, 2]
-    k[:, 0, 2] = k[:, 2, 0] = r[:, 0, 2] - r[:, 2, 0]
-    k[:, 0, 3] = k[:, 3, 0] = r[:, 1, 0] - r[:, 0, 1]
-    k[:, 1, 2] = k[:, 2, 1] = r[:, 1, 0] + r[:, 0, 1]
-    k[:, 1, 3] = k[:, 3, 1] = r[:, 2, 0] + r[:, 0, 2]
-    k[:, 2, 3] = k[:, 3, 2] = r[:, 2, 1] + r[:, 1, 2]
-    return np.linalg.eigh(k)[1][:, :, -1]
-
-
-def _rotations(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    w, x, y, z = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)

@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.rotations import quaternions
 from climatenerf.core.storage import make_folder, write_bytes, write_json
 from climatenerf.scene.readers.ply import write_points
 from climatenerf.scene.scene import Scene, View
@@ -65,7 +65,7 @@ def export_colmap(scene: Scene, folder: Path) -> Path:
     tracks: dict[int, list[str]] = {}
     for number, view in enumerate(scene.views, 1):
         w2c = np.linalg.inv(view.c2w)
-        pose = " ".join(map(_text, [*quaternion(w2c[:3, :3]), *w2c[:3, 3]]))
+        pose = " ".join(map(_text, [*quaternions(w2c[:3, :3]), *w2c[:3, 3]]))
         images.append(f"{number} {pose} {view.camera + 1} {view.name}")
         marks = []
         if scene.points is not None and view.seen is not None and len(view.seen):
@@ -82,33 +82,6 @@ def export_colmap(scene: Scene, folder: Path) -> Path:
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
         write_bytes(model / f"{name}.txt", ("\n".join(lines) + "\n").encode())
     return model
-
-
-def quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """(w, x, y, z) with w >= 0, from the largest of the four components for accuracy."""
-    r = rotation
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    # Four times the products of each pair of components.
-    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
-    table = np.array(
-        [
-            [squares[0], wx, wy, wz],
-            [wx, squares[1], xy, xz],
-            [wy, xy, squares[2], yz],
-            [wz, xz, yz, squares[3]],
-        ]
-    )
-    q = table[int(np.argmax(squares))]
-    q = q / np.linalg.norm(q)
-    return -q if q[0] < 0 else q
 
 
 def _colmap_camera(camera: Camera) -> tuple[str, list[float]]:

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.rotations import rotation_matrices
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.scene import View
 
@@ -204,17 +205,9 @@ def _pose(q: list[float], t: list[float], name: str, where: str) -> Float[np.nda
             f"The pose of {name} in {where} is not finite or far too large; remove that picture or "
             "pose it again."
         )
-    norm = float(np.linalg.norm(q))
-    if norm < 1e-6:
+    if np.linalg.norm(q) < 1e-6:
         raise UserError(f"The pose of {name} in {where} has a zero quaternion; pose it again.")
-    w, x, y, z = np.array(q) / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = rotation_matrices(np.array(q))
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T
     c2w[:3, 3] = -rotation.T @ np.array(t)
