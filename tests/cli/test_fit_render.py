@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 from importlib.resources import files
 from pathlib import Path
 
@@ -305,6 +306,28 @@ def test_parts_in_any_order_are_joined_to_the_movie_of_one_render(run_folder, tm
         if path.is_file():
             same = tmp_path / "parts" / path.relative_to(tmp_path / "whole")
             assert same.read_bytes() == path.read_bytes(), path
+
+
+@pytest.mark.slow
+def test_processes_render_parts_of_a_run_and_one_is_killed(run_folder, tmp_path):
+    flags = ["--size", "48x27", "--frames", "6", "--flood.level", "0.3 m", "--snow.depth", "9 cm"]
+
+    def start(out, *words):
+        command = [sys.executable, "-m", "climatenerf", "render", run_folder, "-o", tmp_path / out]
+        return subprocess.Popen([*map(str, command), *flags, *words], stderr=subprocess.DEVNULL)
+
+    assert start("whole").wait() == 0
+    killed, other = start("parts", "--part", "1/2"), start("parts", "--part", "2/2")
+    while killed.poll() is None and not (tmp_path / "parts" / "frames" / "0000.png").exists():
+        time.sleep(0.01)
+    killed.kill()
+    killed.wait()
+    assert other.wait() == start("parts", "--part", "1/2").wait() == 0
+    joins = [start("parts", "--join") for _ in range(2)]
+    assert [each.wait() for each in joins] == [0, 0]
+    for path in (p for p in (tmp_path / "whole").rglob("*") if p.is_file()):
+        same = tmp_path / "parts" / path.relative_to(tmp_path / "whole")
+        assert same.read_bytes() == path.read_bytes(), path
 
 
 def test_a_part_with_other_flags_leaves_an_unfinished_render_alone(run_folder, tmp_path, capsys):

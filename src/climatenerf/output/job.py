@@ -297,6 +297,7 @@ def render_frames(
     """
     indices = list(indices)
     check_folder(job, out, preview)
+    render_folder.continue_promotion(out, job.key)
     missing = missing_frames(job, out, indices)
     if not missing:
         return
@@ -341,6 +342,7 @@ def join(
     Raises:
         UserError: frames are missing, ffmpeg fails, or a disk error.
     """
+    render_folder.continue_promotion(out, job.key)
     missing = missing_frames(job, out)
     if missing:
         first = ", ".join(f"{index:04d}" for index in missing[:5])

@@ -231,8 +231,8 @@ def commit_frame(
 def promote(out: Path, key: str) -> None:
     """Move a complete render from `next` into `out`; call it with the lock held.
 
-    An interrupted move continues with the next call: `out` then holds the new render already, and
-    `next` the rest of its files.
+    An interrupted move is finished by `continue_promotion`: `out` then holds the new render
+    already, and `next` the rest of its files.
     """
     source = out / NEXT
     waiting = held_render(source)
@@ -260,6 +260,19 @@ def promote(out: Path, key: str) -> None:
         if path.stem.isdecimal() and int(path.stem) >= held["frames"]:
             path.unlink(missing_ok=True)
     write_json(out / STATE / "render.json", {**held, "replaces": []})
+
+
+def continue_promotion(out: Path, key: str) -> None:
+    """Finish moving a complete render into `out`, if a process was killed while it did so."""
+
+    def begun() -> bool:
+        found = [held_render(folder) for folder in (out, out / NEXT)]
+        return all(held is not None and held["render"] == key for held in found)
+
+    if begun():
+        with locked(out):
+            if begun():
+                promote(out, key)
 
 
 def remove_abandoned(out: Path) -> None:

@@ -1,0 +1,63 @@
+"""Render jobs with a frame source that costs nothing, and processes that render or join them."""
+
+from pathlib import Path
+
+import numpy as np
+
+from climatenerf.core.cameras import Camera
+from climatenerf.output.job import RenderedFrame, RenderJob, frames_of_part, join, render_frames
+from climatenerf.paths.camera_path import CameraPath
+from climatenerf.scene import Scene
+from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.parameters import Smog, Weather
+
+WIDTH, HEIGHT = 32, 18
+SCENE = Scene(Path("/none"), "test", (), ())
+
+
+def make_job(frames: int = 8, visibility: float = 50.0, **changes) -> RenderJob:
+    """A camera that moves along x, in smog."""
+    c2w = np.repeat(np.eye(4)[None], frames, axis=0)
+    c2w[:, 0, 3] = np.arange(frames)
+    camera = Camera(WIDTH, HEIGHT, 20.0, 20.0, WIDTH / 2, HEIGHT / 2)
+    path = CameraPath(c2w, (camera,) * frames, "test")
+    weather = KeyframedWeather(Weather(smog=Smog(visibility=visibility)), {})
+    settings = {"layers": ("depth",), **changes}
+    return RenderJob("a run", path, 12.0, weather, **settings)
+
+
+def noise_of(job: RenderJob):
+    """A frame source whose pictures depend on the job and the index alone."""
+
+    def render(index, preview):
+        rng = np.random.default_rng([int(job.key[:8], 16), index])
+        picture = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+        names = ("depth", "water_depth", "transmittance", "snow_thickness")
+        layers = {name: rng.random((HEIGHT, WIDTH), np.float32) for name in names}
+        layers |= {f"mask_{name}": rng.random((HEIGHT, WIDTH)) for name in ("water", "snow")}
+        if preview is not None:
+            preview(picture)
+        return RenderedFrame(picture, layers, {"fact": 1.5})
+
+    return render
+
+
+def render_part(out: Path, part: tuple[int, int], frames: int) -> None:
+    """Entry point of a process that renders a part."""
+    job = make_job(frames)
+    render_frames(job, out, lambda: noise_of(job), frames_of_part(job, part))
+
+
+def join_parts(out: Path, frames: int) -> None:
+    """Entry point of a process that joins."""
+    join(make_job(frames), SCENE, out)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    """All files of a render by relative path, but for the lock and what a killed process left."""
+    found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
+    return {
+        name: path.read_bytes()
+        for name, path in found.items()
+        if name != ".frames/lock" and not name.startswith(".frames/unfinished-")
+    }
