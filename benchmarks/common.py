@@ -1,4 +1,4 @@
-"""What the benchmark scripts share: timing, the machine's description, JSON on standard output."""
+"""Shared by the benchmark scripts: timing, memory, a description of the machine, JSON output."""
 
 import importlib.metadata
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 
 from climatenerf.cli import THREADING
 
-# As the command line does, and before torch is imported.
+# As in the command line; torch reads them when it is imported.
 for variable, value in THREADING.items():
     os.environ.setdefault(variable, value)
 
@@ -22,7 +22,16 @@ PYTHON = sys.executable
 
 
 def measure(job: Callable[[], object], repeats: int = 5, warm_up: int = 1) -> dict[str, float]:
-    """Seconds of `job`: median and spread over `repeats`, after `warm_up` runs not counted."""
+    """Time a job.
+
+    Args:
+        job: called `warm_up` times, then `repeats` times.
+        repeats: number of timed calls.
+        warm_up: number of calls before them that are not timed.
+
+    Returns:
+        Seconds, as `spread`.
+    """
     for _ in range(warm_up):
         job()
     seconds = []
@@ -34,25 +43,40 @@ def measure(job: Callable[[], object], repeats: int = 5, warm_up: int = 1) -> di
 
 
 def spread(values: list[float]) -> dict[str, float]:
-    """Median, extremes and count."""
+    """Return median, extremes and count of some values."""
     return {
         "median": statistics.median(values),
-        "least": min(values),
-        "most": max(values),
+        "min": min(values),
+        "max": max(values),
         "repeats": len(values),
     }
 
 
 def command(*words: str) -> str:
-    """Runs `climatenerf WORDS` in a process of its own; returns what it printed."""
+    """Run `climatenerf WORDS` in a process of its own; return its standard output."""
+    return output(["-m", "climatenerf", *words])
+
+
+def output(words: list[str], environment: dict[str, str] | None = None) -> str:
+    """Run Python with arguments in a process of its own; return its standard output."""
     done = subprocess.run(
-        [PYTHON, "-m", "climatenerf", *words], stdout=subprocess.PIPE, text=True, check=True
+        [PYTHON, *words], stdout=subprocess.PIPE, text=True, check=True, env=environment
     )
     return done.stdout
 
 
+def peak_bytes(words: list[str], environment: dict[str, str] | None = None) -> float:
+    """Run Python with arguments in a process of its own; return its peak resident memory."""
+    child = subprocess.Popen([PYTHON, *words], stdout=subprocess.DEVNULL, env=environment)
+    _, status, usage = os.wait4(child.pid, 0)
+    if status:
+        sys.exit(f"`python {' '.join(words)}` failed; its messages are above")
+    # Linux counts in KiB, macOS in bytes.
+    return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 def machine() -> dict[str, object]:
-    """The processor and how busy it was."""
+    """Describe the processor, the usable cores and the load."""
     name = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -63,15 +87,15 @@ def machine() -> dict[str, object]:
 
 
 def versions() -> dict[str, str]:
-    """Of Python and of what computes."""
+    """Return the versions of Python and of the libraries that compute."""
     found = {"python": platform.python_version()}
     return found | {p: importlib.metadata.version(p) for p in ("torch", "numpy", "numba")}
 
 
-MACHINE = machine()  # at the start: later the load is this benchmark's own
+MACHINE = machine()  # at import, since later the load includes the benchmark's own
 
 
 def report(question: str, results: object, seed: int | None = None) -> None:
-    """Prints the answer as JSON."""
+    """Print results as JSON, with the machine and versions."""
     answer = {"question": question, "machine": MACHINE, "versions": versions(), "seed": seed}
     print(json.dumps({**answer, "results": results}, indent=1))
