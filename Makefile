@@ -41,4 +41,5 @@ test-slow: $(SETUP)
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/pyright

@@ -1,16 +1,33 @@
-"""The examples of the library run as they are and make what they say."""
+"""The examples of the library run unchanged and write the files that they name."""
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import climatenerf
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
-pytestmark = pytest.mark.slow
+
+@pytest.mark.parametrize("name", ["01_fit_and_flood", "02_weather_file"])
+def test_the_examples_use_public_names_alone(name):
+    tree = ast.parse((EXAMPLES / f"{name}.py").read_text())
+    modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
+    modules |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
+    assert {m for m in modules if m.startswith("climatenerf")} == {"climatenerf"}
+    used = {
+        n.attr
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name)
+        if n.value.id == "climatenerf"
+    }
+    assert used <= set(dir(climatenerf))
 
 
+@pytest.mark.slow
 def test_the_examples_run_one_after_the_other(tmp_path):
     run = tmp_path / "run"
     told = {}
@@ -23,7 +40,7 @@ def test_the_examples_run_one_after_the_other(tmp_path):
         done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
         assert done.returncode == 0, done.stderr
         told[name] = done.stdout
-    assert (run / "flooded.png").stat().st_size > 1000
+    assert (run / "flood" / "frames" / "0000.png").stat().st_size > 1000
     assert (run / "weather.jpg").stat().st_size > 1000
     assert (run / "ash.png").stat().st_size > 1000
     assert "water on 0%" not in told["01_fit_and_flood"]

@@ -1,7 +1,36 @@
 """climatenerf: photos of a real place in; smog, flood and snow on that place out.
 
-Importing this package loads neither torch nor numba; the command line and the sub-packages do so
-when they need them.
+The public names are listed by `dir(climatenerf)` and described in `climatenerf.api`. Importing this
+package loads neither torch nor numba; each name is imported when it is first used.
 """
 
+import importlib
+
 __version__ = "0.1.0"
+
+_PUBLIC = {
+    "open_scene": "climatenerf.api",
+    "fit": "climatenerf.api",
+    "load_run": "climatenerf.api",
+    "render_movie": "climatenerf.api",
+    "evaluate": "climatenerf.api",
+    "Weather": "climatenerf.weather.parameters",
+    "Smog": "climatenerf.weather.parameters",
+    "Flood": "climatenerf.weather.parameters",
+    "Snow": "climatenerf.weather.parameters",
+    "Sun": "climatenerf.weather.parameters",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names, and no submodule that happens to be loaded."""
+    return sorted([*_PUBLIC, *(name for name in globals() if name.startswith("__"))])

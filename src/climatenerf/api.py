@@ -175,6 +175,9 @@ def fit(
 def load_run(folder: PathText) -> Run:
     """Read a run folder that `fit` made.
 
+    Args:
+        folder: the run folder.
+
     Raises:
         UserError: the folder holds no run, a damaged one, or one of a newer version.
     """

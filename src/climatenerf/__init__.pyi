@@ -1,0 +1,13 @@
+# For type checkers and editors: what `__init__.py` imports when it is first used.
+from climatenerf.api import evaluate as evaluate
+from climatenerf.api import fit as fit
+from climatenerf.api import load_run as load_run
+from climatenerf.api import open_scene as open_scene
+from climatenerf.api import render_movie as render_movie
+from climatenerf.weather.parameters import Flood as Flood
+from climatenerf.weather.parameters import Smog as Smog
+from climatenerf.weather.parameters import Snow as Snow
+from climatenerf.weather.parameters import Sun as Sun
+from climatenerf.weather.parameters import Weather as Weather
+
+__version__: str

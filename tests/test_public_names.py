@@ -1,0 +1,51 @@
+"""The names that a user of the library may rely on."""
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import climatenerf
+
+FUNCTIONS = ["evaluate", "fit", "load_run", "open_scene", "render_movie"]
+CLASSES = ["Flood", "Smog", "Snow", "Sun", "Weather"]
+
+
+def public(names):
+    return [name for name in names if not name.startswith("__")]
+
+
+def test_dir_lists_the_public_names_and_loads_nothing_heavy():
+    code = (
+        "import sys, climatenerf; from climatenerf import cli, core; names = dir(climatenerf);"
+        "print(*names); climatenerf.Weather(flood=climatenerf.Flood(level=0.5));"
+        "print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    names, modules = done.stdout.splitlines()
+    assert public(names.split()) == sorted(FUNCTIONS + CLASSES)
+    assert "__version__" in names.split()
+    assert not {"torch", "numba", "scipy"} & set(modules.split())
+
+
+@pytest.mark.parametrize("name", FUNCTIONS + CLASSES)
+def test_each_public_name_is_documented(name):
+    found = getattr(climatenerf, name)
+    assert inspect.getdoc(found)
+    if name in FUNCTIONS:
+        text = inspect.getdoc(found)
+        assert all(f"{each}:" in text for each in inspect.signature(found).parameters if each)
+
+
+def test_the_stub_for_type_checkers_names_the_same():
+    stub = ast.parse(Path(climatenerf.__file__).with_suffix(".pyi").read_text())
+    names = [n.names[0].asname for n in stub.body if isinstance(n, ast.ImportFrom)]
+    assert sorted(names) == sorted(FUNCTIONS + CLASSES)
+
+
+def test_another_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'flood'"):
+        climatenerf.flood  # noqa: B018
