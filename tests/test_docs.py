@@ -130,3 +130,12 @@ def test_losses_in_pages_exist():
         assert used <= names, f"{name_of(page)}: {used - names}"
     described = re.findall(r"\(`(\w+)`\)", (ROOT / "docs" / "physics.md").read_text())
     assert names <= set(described), names - set(described)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_python_in_pages_uses_public_names(page):
+    for language, block in FENCE.findall(page.read_text()):
+        if language == "python":
+            compile(block, name_of(page), "exec")
+            used = set(re.findall(r"\bclimatenerf\.(\w+)", block))
+            assert used <= set(dir(climatenerf)), used - set(dir(climatenerf))
