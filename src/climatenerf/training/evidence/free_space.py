@@ -1,12 +1,13 @@
-"""What photos, labels and sparse points say of space before anything is learned.
+"""Free-space constraint: where space must be empty, and where density near the ground is an error.
 
-Cells that no photo has in view stay empty, as do those right before a camera, those that photos
-agree to be before the sky, unless a point lies by them, and those above points of the ground that
-most photos see ground behind. Elsewhere matter above the ground costs, but is not forbidden: a
-crest may hide a ditch and what is in it, and the map of the ground does not know every step. What
-stands on the ground is spared, with a rim about it: a trunk is narrower than the haze that becomes
-one. Once the field has learned classes of its own they say better what stands, and lumps in the rim
-are pulled as well.
+Cells of the occupancy grid are forced empty if no view sees them, if they lie right in front of a
+camera, if the views agree that only sky is behind them, or if they are above the ground and most
+views see ground behind them. Cells near sparse points are protected from the first three.
+
+Elsewhere, density above the ground is penalised but allowed: a crest may hide a ditch and what is
+in it, and the ground height does not resolve every step. Obstacles on the ground are exempt, with a
+margin of one cell: at first a trunk is haze wider than the trunk. Once the field has learned its
+own classes, density in that margin that it classifies as ground is penalised too.
 """
 
 import torch
@@ -24,57 +25,78 @@ from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.static_shapes import Rooms
 
+CHUNK = 2**18  # cells looked up at once, to bound the memory of their centres
+SAME_POINT = 1e-4  # grid units within which two measurements are of one point
+STEP = 0.05  # grid units along a ray over which its approach to the ground is measured
+MIN_APPROACH = 0.02  # descent over distance; flatter rays give no position, at worst 0/0
+MIN_POINTS = 20  # of a photo, for its camera's clearance
+NEAR_QUANTILE = 0.02  # of the distances of a photo's points: the nearest, without outliers
+CLEARANCE_FACTOR = 0.8  # of that distance; matter closer to the camera would show points
+
 
 class FreeSpace:
-    """Bars cells of a field's occupancy, and knows where sky and ground are seen."""
+    """Forces cells of a field's occupancy empty; finds samples off the ground."""
 
     def __init__(
         self,
         field: Field,
         pixels: TrainingPixels,
-        points: SparseDepth | None,
+        sparse: SparseDepth | None,
         settings: FitSettings,
     ):
-        self.field, self.pixels, self.points = field, pixels, points
-        self.carves, self.moves = settings.free_space, settings.refine_poses
-        self.solid = to_device(SOLID)
-        self.knows_ground = settings.losses.ground_height > 0 and points is not None
+        """Fit the ground and force the first cells empty.
+
+        Args:
+            field: Its occupancy is changed in place.
+            pixels: The training photos, with label hulls if there are labels.
+            sparse: Sparse depth of those photos.
+            settings: `free_space` switches forced empty cells, `losses.ground_height` the ground.
+        """
+        self.field, self.pixels, self.sparse = field, pixels, sparse
+        self.enabled, self.poses_move = settings.free_space, settings.refine_poses
+        self.class_of_logit = to_device(SOLID)
+        self.uses_ground = settings.losses.ground_height > 0 and sparse is not None
         self.fit_ground()
         self.force_empty()
 
     def fit_ground(self) -> None:
-        """Draws the map of the ground, and notes points that stand on it, and steps off it."""
-        self.ground, self.steps = None, torch.zeros(0, 3)
-        places, lies = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
-        if self.knows_ground and self.points is not None:
-            places, lies = self.classify_points(self.points)
-            self.ground = fit_ground_height(places[lies])
+        """Fit the ground height; split the points into ground, steps of the ground and obstacles.
+
+        Sets `ground` (None if it is not used or not found), and in grid units `step_points`, ground
+        points that the height cannot follow, and `obstacle_points`, all that are not ground.
+        """
+        self.ground, self.step_points = None, torch.zeros(0, 3)
+        q, on_ground = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
+        if self.uses_ground and self.sparse is not None:
+            q, on_ground = self.classify_points(self.sparse)
+            self.ground = fit_ground_height(q[on_ground])
         if self.ground is not None:
-            # Steps and banks that the map cannot follow are not to be levelled.
-            steps = lies & (self.ground.height_above(places)[0].abs() > self.ground.tolerance)
-            self.steps, lies = places[steps], lies & ~steps
-        self.standing = places[~lies]
-        self.hull = None
+            # Steps and banks must not be flattened.
+            height = self.ground.height_above(q)[0]
+            is_step = on_ground & (height.abs() > self.ground.tolerance)
+            self.step_points, on_ground = q[is_step], on_ground & ~is_step
+        self.obstacle_points = q[~on_ground]
+        self.obstacle_hull = None
 
     def classify_points(
-        self, points: SparseDepth
+        self, sparse: SparseDepth
     ) -> tuple[Float[Tensor, "p 3"], Bool[Tensor, "p"]]:
-        """Each point once, in grid units, and whether most views that show it label it ground."""
-        lies = is_ground(self.pixels.label_towards(points.image, points.rays_d))
-        place = (self.field.to_grid(points.ends) / SAME).round()
-        once, row, views = place.unique(dim=0, return_inverse=True, return_counts=True)
-        votes = torch.zeros(once.shape[0]).index_add(0, row, lies.float())
-        return once * SAME, votes > 0.5 * views
+        """Return each point once, in grid units, and whether most of its views label it ground."""
+        on_ground = is_ground(self.pixels.label_towards(sparse.image, sparse.rays_d))
+        rounded = (self.field.to_grid(sparse.points) / SAME_POINT).round()
+        unique, row, views = rounded.unique(dim=0, return_inverse=True, return_counts=True)
+        votes = torch.zeros(unique.shape[0]).index_add(0, row, on_ground.float())
+        return unique * SAME_POINT, votes > 0.5 * views
 
     def force_empty(self, everywhere: bool = True) -> None:
-        """Bars the cells that are known to be empty.
+        """Force cells of the occupancy empty; a forced cell stays so.
 
         Args:
-            everywhere: ask of all cells; else of those that are occupied, which is quicker.
+            everywhere: Test all cells; else only the occupied ones, which is faster.
         """
-        witness, occupancy = self.pixels.sky_hull, self.field.occupancy
+        hull, occupancy = self.pixels.sky_hull, self.field.occupancy
         self.rasterise_points()
-        if not self.carves:
+        if not self.enabled:
             return
         cells = torch.arange(occupancy.occupied.numel())
         if not everywhere:
@@ -83,94 +105,111 @@ class FreeSpace:
         x = centre * self.field.unit + self.field.centre
         radius = size * (self.field.unit * 3**0.5 / 2)
         empty = torch.zeros(cells.shape[0], dtype=torch.bool)
-        if not self.moves:  # cameras that are still to turn have something else in view
+        if not self.poses_move:  # poses still change: so do the frusta
             empty = ~intersects_frustum(x, radius, self.pixels.frusta)
             empty |= self.too_near_camera(x, radius)
-        if witness is not None:
-            empty |= witness.consensus(x, radius)
-        barred = occupancy.barred.view(-1)
-        barred[cells[empty]] = True
-        barred[_grown(self.protected).view(-1)] = False
+        if hull is not None:
+            empty |= hull.consensus(x, radius)
+        forced = occupancy.barred.view(-1)
+        forced[cells[empty]] = True
+        forced[_dilate(self.protected).view(-1)] = False
         if self.ground is not None:
-            high = self.ground.clears(centre, size * (3**0.5 / 2)).nonzero()[:, 0]
-            high = high[self.in_ground_hull(centre[high], radius[high])]
-            high = high[~self.obstacle.view(-1)[cells[high]]]
-            barred[cells[high]] = True
-        occupancy.occupied.view(-1)[barred] = 0
+            rows = self.ground.is_above_crests(centre, size * (3**0.5 / 2)).nonzero()[:, 0]
+            rows = rows[self.in_ground_hull(centre[rows], radius[rows])]
+            rows = rows[~self.obstacle.view(-1)[cells[rows]]]
+            forced[cells[rows]] = True
+        occupancy.occupied.view(-1)[forced] = 0
 
     def too_near_camera(
         self, x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]
     ) -> Bool[Tensor, "n"]:
-        """Whether balls (world m) lie before a camera and much nearer than all that it shows.
+        """Return which balls lie in front of a camera, much closer than all it observes.
 
-        What fills a corner of a few photos may as well be a dark lump before them; other photos
-        hardly see so small a place. But points are found on what is truly near, except for smooth
-        ground, which is spared where its map is known.
+        A dark lump there can explain a corner of a few photos, and other photos hardly see so small
+        a volume. Near surfaces have sparse points of their own. Smooth ground may have none, so
+        space near the ground height is excluded.
+
+        Args:
+            x: Ball centres, world m.
+            radius: Ball radii, m.
         """
-        if self.points is None:
+        if self.sparse is None:
             return torch.zeros(x.shape[0], dtype=torch.bool)
         count = self.pixels.c2w.shape[0]
-        reach = torch.zeros(count)
+        clearance = torch.zeros(count)
         for image in range(count):
-            depth = self.points.depth[self.points.image == image]
+            depth = self.sparse.depth[self.sparse.image == image]
             if depth.numel() >= MIN_POINTS:
-                reach[image] = IN_THE_WAY * depth.quantile(NEAREST)
-        eyes = self.pixels.c2w[:, :3, 3]
-        before = within_camera_range(x, radius, self.pixels.frusta, eyes, reach)
+                clearance[image] = CLEARANCE_FACTOR * depth.quantile(NEAR_QUANTILE)
+        centres = self.pixels.c2w[:, :3, 3]
+        near = within_camera_range(x, radius, self.pixels.frusta, centres, clearance)
         if self.ground is not None:
-            over, known = self.ground.height_above(self.field.to_grid(x))
-            before &= ~known | (over > radius / self.field.unit + self.ground.tolerance)
-        return before
+            height, valid = self.ground.height_above(self.field.to_grid(x))
+            near &= ~valid | (height > radius / self.field.unit + self.ground.tolerance)
+        return near
 
     def rasterise_points(self) -> None:
-        """Notes the occupancy's cells in which sparse points lie, and those by what stands."""
-        ends = torch.zeros(0, 3) if self.points is None else self.field.to_grid(self.points.ends)
-        self.protected = self.cells_containing(ends)
-        if self.hull is None:
-            self.hull = self.find_obstacles()
-        while self.hull.shape[1] < self.field.occupancy.side:  # asking of all again takes seconds
-            for axis in (1, 2, 3):
-                self.hull = self.hull.repeat_interleave(2, dim=axis)
-        self.obstacle = _grown(self.cells_containing(self.standing) | self.hull)
-        self.stepped = _grown(self.cells_containing(self.steps))
+        """Mark the cells of points, at the occupancy's present resolution.
 
-    def find_obstacles(self) -> Bool[Tensor, "k g g g"]:
-        """The occupancy's cells where most photos see what stands on the ground."""
-        occupancy, witness = self.field.occupancy, self.pixels.obstacle_hull
-        stands = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
-        if self.ground is None or witness is None:
-            return stands
-        for cells in torch.arange(stands.numel()).split(AT_ONCE):
+        Sets `protected` (cells of sparse points), `obstacle` and `near_step` (each with a margin of
+        one cell), all [cascades side side side].
+        """
+        q = torch.zeros(0, 3) if self.sparse is None else self.field.to_grid(self.sparse.points)
+        self.protected = self.cells_containing(q)
+        if self.obstacle_hull is None:
+            self.obstacle_hull = self.find_obstacles()
+        # Upsample: to find the obstacles again at a finer resolution takes seconds.
+        while self.obstacle_hull.shape[1] < self.field.occupancy.side:
+            for axis in (1, 2, 3):
+                self.obstacle_hull = self.obstacle_hull.repeat_interleave(2, dim=axis)
+        self.obstacle = _dilate(self.cells_containing(self.obstacle_points) | self.obstacle_hull)
+        self.near_step = _dilate(self.cells_containing(self.step_points))
+
+    def find_obstacles(self) -> Bool[Tensor, "cascades side side side"]:
+        """Return the cells near the ground height in which most views see an obstacle."""
+        occupancy, hull = self.field.occupancy, self.pixels.obstacle_hull
+        obstacle = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
+        if self.ground is None or hull is None:
+            return obstacle
+        for cells in torch.arange(obstacle.numel()).split(CHUNK):
             centre, _ = occupancy.cell_centres(cells)
-            near = self.ground.height_above(centre)[1].nonzero()[:, 0]
-            x = centre[near] * self.field.unit + self.field.centre
-            stands.view(-1)[cells[near]] = witness.consensus(x, torch.zeros(near.shape[0]))
-        return stands
+            valid = self.ground.height_above(centre)[1].nonzero()[:, 0]
+            x = centre[valid] * self.field.unit + self.field.centre
+            obstacle.view(-1)[cells[valid]] = hull.consensus(x, torch.zeros(valid.shape[0]))
+        return obstacle
 
     def cells_containing(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
-        """The occupancy's cells in which places (grid units) lie."""
-        held = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
+        """Return the occupancy's cells that contain positions q (grid units)."""
+        marked = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
         cells, inside = self.field._cells(q)
-        held.view(-1)[cells[inside]] = True
-        return held
+        marked.view(-1)[cells[inside]] = True
+        return marked
 
     def in_sky_hull(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Whether photos agree to see sky behind places x (world m), and no point is by them."""
-        witness = self.pixels.sky_hull
-        if witness is None or not self.carves:
+        """Return which positions x (world m) have only sky behind them by consensus.
+
+        False in cells of sparse points; true everywhere if labels do not carve.
+        """
+        hull = self.pixels.sky_hull
+        if hull is None or not self.enabled:
             return torch.ones(x.shape[0], dtype=torch.bool)
-        agreed = witness.consensus(x, torch.zeros(x.shape[0]))
+        empty = hull.consensus(x, torch.zeros(x.shape[0]))
         cells, _ = self.field._cells(self.field.to_grid(x))
-        return agreed & ~self.protected.view(-1)[cells]
+        return empty & ~self.protected.view(-1)[cells]
 
     def in_ground_hull(
         self, q: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]
     ) -> Bool[Tensor, "n"]:
-        """Whether photos agree to see ground behind balls about q (grid units); radius in m."""
-        witness = self.pixels.ground_hull
-        if witness is None:
+        """Return which balls have only ground behind them by consensus.
+
+        Args:
+            q: Ball centres, grid units.
+            radius: Ball radii, m.
+        """
+        hull = self.pixels.ground_hull
+        if hull is None:
             return torch.zeros(q.shape[0], dtype=torch.bool)
-        return witness.consensus(q * self.field.unit + self.field.centre, radius)
+        return hull.consensus(q * self.field.unit + self.field.centre, radius)
 
     def ground_offsets(
         self,
@@ -178,55 +217,56 @@ class FreeSpace:
         rays_d: Float[Tensor, "n 3"],
         t: Float[Tensor, "n"],
         rooms: Rooms,
-        classed: bool = False,
+        use_classes: bool = False,
     ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Bool[Tensor, "k"]]:
-        """Which samples of rays to the ground lie too far from it, and where (t) they should.
+        """Find samples of rays labelled ground that lie off the ground, and their target depth.
 
-        Only those where most photos see ground, away from what stands on it, and with `classed`
-        those that the field takes for ground, away from steps; t in grid units.
+        A sample is penalised if most views see ground behind it and it is away from obstacles; with
+        `use_classes` also if the field classifies it as ground and it is away from steps.
+
+        Args:
+            q: Sample positions, grid units.
+            rays_d: Unit directions of their rays.
+            t: Ray length of the samples, grid units.
+            rooms: Fixed-capacity buffers of the step.
+            use_classes: Whether the field's own classes are reliable yet.
 
         Returns:
-            Samples off the ground (in a fixed room the last again and again), where they should be,
-            and to which of them all the rest applies.
+            Indices of samples off the ground (a fixed-capacity buffer repeats the last one), the
+            ray length (grid units) at which their ray meets the ground, and which of them are
+            penalised.
         """
         if self.ground is None:
             return torch.zeros(0, dtype=torch.long), t[:0], t[:0] > 0
-        over, known = self.ground.height_above(q)
-        ahead, _ = self.ground.height_above(q + STEP * rays_d)
-        nearing = (over - ahead) / STEP
-        off = over.sign() * (over.abs() - self.ground.tolerance).clamp_min(0.0)
-        far = rooms.chosen("far", known & (nearing > MIN_NEARING) & (off != 0))
-        cells, _ = self.field._cells(q[far])
-        pulled = torch.zeros(far.shape[0], dtype=torch.bool)
-        if classed:
-            pulled = self.classified_as_ground(q[far]) & ~self.stepped.view(-1)[cells]
-        rest = rooms.chosen("rest", ~pulled & ~self.obstacle.view(-1)[cells])
-        pulled[rest] = self.in_ground_hull(q[far[rest]], torch.zeros(rest.shape[0]))
-        # Rays that do not near the ground, in a room's rest: 0/0.
-        on = off[far] / nearing[far].clamp_min(MIN_NEARING)
-        return far, (t[far] + on).clamp_min(0.0), pulled
+        height, valid = self.ground.height_above(q)
+        height_ahead, _ = self.ground.height_above(q + STEP * rays_d)
+        approach = (height - height_ahead) / STEP
+        excess = height.sign() * (height.abs() - self.ground.tolerance).clamp_min(0.0)
+        off = rooms.chosen("far", valid & (approach > MIN_APPROACH) & (excess != 0))
+        cells, _ = self.field._cells(q[off])
+        penalised = torch.zeros(off.shape[0], dtype=torch.bool)
+        if use_classes:
+            penalised = self.classified_as_ground(q[off]) & ~self.near_step.view(-1)[cells]
+        rest = rooms.chosen("rest", ~penalised & ~self.obstacle.view(-1)[cells])
+        penalised[rest] = self.in_ground_hull(q[off[rest]], torch.zeros(rest.shape[0]))
+        # The filler of a buffer may be a ray that does not approach the ground: 0/0.
+        to_ground = excess[off] / approach[off].clamp_min(MIN_APPROACH)
+        return off, (t[off] + to_ground).clamp_min(0.0), penalised
 
     @torch.no_grad()
     def classified_as_ground(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Whether matter at q (grid units) is ground by the field's own classes."""
+        """Return where the field's own classes at q (grid units) are ground."""
         _, logits = self.field.surface_at(reference.contract(q))
-        return is_ground(self.solid[logits.argmax(-1)])
+        return is_ground(self.class_of_logit[logits.argmax(-1)])
 
 
 def is_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
-    """Whether merged classes are such as lie on the ground."""
+    """Return which merged classes are ground."""
     return torch.stack([label == kind for kind in GROUND]).any(0)
 
 
-def _grown(cells: Bool[Tensor, "k g g g"]) -> Bool[Tensor, "k g g g"]:
-    """Cells and their neighbours."""
+def _dilate(
+    cells: Bool[Tensor, "cascades side side side"],
+) -> Bool[Tensor, "cascades side side side"]:
+    """Return the cells and their 26 neighbours."""
     return torch.nn.functional.max_pool3d(cells[:, None].float(), 3, 1, padding=1)[:, 0] > 0
-
-
-AT_ONCE = 2**18  # cells that are asked about: their places take room
-SAME = 1e-4  # grid units within which two ends are one point
-STEP = 0.05  # grid units over which a ray nears the ground
-MIN_NEARING = 0.02  # way down over way along: flatter rays tell nothing, 0/0 at worst
-NEAREST = 0.02  # quantile of the distances of a photo's points that stands for the nearest,
-MIN_POINTS = 20  # where it has so many
-IN_THE_WAY = 0.8  # of that distance: what is nearer shows no point because it is not there

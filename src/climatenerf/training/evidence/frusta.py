@@ -1,7 +1,7 @@
-"""What cameras have in view at all, and what is so near before one that it would be in its way.
+"""View frusta: which space any camera sees, and which space lies too close in front of one.
 
-Of space outside every picture the photos say nothing. Matter that grows there only shelters the
-ground and blackens reflections, so it is left empty (as Instant-NGP does: Müller et al. 2022).
+Photos hold no information about space outside every frustum. Density that grows there only shadows
+the ground and darkens reflections, so that space is culled, as in Instant-NGP (Müller et al. 2022).
 """
 
 from collections.abc import Sequence
@@ -14,31 +14,32 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.device import to_device
 
-AT_ONCE = 800_000  # distances between places and views that fit into the cache
-BORDER = 64  # points along each side of a picture from which its pyramid of sight is found
-WIDE = 0.1  # least cosine from the axis that fits into a pyramid; beyond it all counts as in view
+CHUNK = 800_000  # distances between balls and views computed at once, to fit into the cache
+BORDER_SAMPLES = 64  # points along each side of an image from which its frustum is found
+MIN_COSINE = 0.1  # from the optical axis; a view with wider rays has no frustum and sees everything
 
 
 def frustum_planes(
     cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]
 ) -> Float[Tensor, "v 4 4"]:
-    """The four sides of each view's pyramid of sight, as planes.
+    """Return the four side planes of each view's frustum; the frustum starts at the camera centre.
 
     Args:
-        cameras: of each view; where distortion bends the picture's border, the pyramid holds it.
-        c2w: poses, world metres.
+        cameras: Of each view. Where lens distortion bends the image border, the frustum encloses
+            the border.
+        c2w: Camera poses, world m, OpenCV axes.
 
     Returns:
-        Rows (unit normal, offset) with normal . x + offset = metres outside; of a view too wide
-        for a pyramid, planes that have everything inside.
+        Per view four rows (unit normal, offset): normal . x + offset is the distance (m) of x
+        outside the plane. For a view too wide for a frustum, planes that contain all space.
     """
     planes = []
     for camera, pose in zip(cameras, np.asarray(c2w, np.float64), strict=True):
-        along = np.linspace(0, 1, BORDER)
-        ends = np.stack([np.zeros(BORDER), np.ones(BORDER)])
+        along = np.linspace(0, 1, BORDER_SAMPLES)
+        ends = np.stack([np.zeros(BORDER_SAMPLES), np.ones(BORDER_SAMPLES)])
         x, y = np.append(along[None].repeat(2, 0), ends), np.append(ends, along[None].repeat(2, 0))
         d = camera.directions(np.stack([x * camera.width, y * camera.height], axis=-1))
-        if d[:, 2].min() < WIDE:
+        if d[:, 2].min() < MIN_COSINE:
             planes.append(np.array([[0.0, 0.0, 0.0, -1e9]] * 4))
             continue
         slope = d[:, :2] / d[:, 2:]
@@ -51,33 +52,49 @@ def frustum_planes(
 
 
 def intersects_frustum(
-    x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], views: Float[Tensor, "v 4 4"]
+    x: Float[Tensor, "n 3"], radius: Float[Tensor, "n"], frusta: Float[Tensor, "v 4 4"]
 ) -> Bool[Tensor, "n"]:
-    """Whether balls about x (world m) with a radius (m) reach into any view's pyramid of sight."""
-    found, some = [], max(256, AT_ONCE // views.shape[0])
-    for place, reach in zip(x.split(some), radius.split(some), strict=True):
-        outside = torch.full((place.shape[0], views.shape[0]), -torch.inf)
-        for side in views.unbind(1):
-            outside = torch.maximum(outside, place @ side[:, :3].T + side[:, 3])
-        found.append(outside.amin(-1) < reach)
+    """Return which balls intersect the frustum of any view.
+
+    Args:
+        x: Ball centres, world m.
+        radius: Ball radii, m.
+        frusta: From `frustum_planes`.
+    """
+    found, size = [], max(256, CHUNK // frusta.shape[0])
+    for centres, radii in zip(x.split(size), radius.split(size), strict=True):
+        outside = torch.full((centres.shape[0], frusta.shape[0]), -torch.inf)
+        for side in frusta.unbind(1):
+            outside = torch.maximum(outside, centres @ side[:, :3].T + side[:, 3])
+        found.append(outside.amin(-1) < radii)
     return torch.cat(found)
 
 
 def within_camera_range(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
-    views: Float[Tensor, "v 4 4"],
-    eyes: Float[Tensor, "v 3"],
-    reach: Float[Tensor, "v"],
+    frusta: Float[Tensor, "v 4 4"],
+    camera_centres: Float[Tensor, "v 3"],
+    max_distance: Float[Tensor, "v"],
 ) -> Bool[Tensor, "n"]:
-    """Whether balls are wholly within a view's reach (m) of its eye, their middles in view."""
+    """Return which balls lie wholly closer to a view's camera than a distance, centres in view.
+
+    Args:
+        x: Ball centres, world m.
+        radius: Ball radii, m.
+        frusta: From `frustum_planes`.
+        camera_centres: Of each view, world m.
+        max_distance: Of each view, m; 0 excludes the view.
+    """
     found = torch.zeros(x.shape[0], dtype=torch.bool)
-    low, high = (eyes - reach[:, None]).amin(0), (eyes + reach[:, None]).amax(0)
+    low = (camera_centres - max_distance[:, None]).amin(0)
+    high = (camera_centres + max_distance[:, None]).amax(0)
     near = ((x > low) & (x < high)).all(-1).nonzero()[:, 0]
-    for some in near.split(max(256, AT_ONCE // views.shape[0])):
-        place, own = x[some], radius[some, None]
-        beyond = (place[:, None] - eyes).norm(dim=-1) + own - reach
-        for side in views.unbind(1):
-            beyond = torch.maximum(beyond, place @ side[:, :3].T + side[:, 3])
-        found[some] = beyond.amin(-1) < 0
+    for rows in near.split(max(256, CHUNK // frusta.shape[0])):
+        centres = x[rows]
+        farthest = (centres[:, None] - camera_centres).norm(dim=-1) + radius[rows, None]
+        outside = farthest - max_distance
+        for side in frusta.unbind(1):
+            outside = torch.maximum(outside, centres @ side[:, :3].T + side[:, 3])
+        found[rows] = outside.amin(-1) < 0
     return found

@@ -1,4 +1,4 @@
-"""Sparse points as measured depth: rays from photos to the points that they are known to show."""
+"""Sparse depth: rays from photos to the triangulated points that they observe."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,67 +15,80 @@ from climatenerf.training.dataset import TrainingPixels
 
 @dataclass(frozen=True)
 class SparseDepth:
-    """Rays that end on a sparse point."""
+    """Rays with a measured depth."""
 
     rays_o: Float[Tensor, "m 3"]
     """Camera centres, world m."""
     rays_d: Float[Tensor, "m 3"]
-    """Unit directions."""
+    """Unit directions, world axes."""
     depth: Float[Tensor, "m"]
-    """Ray length of the point, m."""
+    """Length of the ray up to the measured point, m."""
     image: Int[Tensor, "m"]
     """Index of the training image."""
 
     @property
-    def ends(self) -> Float[Tensor, "m 3"]:
-        """The points, world m."""
+    def points(self) -> Float[Tensor, "m 3"]:
+        """The measured points, world m."""
         return self.rays_o + self.depth[:, None] * self.rays_d
 
-    def select(self, which: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "SparseDepth":
-        """Those of the given rows, or of a mask."""
-        return SparseDepth(
-            self.rays_o[which], self.rays_d[which], self.depth[which], self.image[which]
-        )
+    def select(self, rows: Int[Tensor, "k"] | Bool[Tensor, "m"]) -> "SparseDepth":
+        """Return the rays of the given indices, or of a mask."""
+        return SparseDepth(self.rays_o[rows], self.rays_d[rows], self.depth[rows], self.image[rows])
 
     def draw(self, n: int, generator: torch.Generator) -> "SparseDepth":
-        """n random ones of them."""
+        """Return n random rays, drawn with replacement."""
         return self.select(integers(generator, 0, self.depth.shape[0], n))
 
 
 def read_sparse_depth(scene: Scene) -> SparseDepth | None:
-    """One ray for each point that each training view shows, or None if that is not known."""
+    """Return one ray for each sparse point that each training view observes.
+
+    Returns:
+        None if the scene has no points, or no view's observations are known.
+    """
     points = scene.points_world()
-    eyes, ends, of = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, int)]
+    origins, ends, images = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, int)]
     for index, view in enumerate(scene.of_split("train")):
         if points is not None and view.seen is not None:
             ends.append(points[view.seen])
-            of.append(np.full(len(ends[-1]), index))
-            eyes.append(np.broadcast_to(scene.c2w_world(view)[:3, 3], ends[-1].shape))
-    eye, end = np.concatenate(eyes), np.concatenate(ends)
-    depth = np.linalg.norm(end - eye, axis=-1)
-    # A point in the camera has no direction. The median, since stray points can be very far.
-    kept = depth > 1e-6 * np.median(depth) if depth.size else depth > 0
-    if not kept.any():
+            images.append(np.full(len(ends[-1]), index))
+            origins.append(np.broadcast_to(scene.c2w_world(view)[:3, 3], ends[-1].shape))
+    origin, end = np.concatenate(origins), np.concatenate(ends)
+    depth = np.linalg.norm(end - origin, axis=-1)
+    # A point at the camera centre has no direction. Relative to the median depth, since outliers
+    # can be very far away.
+    valid = depth > 1e-6 * np.median(depth) if depth.size else depth > 0
+    if not valid.any():
         return None
-    rays_d = (end - eye)[kept] / depth[kept, None]
+    rays_d = (end - origin)[valid] / depth[valid, None]
     return SparseDepth(
-        rays_o=to_device(eye[kept].astype(np.float32)),
+        rays_o=to_device(origin[valid].astype(np.float32)),
         rays_d=to_device(rays_d.astype(np.float32)),
-        depth=to_device(depth[kept].astype(np.float32)),
-        image=to_device(np.concatenate(of)[kept].astype(np.int64)),
+        depth=to_device(depth[valid].astype(np.float32)),
+        image=to_device(np.concatenate(images)[valid].astype(np.int64)),
     )
 
 
 def unmasked_sparse_depth(scene: Scene, pixels: TrainingPixels) -> SparseDepth | None:
-    """`read_sparse_depth` of what no mask hides: behind a mirror there is no wall at that depth."""
-    points = read_sparse_depth(scene)
-    if points is None:
+    """Return `read_sparse_depth` without the rays through masked pixels.
+
+    A masked mirror, for example, has points behind it where the wall is not.
+
+    Args:
+        scene: The capture.
+        pixels: Of its training views, with their masks.
+
+    Returns:
+        None if no ray is left.
+    """
+    sparse = read_sparse_depth(scene)
+    if sparse is None:
         return None
-    kept = pixels.usable_towards(points.image, points.rays_d)
-    return points.select(kept) if bool(kept.any()) else None
+    visible = pixels.usable_towards(sparse.image, sparse.rays_d)
+    return sparse.select(visible) if bool(visible.any()) else None
 
 
-def concatenate(some: Sequence[SparseDepth]) -> SparseDepth:
-    """The rays of all of them; at least one."""
-    every = zip(*(vars(each).values() for each in some), strict=True)
-    return SparseDepth(*(torch.cat(same) for same in every))
+def concatenate(parts: Sequence[SparseDepth]) -> SparseDepth:
+    """Return the rays of all parts, in order; at least one part is needed."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return SparseDepth(*(torch.cat(column) for column in columns))
