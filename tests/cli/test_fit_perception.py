@@ -66,7 +66,7 @@ def test_unknown_models_are_refused_before_the_fit(capture, fitted, capsys):
     assert fit_of(capture, "--mono-depth", capture / "absent") == 2
     assert "there is no model" in capsys.readouterr().err
     capsys.readouterr()
-    assert fit_of(capture, "--labels", "simple", "--mono-depth", "absent") == 2
+    assert fit_of(capture, "--labels", "heuristic", "--mono-depth", "absent") == 2
     err = capsys.readouterr().err
     assert "there is no model absent" in err and "labels:" not in err, "labels may take minutes"
     assert not fitted

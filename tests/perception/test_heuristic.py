@@ -1,4 +1,4 @@
-"""Sky by its looks and ground by its points: made pictures, the reference street, captures."""
+"""Heuristic labels on synthetic pictures, the reference street and real captures."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +8,14 @@ import pytest
 from PIL import Image
 from support.scene_builders import look_at, names_of, ring, write_colmap, write_images
 
-from climatenerf.perception.heuristic import GROUND, SKY, find_sky, shows_sky, simple_labels
-from climatenerf.perception.heuristic_ground import ground_points
+from climatenerf.perception.heuristic import (
+    GROUND,
+    SKY,
+    heuristic_labels,
+    is_outdoors,
+    segment_sky,
+)
+from climatenerf.perception.heuristic_ground import classify_ground_points
 from climatenerf.scene import Camera, Scene, View, read_scene
 from climatenerf.scene.images import load_labels
 
@@ -18,7 +24,7 @@ HEIGHT, WIDTH = 120, 200
 
 
 def upward(horizon=70, roll=0):
-    """Sine above the horizon of the rays of an upright or rolled camera."""
+    """Sine of the elevation of each pixel's ray, for an upright camera or one rolled by 90°."""
     rows = np.broadcast_to((horizon - np.arange(HEIGHT))[:, None] / 150, (HEIGHT, WIDTH))
     return np.rot90(rows, roll).astype(np.float32)
 
@@ -29,10 +35,10 @@ def textured(seed=0, base=(90, 80, 50)):
 
 
 def landscape(top=(110, 160, 235), low=(200, 215, 240), edge=50):
-    """A gradient sky over textured ground, and where the sky is."""
-    share = np.linspace(0, 1, edge)[:, None, None]
+    """Picture of a gradient sky over textured ground, and the true sky mask."""
+    fraction = np.linspace(0, 1, edge)[:, None, None]
     picture = textured()
-    picture[:edge] = np.rint(np.asarray(top) * (1 - share) + np.asarray(low) * share)
+    picture[:edge] = np.rint(np.asarray(top) * (1 - fraction) + np.asarray(low) * fraction)
     sky = np.zeros((HEIGHT, WIDTH), bool)
     sky[:edge] = True
     return picture, sky
@@ -44,83 +50,83 @@ NO_POINTS = np.zeros((HEIGHT, WIDTH), bool)
 @pytest.mark.parametrize(
     "colours", [((110, 160, 235), (200, 215, 240)), ((225, 228, 232), (245, 246, 248))]
 )
-def test_blue_and_overcast_skies_are_found_up_to_their_edge(colours):
+def test_blue_and_overcast_skies_are_segmented_up_to_a_margin(colours):
     picture, sky = landscape(*colours)
-    found = find_sky(picture, upward(), NO_POINTS)
+    found = segment_sky(picture, upward(), NO_POINTS)
     assert not (found & ~sky).any()
-    assert found.sum() > 0.9 * sky.sum() and not found[47:50].any(), "the edge is doubtful"
+    assert found.sum() > 0.9 * sky.sum() and not found[47:50].any(), "the margin is unknown"
 
 
-def test_a_camera_on_its_side_sees_the_same_sky():
+def test_segmentation_does_not_depend_on_camera_roll():
     picture, _ = landscape()
-    upright = find_sky(picture, upward(), NO_POINTS)
+    upright = segment_sky(picture, upward(), NO_POINTS)
     for roll in (1, 2, 3):
         turned = np.ascontiguousarray(np.rot90(picture, roll))
-        found = find_sky(turned, upward(roll=roll), np.rot90(NO_POINTS, roll))
+        found = segment_sky(turned, upward(roll=roll), np.rot90(NO_POINTS, roll))
         np.testing.assert_array_equal(np.rot90(found, -roll), upright)
 
 
-def test_wires_do_not_stop_the_sky_and_clouds_belong_to_it():
+def test_sky_continues_across_wires_and_includes_clouds():
     picture, sky = landscape()
     picture[20:22] = 40
     picture[30:40, 60:90] = 250
-    found = find_sky(picture, upward(), NO_POINTS)
+    found = segment_sky(picture, upward(), NO_POINTS)
     assert found[5:15].all() and found[27:29].all() and found[30:40, 60:90].all()
     assert not found[20:22].any() and not (found & ~sky).any()
 
 
-def test_what_goes_on_below_the_horizon_is_no_sky():
+def test_regions_continuing_below_the_horizon_are_not_sky():
     wall = np.full((HEIGHT, WIDTH, 3), 235, np.uint8)
     wall[100:] = textured()[100:]
-    assert not find_sky(wall, upward(), NO_POINTS).any()
+    assert not segment_sky(wall, upward(), NO_POINTS).any()
 
 
-def test_a_room_has_no_sky():
-    """Warm walls, a white wall no brighter than the window, and a ceiling in dim light."""
+def test_rooms_have_no_sky():
+    """A warm wall, a dim ceiling, and a white wall that is darker than the window."""
     for colour in ((240, 232, 215), (150, 152, 155)):
         picture = textured()
         picture[:50] = colour
-        assert not find_sky(picture, upward(), NO_POINTS).any()
+        assert not segment_sky(picture, upward(), NO_POINTS).any()
     picture = textured()
     picture[:50] = (215, 216, 218)
     picture[55:75, 50:190] = 255
-    assert not find_sky(picture, upward(), NO_POINTS).any()
+    assert not segment_sky(picture, upward(), NO_POINTS).any()
 
 
-def test_points_of_matter_are_no_sky():
+def test_pixels_near_sparse_points_are_not_sky():
     picture, _ = landscape()
-    some = NO_POINTS.copy()
-    some[10:20, 30:40] = True
-    found = find_sky(picture, upward(), some)
-    assert found.any() and not found[some].any()
-    some[:40] = True
-    assert not find_sky(picture, upward(), some).any()
+    matter = NO_POINTS.copy()
+    matter[10:20, 30:40] = True
+    found = segment_sky(picture, upward(), matter)
+    assert found.any() and not found[matter].any()
+    matter[:40] = True
+    assert not segment_sky(picture, upward(), matter).any(), "too much matter in the region"
 
 
-def test_a_capture_without_sky_is_not_outdoors(tmp_path):
+def test_capture_without_sky_is_not_outdoors(tmp_path):
     names = names_of(9)
-    write_images(tmp_path / "images", names)  # plain and dark
+    write_images(tmp_path / "images", names)  # uniform and dark
     write_colmap(tmp_path / "sparse" / "0", ring(9), names)
     scene = read_scene(tmp_path)
-    assert not shows_sky(scene)
-    assert (simple_labels(scene.views[0], scene, ground_points(scene)) == 255).all()
+    assert not is_outdoors(scene)
+    assert (heuristic_labels(scene.views[0], scene, classify_ground_points(scene)) == 255).all()
 
 
 @pytest.mark.skipif(not STREET.is_dir(), reason="the reference street is not in this checkout")
-def test_sky_of_the_street_is_sky():
+def test_sky_precision_and_recall_on_the_reference_street():
     scene = read_scene(STREET, holdout="0")
-    assert shows_sky(scene)
-    right = wrong = missed = 0
+    assert is_outdoors(scene)
+    correct = wrong = missed = 0
     for view in scene.views[::7]:
-        labels = simple_labels(view, scene, None)
+        labels = heuristic_labels(view, scene, None)
         assert set(np.unique(labels)) <= {SKY, 255}
         truth = load_labels(view, scene) == SKY
         found = labels == SKY
-        right += (found & truth).sum()
+        correct += (found & truth).sum()
         wrong += (found & ~truth).sum()
         missed += (truth & ~found).sum()
-    assert right / (right + wrong) > 0.999
-    assert right / (right + missed) > 0.7
+    assert correct / (correct + wrong) > 0.999
+    assert correct / (correct + missed) > 0.7
 
 
 BOX = np.array([[-0.6, -0.6, 0.0], [0.6, 0.6, 1.1]])
@@ -128,7 +134,7 @@ CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
 
 
 def first_hits(rays, origin, slope):
-    """Distance along rays to the box and to the ground z = slope x, infinite where missed."""
+    """Ray lengths to the box and to the ground z = slope x; infinite for a miss."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = (BOX - origin) / rays[..., None, :]
         enter, leave = ends.min(axis=-2).max(axis=-1), ends.max(axis=-2).min(axis=-1)
@@ -139,9 +145,9 @@ def first_hits(rays, origin, slope):
 
 @pytest.fixture(params=[0.0, 0.15], ids=["level", "slope"])
 def yard(tmp_path, request):
-    """A box on the ground amid nine cameras, points on both, and what each pixel shows.
+    """A box on the ground among nine cameras, points on both, and the true class of each pixel.
 
-    The box looks like the ground: what tells them apart are the points alone.
+    Box and ground have the same colour, so only the points distinguish them.
     """
     slope, random = request.param, np.random.default_rng(0)
     ground = random.uniform(-7, 7, (2500, 3))
@@ -159,11 +165,11 @@ def yard(tmp_path, request):
         pose = look_at(pose[:3, 3] + (0, 0, slope * pose[0, 3]), (0, 0, 0.5))
         near, far = first_hits(CAMERA.directions() @ pose[:3, :3].T, pose[:3, 3], slope)
         truths.append(np.where(np.isinf(near) & np.isinf(far), 2, near < far))
-        way = points - pose[:3, 3]
-        pixels = CAMERA.project(way @ pose[:3, :3])
+        offset = points - pose[:3, 3]
+        pixels = CAMERA.project(offset @ pose[:3, :3])
         inside = ((pixels >= 0) & (pixels < (160, 120))).all(axis=-1)
-        length = np.linalg.norm(way, axis=-1)
-        hit = np.minimum(*first_hits(way / length[:, None], pose[:3, 3], slope))
+        length = np.linalg.norm(offset, axis=-1)
+        hit = np.minimum(*first_hits(offset / length[:, None], pose[:3, 3], slope))
         seen = np.flatnonzero(inside & (hit > length - 1e-6))
         path = tmp_path / f"{number}.png"
         noise = random.integers(85, 95, (120, 160, 3), dtype=np.uint8)
@@ -173,23 +179,23 @@ def yard(tmp_path, request):
     return scene, truths, np.arange(len(points)) < len(ground)
 
 
-def test_ground_is_what_lies_between_its_points(yard):
+def test_ground_label_fills_the_area_between_ground_points(yard):
     scene, truths, is_ground = yard
-    known = ground_points(scene)
-    assert known is not None
-    assert known.on[~is_ground].mean() < 0.02 and known.on[is_ground].mean() > 0.8
+    ground = classify_ground_points(scene)
+    assert ground is not None
+    assert ground.is_ground[~is_ground].mean() < 0.02 and ground.is_ground[is_ground].mean() > 0.8
     for view, truth in zip(scene.views, truths, strict=True):
-        found = simple_labels(view, scene, known) == GROUND
-        box, ground, sky = (truth == kind for kind in (1, 0, 2))
-        assert not found[sky].any()
-        assert found[box].mean() < 0.06 and found[box].sum() < 0.01 * found.sum()
-        assert found[ground].mean() > 0.6
+        found = heuristic_labels(view, scene, ground) == GROUND
+        on_box, on_ground, on_sky = (truth == kind for kind in (1, 0, 2))
+        assert not found[on_sky].any()
+        assert found[on_box].mean() < 0.06 and found[on_box].sum() < 0.01 * found.sum()
+        assert found[on_ground].mean() > 0.6
 
 
-def test_ground_ends_where_a_photo_changes(yard):
-    """Paint of another colour, without points of its own, is no longer surely ground."""
+def test_ground_label_stops_at_colour_edges(yard):
+    """A painted patch without sparse points of its own stays unknown."""
     scene, _, _ = yard
-    known = ground_points(scene)
+    ground = classify_ground_points(scene)
     view = scene.views[0]
     patch = np.zeros((120, 160), bool)
     patch[100:118, 10:60] = True
@@ -197,83 +203,86 @@ def test_ground_ends_where_a_photo_changes(yard):
     column, row = pixels.astype(int).T
     view = replace(view, seen=view.seen[~patch[row, column]])
     picture = np.array(Image.open(view.path))
-    before = simple_labels(view, scene, known) == GROUND
+    before = heuristic_labels(view, scene, ground) == GROUND
     picture[patch] = (200, 30, 30)
     Image.fromarray(picture).save(view.path)
-    after = simple_labels(view, scene, known) == GROUND
+    after = heuristic_labels(view, scene, ground) == GROUND
     assert before[patch].mean() > 0.9 and after[patch].mean() < 0.1
     assert after[~patch].sum() > 0.9 * before[~patch].sum()
 
 
-def test_no_ground_without_points_or_without_knowing_who_sees_them(yard):
+def test_ground_needs_points_and_their_observations(yard):
     scene, _, _ = yard
-    blind = tuple(replace(view, seen=None) for view in scene.views)
-    assert ground_points(replace(scene, points=None)) is None
-    assert ground_points(replace(scene, views=blind)) is None
+    unobserved = tuple(replace(view, seen=None) for view in scene.views)
+    assert classify_ground_points(replace(scene, points=None)) is None
+    assert classify_ground_points(replace(scene, views=unobserved)) is None
     high = replace(scene, points=scene.points + (0, 0, 50))
-    assert ground_points(high) is None
-    known = ground_points(scene)
-    for seen in (None, np.empty(0, np.int64), np.flatnonzero(~known.on)):
-        labels = simple_labels(replace(scene.views[0], seen=seen), scene, known)
+    assert classify_ground_points(high) is None
+    ground = classify_ground_points(scene)
+    for seen in (None, np.empty(0, np.int64), np.flatnonzero(~ground.is_ground)):
+        labels = heuristic_labels(replace(scene.views[0], seen=seen), scene, ground)
         assert not (labels == GROUND).any()
 
 
-def test_a_raised_terrace_is_no_ground(yard):
-    """It is level too, but no slope leads there from the ground below the cameras."""
+def test_raised_terrace_is_not_ground(yard):
+    """A terrace is level, but no walkable slope connects it to ground below a camera."""
     scene, _, is_ground = yard
     points = scene.points.copy()
     raised = is_ground & (np.abs(points[:, :2] - (2.5, 0)) < (1.2, 1.6)).all(axis=-1)
     assert raised.sum() > 50
     points[raised, 2] += 1.4
-    known = ground_points(replace(scene, points=points))
-    assert known is not None
-    assert known.on[raised].mean() < 0.02 and known.on[is_ground & ~raised].mean() > 0.5
+    ground = classify_ground_points(replace(scene, points=points))
+    assert ground is not None
+    assert (
+        ground.is_ground[raised].mean() < 0.02
+        and ground.is_ground[is_ground & ~raised].mean() > 0.5
+    )
 
 
-def test_a_roof_that_no_ground_leads_to_is_none(yard):
+def test_unconnected_roof_is_not_ground(yard):
     scene, _, is_ground = yard
     roof = np.random.default_rng(1).uniform((11, -2, 1), (15, 2, 1.01), (400, 3))
-    known = ground_points(replace(scene, points=np.concatenate([scene.points, roof])))
-    assert known is not None
-    assert not known.on[len(is_ground) :].any()
-    assert known.on[: len(is_ground)][is_ground].mean() > 0.8
+    ground = classify_ground_points(replace(scene, points=np.concatenate([scene.points, roof])))
+    assert ground is not None
+    assert not ground.is_ground[len(is_ground) :].any()
+    assert ground.is_ground[: len(is_ground)][is_ground].mean() > 0.8
 
 
 @pytest.mark.skipif(not STREET.is_dir(), reason="the reference street is not in this checkout")
-def test_ground_of_the_street_is_ground():
+def test_ground_precision_and_recall_on_the_reference_street():
     scene = read_scene(STREET, holdout="0")
-    known = ground_points(scene)
-    right = wrong = missed = 0
+    ground = classify_ground_points(scene)
+    correct = wrong = missed = 0
     for view in scene.views[::7]:
         truth = load_labels(view, scene)
-        found = simple_labels(view, scene, known)[truth != 255] == GROUND
+        found = heuristic_labels(view, scene, ground)[truth != 255] == GROUND
         truth = np.isin(truth[truth != 255], (0, 1, 9))
-        right += (found & truth).sum()
+        correct += (found & truth).sum()
         wrong += (found & ~truth).sum()
         missed += (truth & ~found).sum()
-    assert right / (right + wrong) > 0.995
-    assert right / (right + missed) > 0.3
+    assert correct / (correct + wrong) > 0.995
+    assert correct / (correct + missed) > 0.3
 
 
 @pytest.mark.slow
-def test_ground_of_a_drive(captures):
-    """The labels are a network's; dry verges and leaf litter are vegetation to it."""
+def test_ground_of_a_real_drive(captures):
+    """Reference labels are a network's, which takes dry verges and leaf litter for vegetation."""
     scene = read_scene(captures / "kitti_drive", holdout="0")
-    known = ground_points(scene)
-    found = [simple_labels(view, scene, known) == GROUND for view in scene.views[::12]]
+    ground = classify_ground_points(scene)
+    found = [heuristic_labels(view, scene, ground) == GROUND for view in scene.views[::12]]
     truth = [np.isin(load_labels(view, scene), (0, 1, 9)) for view in scene.views[::12]]
-    right = np.sum([f & t for f, t in zip(found, truth, strict=True)])
-    assert right > 0.94 * np.sum(found) and right > 0.4 * np.sum(truth)
+    correct = np.sum([f & t for f, t in zip(found, truth, strict=True)])
+    assert correct > 0.94 * np.sum(found) and correct > 0.4 * np.sum(truth)
 
 
 @pytest.mark.slow
-def test_sky_of_real_captures_and_none_in_a_room(captures):
-    """The labels are a network's, and miss some sky between branches."""
+def test_sky_of_real_captures_and_of_a_room(captures):
+    """Reference labels are a network's, which misses some sky between branches."""
     for name, precision, recall in (("ditch", 0.95, 0.65), ("stone_sign", 0.75, 0.65)):
         scene = read_scene(captures / name, holdout="0")
-        assert shows_sky(scene), name
-        found = [simple_labels(view, scene, None) == SKY for view in scene.views[::12]]
+        assert is_outdoors(scene), name
+        found = [heuristic_labels(view, scene, None) == SKY for view in scene.views[::12]]
         truth = [load_labels(view, scene) == SKY for view in scene.views[::12]]
-        right = np.sum([f & t for f, t in zip(found, truth, strict=True)])
-        assert right > precision * np.sum(found) and right > recall * np.sum(truth), name
-    assert not shows_sky(read_scene(captures / "fox", holdout="0"))
+        correct = np.sum([f & t for f, t in zip(found, truth, strict=True)])
+        assert correct > precision * np.sum(found) and correct > recall * np.sum(truth), name
+    assert not is_outdoors(read_scene(captures / "fox", holdout="0"))

@@ -1,4 +1,4 @@
-"""The real classes with tiny sizes, through the path that the large ones take."""
+"""Networks of the real architectures at tiny sizes, through the same code path."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ pytest.importorskip("transformers", reason="pip install .[perception]")
 from support import networks
 
 
-def test_names_decide_the_train_id():
+def test_class_names_map_to_train_ids():
     named = train_ids({number: name for number, name in enumerate(CITYSCAPES)}, "m")
     assert named.tolist() == list(range(19))
     others = {
@@ -32,7 +32,7 @@ def test_names_decide_the_train_id():
 
 
 @pytest.mark.parametrize("save", [networks.save_segformer, networks.save_oneformer])
-def test_labels_have_the_photo_s_size_and_known_ids(tmp_path, save):
+def test_labels_have_the_photo_size_and_known_ids(tmp_path, save):
     network = load_segmentation(str(save(tmp_path / "net")))
     photo = networks.picture()
     labels = network.predict(photo)
@@ -42,21 +42,21 @@ def test_labels_have_the_photo_s_size_and_known_ids(tmp_path, save):
     assert network.revision is None
 
 
-def test_classes_of_no_kin_are_unknown(tmp_path):
+def test_unmapped_classes_are_unknown(tmp_path):
     network = load_segmentation(str(networks.save_segformer(tmp_path / "n", networks.ROOM_NAMES)))
-    seen = np.unique([network.predict(networks.picture(seed=i)) for i in range(5)])
-    assert set(seen.tolist()) <= {3, 10, 8, 2, 255, 9}
+    ids = np.unique([network.predict(networks.picture(seed=i)) for i in range(5)])
+    assert set(ids.tolist()) <= {3, 10, 8, 2, 255, 9}
 
 
-def test_few_scores_at_once_give_labels_of_full_size(tmp_path, monkeypatch):
+def test_memory_limit_on_scores_keeps_the_label_size(tmp_path, monkeypatch):
     network = load_segmentation(str(networks.save_segformer(tmp_path / "net")))
     whole = network.predict(networks.picture())
-    monkeypatch.setattr("climatenerf.perception.segmentation._MAX_NUMBERS", 5 * 30 * 48 // 4)
+    monkeypatch.setattr("climatenerf.perception.segmentation._MAX_SCORES", 5 * 30 * 48 // 4)
     coarse = network.predict(networks.picture())
     assert coarse.shape == whole.shape and (coarse == whole).mean() > 0.7
 
 
-def test_depth_has_the_photo_s_shape_and_is_nearness(tmp_path):
+def test_depth_has_the_photo_shape_and_is_inverse_depth(tmp_path):
     wide = networks.picture(90, 160)
     relative = load_depth(str(networks.save_depth_anything(tmp_path / "r"))).predict(wide)
     assert relative.shape == (90, 160) and relative.dtype == np.float32
@@ -64,22 +64,22 @@ def test_depth_has_the_photo_s_shape_and_is_nearness(tmp_path):
     large = networks.picture(600, 1000)
     assert load_depth(str(tmp_path / "r")).predict(large).shape == (311, 518)
     metric = load_depth(str(networks.save_depth_anything(tmp_path / "m", "metric"))).predict(wide)
-    assert (metric >= 1 / 20 - 1e-4).all(), "the inverse of at most 20 m"
+    assert (metric >= 1 / 20 - 1e-4).all(), "the network's largest depth is 20 m"
 
 
-def test_what_cannot_be_loaded_is_said_in_a_sentence(tmp_path, monkeypatch):
-    with pytest.raises(UserError, match="give the folder of one"):
+def test_unusable_models_give_one_sentence_errors(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="give the folder of a model"):
         load_segmentation(str(tmp_path / "absent"))
-    with pytest.raises(UserError, match="give the folder of one"):
+    with pytest.raises(UserError, match="give the folder of a model"):
         load_segmentation("simpel")
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="cannot be loaded"):
         load_segmentation(str(tmp_path / "empty"))
     networks.save_segformer(tmp_path / "net")
     networks.save_depth_anything(tmp_path / "depth")
-    with pytest.raises(UserError, match="no Depth Anything"):
+    with pytest.raises(UserError, match="not a Depth Anything model"):
         load_depth(str(tmp_path / "net"))
-    with pytest.raises(UserError, match="no network for segmentation"):
+    with pytest.raises(UserError, match="not a segmentation network"):
         load_segmentation(str(tmp_path / "depth"))
     (tmp_path / "net" / "model.safetensors").write_bytes(b"damaged")
     with pytest.raises(UserError, match="cannot be loaded"):
@@ -89,24 +89,24 @@ def test_what_cannot_be_loaded_is_said_in_a_sentence(tmp_path, monkeypatch):
         load_depth(str(tmp_path / "depth"))
 
 
-def test_the_disk_comes_before_the_internet():
-    asked = []
+def test_cached_models_are_preferred_to_downloads():
+    calls = []
 
     def load(name, local):
-        asked.append(local)
+        calls.append(local)
         if local:
             raise OSError("not cached")
         raise OSError("We couldn't connect\nand more")
 
     with pytest.raises(UserError, match="couldn't connect.*local path") as error:
         models.load_parts("owner/net", load)
-    assert asked == [True, False] and "\n" not in str(error.value)
+    assert calls == [True, False] and "\n" not in str(error.value)
     assert models.load_parts("owner/net", lambda name, local: local) is True
 
 
-def test_licences():
+def test_licence_of_known_and_unknown_models():
     assert models.licence_of("depth-anything/Depth-Anything-V2-Small-hf") == "Apache-2.0"
     assert "non-commercial" in models.licence_of("depth-anything/Depth-Anything-V2-Large-hf")
     assert "non-commercial" in models.licence_of("/copies/segformer-b5-finetuned-cityscapes")
     assert models.licence_of("shi-labs/oneformer_cityscapes_swin_large") == "MIT"
-    assert "not known" in models.licence_of("me/mine")
+    assert "unknown" in models.licence_of("me/mine")

@@ -68,8 +68,8 @@ class Fit:
     """What the numbers in label files mean: cityscapes-train-ids, cityscapes-ids or seven. Default:
     what the capture says."""
     labels: str | None = None
-    """Class labels: none, simple (sky and ground without a network), or a segmentation network's
-    name or folder. Default: the capture's label files, else simple if it surely shows sky."""
+    """Class labels: none, heuristic (sky and ground without a network), or a network's
+    name or folder. Default: the capture's label files, else heuristic if it surely shows sky."""
     mono_depth: str | None = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
     capture's depth_relative files, else its depth files; none leaves both alone."""

@@ -1,4 +1,4 @@
-"""Class labels, sky and relative depth of photos, where the capture has no files of them."""
+"""Class labels and relative depth of photos, for captures that have no files of them."""
 
 from climatenerf.perception.prepare import check_depth_model, prepare_depth, prepare_labels
 

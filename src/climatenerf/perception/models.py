@@ -1,4 +1,4 @@
-"""Networks of `transformers`: finding one by name or folder, and what may be done with it."""
+"""Loading networks of `transformers` by name or folder, and the licences of their weights."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from climatenerf.core.errors import UserError
 
 Parts = TypeVar("Parts")
 
-# Asked in this order, of the name's lower case, so that a local copy is known by its folder too.
+# The first part found in the lower-case name counts; a local copy is recognised by its folder.
 _LICENCES = (
-    ("segformer", "NVIDIA's own licence: non-commercial, for research or evaluation only"),
+    ("segformer", "NVIDIA source code licence: non-commercial, research or evaluation only"),
     ("oneformer", "MIT"),
     ("depth-anything-v2-small", "Apache-2.0"),
     ("depth-anything-v2-metric-indoor-small", "Apache-2.0"),
@@ -29,12 +29,12 @@ _LICENCES = (
 
 @dataclass(frozen=True)
 class Network:
-    """A network that is ready to look at photos.
+    """A loaded network.
 
     Attributes:
         name: As the user gave it: a name on the Hugging Face Hub, or a folder.
-        revision: Commit of the Hub that was loaded; None of a folder.
-        predict: From an 8-bit sRGB picture to what the network sees, `h w`.
+        revision: Commit on the Hub; None for a folder.
+        predict: Maps an 8-bit sRGB picture `h w 3` to the network's output.
     """
 
     name: str
@@ -43,13 +43,13 @@ class Network:
 
 
 def licence_of(name: str) -> str:
-    """The licence of a network's weights, in a few words."""
+    """Return the licence of a network's weights, in a few words."""
     found = [licence for part, licence in _LICENCES if part in name.lower()]
-    return found[0] if found else "not known here; see where the model is from"
+    return found[0] if found else "unknown; see the source of the model"
 
 
 def check_name(name: str) -> None:
-    """Refuses what cannot be a network, before anything is loaded.
+    """Check that a name can be a network, before anything is loaded.
 
     Raises:
         UserError: `transformers` is missing, or the name is neither a folder nor OWNER/NAME.
@@ -61,13 +61,20 @@ def check_name(name: str) -> None:
         )
     if not Path(name).expanduser().is_dir() and not re.fullmatch(r"[\w-][\w.-]*/[\w.-]+", name):
         raise UserError(
-            f"there is no model {name}: give the folder of one, or its name on the Hugging Face"
+            f"there is no model {name}; give the folder of a model, or its name on the Hugging Face"
             " Hub as OWNER/NAME"
         )
 
 
 def load_parts(name: str, load: Callable[[str, bool], Parts]) -> Parts:
-    """What `load(name, local_files_only)` gives: from the disk if it is there, else by download.
+    """Load a network from a folder, from the local cache, or by download, in this order.
+
+    Args:
+        name: Folder, or OWNER/NAME on the Hub.
+        load: Called as `load(name, local_files_only)`.
+
+    Returns:
+        The result of `load`.
 
     Raises:
         UserError: `transformers` is missing, or there is no usable network of this name.
@@ -76,7 +83,7 @@ def load_parts(name: str, load: Callable[[str, bool], Parts]) -> Parts:
     from safetensors import SafetensorError
 
     folder = Path(name).expanduser()
-    # Whatever the files hold, the library says it with one of these.
+    # The exceptions that the libraries raise for damaged or unsuitable files.
     unusable = (OSError, ValueError, RuntimeError, ImportError, KeyError, SafetensorError)
     if folder.is_dir():
         try:
@@ -84,21 +91,22 @@ def load_parts(name: str, load: Callable[[str, bool], Parts]) -> Parts:
         except unusable as error:
             raise UserError(
                 f"the model in {folder} cannot be loaded ({_first_line(error)}); give a folder"
-                " that save_pretrained wrote, its image processor included"
+                " written by save_pretrained, including the image processor"
             ) from error
     try:
         return load(name, True)
     except unusable:
-        pass  # not downloaded yet
+        pass  # not in the cache
     try:
         return load(name, False)
     except unusable as error:
         raise UserError(
-            f"the model {name} cannot be downloaded ({_first_line(error)}); check the name and the"
-            " internet, or give the local path of a copy"
+            f"the model {name} cannot be downloaded ({_first_line(error)}); check the name and"
+            " the internet connection, or give the local path of a copy"
         ) from error
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of an exception's message, or the exception's name."""
     lines = str(error).strip().splitlines()
     return lines[0].rstrip(".") if lines else type(error).__name__

@@ -1,4 +1,4 @@
-"""Depth of single photos by a network: which of two things is nearer, in no known unit."""
+"""Monocular depth: relative inverse depth of single photos by a network."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from climatenerf.core.errors import UserError
 from climatenerf.perception.models import Network, load_parts
 
 DEFAULT = "depth-anything/Depth-Anything-V2-Small-hf"
-"""The smallest of its family, and the one with a free licence."""
-LONGEST = 518
-"""Pixels on the longer side of what is kept: the network sees no finer."""
+"""The smallest model of its family, and the only one with a free licence."""
+MAX_SIZE = 518
+"""Pixels on the longer side of the stored depth: the resolution of the network."""
 
 
 def load_depth(name: str) -> Network:
-    """A Depth Anything by name or folder.
+    """Load a Depth Anything network by name or folder.
 
-    Its `predict` gives, for a picture `h w 3`, float32 in the same shape of at most `LONGEST`
-    pixels: a z-depth's inverse, up to a factor and a constant that differ between photos; larger
-    is nearer.
+    Its `predict` maps a picture `h w 3` to float32 of the same aspect ratio, at most `MAX_SIZE`
+    pixels on the longer side: inverse z-depth up to a scale and a shift that differ between photos;
+    larger is nearer.
 
     Raises:
-        UserError: It cannot be had, or is a network of another kind.
+        UserError: The network cannot be loaded, or is of another kind.
     """
     config, processor, model = load_parts(name, _load)
 
@@ -32,29 +32,29 @@ def load_depth(name: str) -> Network:
 
         with torch.inference_mode():
             inputs = processor(images=Image.fromarray(picture), return_tensors="pt")
-            seen = model(**inputs.to(model.device)).predicted_depth[0].float().cpu().numpy()
+            depth = model(**inputs.to(model.device)).predicted_depth[0].float().cpu().numpy()
         if config.depth_estimation_type == "metric":
-            seen = 1 / np.maximum(seen, 1e-3)  # a millimetre: 1/0
+            depth = 1 / np.maximum(depth, 1e-3)  # at least a millimetre: 1/0
         height, width = picture.shape[:2]
-        scale = min(1.0, LONGEST / max(height, width))
+        scale = min(1.0, MAX_SIZE / max(height, width))
         size = max(1, round(width * scale)), max(1, round(height * scale))
-        # The network's own shape is the photo's only nearly, as it sees patches of 14 pixels.
-        return np.asarray(Image.fromarray(seen).resize(size, Image.Resampling.BILINEAR))
+        # The network rounds the image to patches of 14 px, so its output is resized.
+        return np.asarray(Image.fromarray(depth).resize(size, Image.Resampling.BILINEAR))
 
     return Network(name, getattr(config, "_commit_hash", None), predict)
 
 
 def _load(name: str, local: bool):
-    """Configuration, processor and model."""
+    """Return configuration, processor and model."""
     import torch
     import transformers
 
     config = transformers.AutoConfig.from_pretrained(name, local_files_only=local)
     if config.model_type != "depth_anything":
-        # Others give depth where this gives its inverse, and nothing in them says which.
+        # Other models return depth instead of inverse depth, and their files do not tell which.
         raise UserError(
-            f"the model {name} is no Depth Anything ({config.model_type}); give {DEFAULT} or a"
-            " copy of one of its family"
+            f"the model {name} is not a Depth Anything model ({config.model_type}); give {DEFAULT},"
+            " another model of its family, or a local copy"
         )
     processor = transformers.AutoImageProcessor.from_pretrained(name, local_files_only=local)
     model = transformers.AutoModelForDepthEstimation.from_pretrained(

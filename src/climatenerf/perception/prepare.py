@@ -1,7 +1,7 @@
-"""Labels and depths that a capture lacks: made once, and kept in the capture's folder.
+"""Class labels and relative depths that a capture lacks: made once, kept in the capture's folder.
 
-`made_by.json` beside them tells of each file what made it from which photo. What is not told of
-there, or was changed since, is the user's and stays as it is.
+`made_by.json` beside the files records which model made each file from which photo. Files that it
+does not list, or that changed since, belong to the user and are never overwritten.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from PIL import Image
 import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import check_schema, explain, read_json, write_bytes, write_json
-from climatenerf.perception.heuristic import shows_sky, simple_labels
-from climatenerf.perception.heuristic_ground import ground_points
+from climatenerf.perception.heuristic import heuristic_labels, is_outdoors
+from climatenerf.perception.heuristic_ground import classify_ground_points
 from climatenerf.perception.models import Network, check_name, licence_of
 from climatenerf.perception.monocular import DEFAULT as DEPTH_ANYTHING
 from climatenerf.perception.monocular import load_depth
@@ -34,24 +34,27 @@ from climatenerf.scene.scene import Scene, View
 LABELS, DEPTHS = "labels", "depth_relative"
 RECORD = "made_by.json"
 SCHEMA_VERSION = 1
-NONE, SIMPLE = "none", "simple"
+NONE, HEURISTIC = "none", "heuristic"
+FORMER_HEURISTIC = "simple"
+"""The former name of "heuristic", still accepted as an argument and in records."""
 
 Track = Callable[[str, list[View]], Iterable[View]]
-"""Goes through photos and shows how far it is: title, photos."""
+"""Progress callback: takes a title and photos, and yields the photos."""
 Say = Callable[[str], None]
-"""Tells the user a line."""
+"""Message callback: takes one line for the user."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where files of one kind come from.
+    """A model that makes one kind of file.
 
     Attributes:
-        kind: Name of their folder.
-        suffix: Of their names.
-        model: Name of the network, or "simple".
-        load: Gets it ready; it may take long, so it is called only if something is to be made.
-        encode: From what is seen in a photo to a file's bytes.
+        kind: Name of the folder of the files.
+        suffix: Suffix of the files' names.
+        model: Name of the network, or "heuristic".
+        load: Returns the model's revision and its function from a photo to an image. Called only if
+            a file is missing, since loading can take long.
+        encode: Maps that image to the bytes of a file.
     """
 
     kind: str
@@ -61,22 +64,25 @@ class Source:
     encode: Callable[[np.ndarray], bytes]
 
 
-def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, say: Say) -> Scene:
-    """The scene with class labels of its photos, those made that it lacks.
+def prepare_labels(
+    scene: Scene, model: str | None, run_folder: Path, track: Track, say: Say
+) -> Scene:
+    """Return the scene with a class label file for each photo, and make those that are missing.
 
     Args:
-        scene: The levelled capture.
-        model: A network's name or folder; "simple" for sky and ground without a network; "none"
-            for no labels at all; None for the labels that the capture has, or else those of
-            "simple" if photos surely show sky.
-        spare: Folder that takes the files of "simple" if nobody asked for it or the capture's may
-            not be written.
-        track: Told of progress.
-        say: Told what the user should know.
+        scene: The capture with z up.
+        model: A network's name or folder; "heuristic" for sky and ground without a network; "none"
+            for no labels; None for the capture's label files, or "heuristic" if it has none and its
+            photos certainly show sky.
+        run_folder: Takes the files of "heuristic" if it was not asked for, or if the capture's
+            folder is read-only.
+        track: Progress callback.
+        say: Message callback.
 
     Raises:
         UserError: The network cannot be used, or its files cannot be written.
     """
+    model = HEURISTIC if model == FORMER_HEURISTIC else model
     if model == NONE:
         return replace(scene, views=tuple(replace(v, label_path=None) for v in scene.views))
     folder = scene.root / LABELS
@@ -84,32 +90,31 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
     names = [_within(v.label_path, folder) for v in scene.views if v.label_path is not None]
     if all(name in entries for name in names):
         scene = replace(scene, label_space=TRAIN_IDS)
-    unasked = False
+    by_default = False
     if model is None:
-        simple = all(name in entries and entries[name]["model"] == SIMPLE for name in names)
-        if not simple or (names and not _writable(folder)):
+        heuristic = all(name in entries and entries[name]["model"] == HEURISTIC for name in names)
+        if not heuristic or (names and not _is_writable(folder)):
             return scene
-        if not names and not shows_sky(scene):
-            say("The capture has no class labels, and no sky is found for sure: none are used.")
+        if not names and not is_outdoors(scene):
+            say("The capture has no class labels and does not certainly show sky: no labels used.")
             return scene
         say(
-            "The capture has no class labels; as a fall-back sky is found by its looks, and ground"
-            " by its points."
-            " Labels of a network are better: --labels MODEL, or files in labels/ (--labels none"
-            " does without)."
+            "The capture has no class labels: using heuristic labels, sky by colour and ground by"
+            " sparse points. A network's labels are better: use --labels MODEL, or put files into"
+            " labels/ (--labels none uses no labels)."
         )
-        model, unasked = SIMPLE, not names
+        model, by_default = HEURISTIC, not names
     if scene.label_space != TRAIN_IDS:
         raise UserError(
-            f"the capture's own labels are {scene.label_space}, which labels of {model} cannot"
-            " stand beside; leave --labels out to use its own, or take them away"
+            f"the capture's own labels are {scene.label_space}, which cannot be mixed with labels"
+            f" of {model}; omit --labels to use the capture's own, or remove them"
         )
-    if model != SIMPLE:
-        check_name(model)  # also where every photo has labels already
-    source = _simple(scene) if model == SIMPLE else _segmentation(scene, model)
-    if unasked or (model == SIMPLE and not _writable(folder)):
-        folder = spare / LABELS  # nobody said that the capture may be written into
-    elif not _writable(folder):
+    if model != HEURISTIC:
+        check_name(model)  # even if no file is missing
+    source = _heuristic(scene) if model == HEURISTIC else _segmentation(scene, model)
+    if by_default or (model == HEURISTIC and not _is_writable(folder)):
+        folder = run_folder / LABELS  # the user did not ask to write into the capture
+    elif not _is_writable(folder):
         raise _read_only(folder)
     paths = _prepare(scene, source, folder, track, say)
     views = tuple(replace(v, label_path=v.label_path or paths.get(v.name)) for v in scene.views)
@@ -117,26 +122,30 @@ def prepare_labels(scene: Scene, model: str | None, spare: Path, track: Track, s
 
 
 def prepare_depth(scene: Scene, model: str, track: Track, say: Say) -> dict[str, Path]:
-    """Files of relative inverse depth, one for each photo, by the photo's name.
+    """Return a file of relative inverse depth for each photo, by the photo's name.
 
     Args:
         scene: The capture.
-        model: A Depth Anything's name or folder; "depth-anything" is the default one.
-        track: Told of progress.
-        say: Told what the user should know.
+        model: A Depth Anything network's name or folder; "depth-anything" for the default one.
+        track: Progress callback.
+        say: Message callback.
 
     Raises:
         UserError: The network cannot be used, or its files cannot be written.
     """
     source = _monocular(scene, _depth_model(model))
     folder = scene.root / DEPTHS
-    if not _writable(folder):
+    if not _is_writable(folder):
         raise _read_only(folder)
     return _prepare(scene, source, folder, track, say)
 
 
 def check_depth_model(model: str) -> None:
-    """Refuses what cannot be a network for `prepare_depth`, before anything is loaded."""
+    """Check that a name can be a network for `prepare_depth`, before anything is loaded.
+
+    Raises:
+        UserError: `transformers` is missing, or the name is neither a folder nor OWNER/NAME.
+    """
     check_name(_depth_model(model))
 
 
@@ -144,87 +153,87 @@ def _depth_model(model: str) -> str:
     return DEPTH_ANYTHING if model == "depth-anything" else model
 
 
-def _simple(scene: Scene) -> Source:
+def _heuristic(scene: Scene) -> Source:
     def load():
-        ground = ground_points(scene)
-        return None, lambda view: simple_labels(view, scene, ground)
+        ground = classify_ground_points(scene)
+        return None, lambda view: heuristic_labels(view, scene, ground)
 
-    return Source(LABELS, ".png", SIMPLE, load, _png)
+    return Source(LABELS, ".png", HEURISTIC, load, _png)
 
 
 def _segmentation(scene: Scene, model: str) -> Source:
-    return Source(LABELS, ".png", model, lambda: _looking(load_segmentation(model), scene), _png)
+    return Source(LABELS, ".png", model, lambda: _predictor(load_segmentation(model), scene), _png)
 
 
 def _monocular(scene: Scene, model: str) -> Source:
-    return Source(DEPTHS, ".npz", model, lambda: _looking(load_depth(model), scene), _npz)
+    return Source(DEPTHS, ".npz", model, lambda: _predictor(load_depth(model), scene), _npz)
 
 
-def _looking(network: Network, scene: Scene):
+def _predictor(network: Network, scene: Scene):
     return network.revision, lambda view: network.predict(load_image(view, scene))
 
 
 def _prepare(scene: Scene, source: Source, folder: Path, track: Track, say: Say) -> dict[str, Path]:
-    """Makes what is missing or out of date; returns where each photo's file is."""
+    """Make the files that are missing or out of date; return each photo's file."""
     entries = _entries(folder)
-    paths, photos, theirs = {}, {}, 0
+    paths, outdated, foreign = {}, {}, 0
     for view, target in _targets(scene, folder, source.suffix):
-        there = _there(view, target, source)
-        entry = None if there is None else entries.get(_within(there, folder) or "")
-        if there is not None and (entry is None or _digest(there) != entry["sha256"]):
-            paths[view.name] = there
-            theirs += 1
+        existing = _existing(view, target, source)
+        entry = None if existing is None else entries.get(_within(existing, folder) or "")
+        if existing is not None and (entry is None or _digest(existing) != entry["sha256"]):
+            paths[view.name] = existing
+            foreign += 1
             continue
-        paths[view.name] = there or target
+        paths[view.name] = existing or target
         digest = _digest(view.path)
         if entry is None or (entry["model"], entry["photo_sha256"]) != (source.model, digest):
-            photos[view.name] = digest
-    if theirs:
-        say(f"{theirs} files in {folder} are not by {source.model}; they stay and are used.")
-    if not photos:
+            outdated[view.name] = digest
+    if foreign:
+        say(f"Keeping and using {foreign} files in {folder} that were not made by {source.model}.")
+    if not outdated:
         return paths
-    licence = None if source.model == SIMPLE else licence_of(source.model)
+    licence = None if source.model == HEURISTIC else licence_of(source.model)
     if licence and not any(entry["model"] == source.model for entry in entries.values()):
-        say(f"Licence of {source.model}: {licence}")  # before its weights are fetched
-    revision, look = source.load()
-    for view in track(source.kind, [v for v in scene.views if v.name in photos]):
+        say(f"Licence of {source.model}: {licence}")  # before the weights are downloaded
+    revision, predict = source.load()
+    for view in track(source.kind, [v for v in scene.views if v.name in outdated]):
         path = paths[view.name]
-        data = source.encode(look(view))
+        data = source.encode(predict(view))
         entry = {
             "model": source.model,
             "revision": revision,
             "licence": licence,
             "climatenerf": climatenerf.__version__,
             "sha256": hashlib.sha256(data).hexdigest(),
-            "photo_sha256": photos[view.name],
+            "photo_sha256": outdated[view.name],
         }
         name = path.relative_to(folder).as_posix()
-        before, entries[name] = entries.get(name), entry
+        previous, entries[name] = entries.get(name), entry
         try:
             write_bytes(path, data)
         except BaseException:
-            if before is not None and path.is_file() and _digest(path) == before["sha256"]:
-                entries[name] = before  # the earlier file is still there
+            if previous is not None and path.is_file() and _digest(path) == previous["sha256"]:
+                entries[name] = previous  # the earlier file is unchanged
             raise
         finally:
-            # Also when stopped just here: a file that nothing tells of would count as the user's.
+            # Also on interruption: a file without a record would count as the user's.
             write_json(folder / RECORD, {"schema_version": SCHEMA_VERSION, "files": entries})
     return paths
 
 
 def _targets(scene: Scene, folder: Path, suffix: str) -> Iterator[tuple[View, Path]]:
-    """Photos and where their file is to be, named so that a reader finds it."""
+    """Yield photos with the path of their file, named as a scene reader expects it."""
     stems = [PurePath(view.name).with_suffix("") for view in scene.views]
     for view, stem in zip(scene.views, stems, strict=True):
         name = PurePath(view.name)
-        # Photos outside the capture have no name by which a file in it could be found.
+        # A photo outside the capture's folder has no relative name for a file in the capture.
         if not name.is_absolute() and ".." not in name.parts:
-            shared = stems.count(stem) > 1
-            yield view, folder / (f"{name}{suffix}" if shared else f"{stem}{suffix}")
+            ambiguous = stems.count(stem) > 1
+            yield view, folder / (f"{name}{suffix}" if ambiguous else f"{stem}{suffix}")
 
 
-def _there(view: View, target: Path, source: Source) -> Path | None:
-    """The file that a photo has already."""
+def _existing(view: View, target: Path, source: Source) -> Path | None:
+    """Return the file that a photo already has, by either of its names."""
     if source.kind == LABELS and view.label_path is not None:
         return view.label_path
     longer = target.with_name(f"{PurePath(view.name).name}{source.suffix}")
@@ -232,7 +241,11 @@ def _there(view: View, target: Path, source: Source) -> Path | None:
 
 
 def _entries(folder: Path) -> dict[str, dict[str, Any]]:
-    """What is told of the files in a folder, by their names within it."""
+    """Return the record of a folder's files, by their names within it.
+
+    Raises:
+        UserError: The record is damaged, or of a newer version.
+    """
     path = folder / RECORD
     if not path.is_file():
         return {}
@@ -243,12 +256,15 @@ def _entries(folder: Path) -> dict[str, dict[str, Any]]:
     if not isinstance(files, dict) or not all(
         isinstance(entry, dict) and needed <= entry.keys() for entry in files.values()
     ):
-        raise UserError(f"{path} is damaged; delete it, and the files beside it that were made")
+        raise UserError(f"{path} is damaged; delete it, and the generated files beside it")
+    for entry in files.values():
+        if entry["model"] == FORMER_HEURISTIC:
+            entry["model"] = HEURISTIC
     return files
 
 
 def _within(path: Path, folder: Path) -> str | None:
-    """The path as seen from a folder; None outside of it."""
+    """Return the path relative to a folder; None outside it."""
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else None
 
 
@@ -260,15 +276,15 @@ def _digest(path: Path) -> str:
         raise explain(error, path) from error
 
 
-def _writable(folder: Path) -> bool:
-    """Whether a folder, which need not be there yet, may be written to."""
+def _is_writable(folder: Path) -> bool:
+    """Return whether a folder, which need not exist yet, can be written to."""
     return os.access(folder if folder.exists() else folder.parent, os.W_OK)
 
 
 def _read_only(folder: Path) -> UserError:
     return UserError(
-        f"{folder} may not be written, and what the model sees is kept there: copy the capture to"
-        " where you may write, or change its permissions"
+        f"{folder} is read-only, and the model's output is stored there; copy the capture to a"
+        " writable folder, or change its permissions"
     )
 
 

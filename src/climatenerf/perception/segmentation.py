@@ -1,4 +1,4 @@
-"""Class labels of photos by a segmentation network, as Cityscapes train ids."""
+"""Class labels (Cityscapes train ids) of photos by a semantic segmentation network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CITYSCAPES = (
 )  # fmt: skip
 """Names of the train ids 0 to 18."""
 
-# What the classes of other data sets, ADE20K above all, are nearest to.
+# Nearest Cityscapes class of classes of other data sets, mainly ADE20K.
 NEAREST = {
     "house": "building",
     "skyscraper": "building",
@@ -47,58 +47,60 @@ NEAREST = {
     "signboard": "traffic sign",
 }
 MIN_CLASSES = 3
-_MAX_NUMBERS = 2**27  # of scores held at once, half a gigabyte
+"""Cityscapes classes that a network must have."""
+_MAX_SCORES = 2**27  # float32 class scores held at once: half a gigabyte
 
 
 def train_ids(names: Mapping[int, str], model: str) -> UInt8[np.ndarray, " n"]:
-    """The Cityscapes train id of each of a network's classes, 255 where there is none.
+    """Return the Cityscapes train id of each of a network's classes, 255 where there is none.
 
     Args:
-        names: The network's own names by its class numbers, from 0 on without a gap. Of several
-            words with commas between, the first counts.
-        model: What to call the network in an error.
+        names: The network's class names by class index, 0 to n-1. Of several names separated by
+            commas or semicolons, the first counts.
+        model: The network's name in an error message.
 
     Raises:
-        UserError: Hardly any name is known.
+        UserError: Fewer than `MIN_CLASSES` classes are recognised.
     """
     table = np.full(max(names, default=-1) + 1, UNKNOWN, np.uint8)
-    for number, words in names.items():
-        name = words.replace(";", ",").split(",")[0].strip().lower().replace("_", " ")
+    for index, synonyms in names.items():
+        name = synonyms.replace(";", ",").split(",")[0].strip().lower().replace("_", " ")
         name = NEAREST.get(name, name)
         if name in CITYSCAPES:
-            table[number] = CITYSCAPES.index(name)
+            table[index] = CITYSCAPES.index(name)
     if len(set(table[table != UNKNOWN].tolist())) < MIN_CLASSES:
-        some = ", ".join(list(names.values())[:3])
+        examples = ", ".join(list(names.values())[:3])
         raise UserError(
             f"the model {model} does not name its classes as Cityscapes or ADE20K do (it has:"
-            f" {some}, ...); give one that was trained on either"
+            f" {examples}, ...); give a model trained on one of them"
         )
     return table
 
 
 def load_segmentation(name: str) -> Network:
-    """A network by name or folder, whose `predict` gives train ids in the picture's own size.
+    """Load a segmentation network by name or folder.
 
-    SegFormer, OneFormer and whatever else `transformers` has for semantic segmentation.
+    SegFormer, OneFormer, or any other semantic segmentation network of `transformers`. Its
+    `predict` maps a picture `h w 3` to train ids `h w`.
 
     Raises:
-        UserError: It cannot be had, is no segmentation network, or names its classes otherwise.
+        UserError: The network cannot be loaded, is of another kind, or has unknown class names.
     """
     config, processor, model = load_parts(name, _load)
     ids = train_ids({int(k): v for k, v in (config.id2label or {}).items()}, name)
-    tasked = {"task_inputs": ["semantic"]} if config.model_type == "oneformer" else {}
+    task = {"task_inputs": ["semantic"]} if config.model_type == "oneformer" else {}
 
     def predict(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
         import torch
 
         height, width = picture.shape[:2]
-        # Scores of many classes for each pixel of a large photo would fill the memory.
-        shrink = max(1.0, math.sqrt(len(ids) * height * width / _MAX_NUMBERS))
+        # Scores of all classes at full resolution could exceed the memory.
+        shrink = max(1.0, math.sqrt(len(ids) * height * width / _MAX_SCORES))
         size = max(1, round(height / shrink)), max(1, round(width / shrink))
         with torch.inference_mode():
-            inputs = processor(images=Image.fromarray(picture), return_tensors="pt", **tasked)
-            seen = model(**inputs.to(model.device))
-            classes = processor.post_process_semantic_segmentation(seen, target_sizes=[size])[0]
+            inputs = processor(images=Image.fromarray(picture), return_tensors="pt", **task)
+            output = model(**inputs.to(model.device))
+            classes = processor.post_process_semantic_segmentation(output, target_sizes=[size])[0]
         labels = Image.fromarray(ids[classes.cpu().numpy()])
         return np.asarray(labels.resize((width, height), Image.Resampling.NEAREST))
 
@@ -106,7 +108,7 @@ def load_segmentation(name: str) -> Network:
 
 
 def _load(name: str, local: bool):
-    """Configuration, processor and model."""
+    """Return configuration, processor and model."""
     import torch
     import transformers
 
@@ -116,9 +118,12 @@ def _load(name: str, local: bool):
     elif type(config) in transformers.MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING:
         kind = transformers.AutoModelForUniversalSegmentation
     else:
-        raise UserError(f"the model {name} is no network for segmentation ({config.model_type})")
+        raise UserError(
+            f"the model {name} is not a segmentation network ({config.model_type}); give a"
+            " SegFormer or another semantic segmentation network of transformers"
+        )
     if config.model_type == "oneformer":
-        # Its class names are wanted for training only, and would be fetched from elsewhere.
+        # Only training needs its file of class names, which would be downloaded separately.
         images = transformers.AutoImageProcessor.from_pretrained(
             name, local_files_only=local, class_info_file=None
         )
