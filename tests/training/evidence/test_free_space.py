@@ -1,15 +1,15 @@
-"""What is barred before a fit: the air above the ground, and nothing that stands on it."""
+"""Free-space constraint: empties the air above the ground, keeps the obstacles on it."""
 
 import numpy as np
 import torch
+from support.tower import CAMERA, TOWER, in_matter, labels, poses
 from support.toy_scene import TINY
-from test_visual_hull import CAMERA, TOWER, in_matter, labels, poses
 
 from climatenerf.core.classes import BUILDING, SKY, SOLID, TERRAIN
 from climatenerf.field.hash_field import Field
 from climatenerf.ops.reference import contract
 from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence import ground_height as ground_map
+from climatenerf.training.evidence import ground_height
 from climatenerf.training.evidence.free_space import FreeSpace
 from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
@@ -31,11 +31,11 @@ def ground_labels(pose):
     return np.vectorize(TRAIN_ID.get)(kind).astype(np.uint8)
 
 
-def points(c2w, n=300):
-    """Rays of the first view that sees each point of the ground and of the tower's sides."""
+def tower_and_ground(c2w, n=300):
+    """Sparse depth of points on the ground and the tower, each in the first view that sees it."""
     random = np.random.default_rng(0)
-    angle, reach = random.uniform(0, 2 * np.pi, n), random.uniform(1.0, 5.0, n)
-    ground = np.stack([reach * np.cos(angle), reach * np.sin(angle), 0 * angle], -1)
+    angle, radius = random.uniform(0, 2 * np.pi, n), random.uniform(1.0, 5.0, n)
+    ground = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], -1)
     side = np.stack([np.full(60, 0.5), random.uniform(-0.5, 0.5, 60), random.uniform(0, 2, 60)], -1)
     rows = []
     for x in np.concatenate([ground, side]):
@@ -59,21 +59,21 @@ def points(c2w, n=300):
     )
 
 
-def carving(change=None, **settings):
+def free_space(change=None, **settings):
     c2w = poses(12, height=1.5)
     maps = [ground_labels(pose) for pose in c2w]
     maps = change(maps) if change else maps
     images = [np.zeros((60, 80, 3), np.uint8)] * 12
     pixels = TrainingPixels([CAMERA], [0] * 12, c2w, images, maps)
     field = Field(TINY, 12, np.array([0.0, 0.0, 0.5]), 3.0, 0.1)
-    return FreeSpace(field, pixels, points(c2w), FitSettings(**settings))
+    return FreeSpace(field, pixels, tower_and_ground(c2w), FitSettings(**settings))
 
 
-def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tower():
-    found = carving()
+def test_cells_above_the_ground_are_forced_empty_except_the_tower():
+    found = free_space()
     occupancy, field = found.field.occupancy, found.field
     centre, size = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
-    x, size, barred = (
+    x, size, forced = (
         centre * field.unit + field.centre,
         size * field.unit,
         occupancy.barred.view(-1),
@@ -82,139 +82,141 @@ def test_cells_well_above_the_ground_are_barred_and_neither_low_ones_nor_the_tow
     assert found.ground is not None
     clear = size * 3**0.5 / 2 + found.ground.tolerance * field.unit
     air = (ring > 2) & (ring < 4) & (x[:, 2] < 0.9)
-    assert barred[air & (x[:, 2] > clear)].float().mean() > 0.3
-    unseen = carving(
+    assert forced[air & (x[:, 2] > clear)].float().mean() > 0.3
+    without_ground = free_space(
         losses=type(FitSettings().losses)(ground_height=0.0)
     ).field.occupancy.barred.view(-1)
-    assert not (barred & ~unseen)[air & (x[:, 2] < clear - 0.02)].any()
-    assert (barred & ~unseen)[air].any()
+    assert not (forced & ~without_ground)[air & (x[:, 2] < clear - 0.02)].any()
+    assert (forced & ~without_ground)[air].any()
     touches = in_matter(x) & (x[:, 2] > -size / 2) & (ring < 5)
-    assert touches.sum() > 50 and not barred[touches].any()
+    assert touches.sum() > 50 and not forced[touches].any()
 
 
-def test_matter_with_points_is_kept_though_every_view_takes_it_for_sky():
-    """A network's word, even unanimous, empties nothing that was measured."""
+def test_cells_of_sparse_points_are_protected_from_wrong_labels():
+    """Even if all views label the tower sky."""
 
     def err(maps):
         return [np.where(m == 2, 10, m).astype(np.uint8) for m in maps]
 
-    found = carving(err, losses=type(FitSettings().losses)(ground_height=0.0))
-    field, barred = found.field, found.field.occupancy.barred.view(-1)
-    assert found.points is not None
-    ends = field.to_grid(found.points.ends)
-    on_tower = ends[found.points.ends[:, 2] > 0.2]
+    found = free_space(err, losses=type(FitSettings().losses)(ground_height=0.0))
+    field, forced = found.field, found.field.occupancy.barred.view(-1)
+    assert found.sparse is not None
+    ends = field.to_grid(found.sparse.points)
+    on_tower = ends[found.sparse.points[:, 2] > 0.2]
     assert len(on_tower) > 10
     cells, _ = field._cells(on_tower)
-    assert not barred[cells].any(), "where points lie"
+    assert not forced[cells].any(), "cells of points"
     side = 2.0 / field.occupancy.side  # of the cells of the first cascade
     beside, _ = field._cells(on_tower - torch.tensor([0.9 * side, 0.0, 0.0]))
-    assert not barred[beside].any(), "and beside them"
-    found.points = None
+    assert not forced[beside].any(), "and their neighbours"
+    found.sparse = None
     found.force_empty()
-    assert barred[cells].float().mean() > 0.2, "without points the word would empty it"
+    assert forced[cells].float().mean() > 0.2, "without points the labels empty the tower"
 
 
-def test_what_is_much_nearer_to_a_camera_than_its_points_is_empty():
-    found = carving(losses=type(FitSettings().losses)(ground_height=0.0))
+def test_space_much_nearer_to_a_camera_than_its_points_is_empty():
+    found = free_space(losses=type(FitSettings().losses)(ground_height=0.0))
     field, occupancy = found.field, found.field.occupancy
-    assert found.points is not None
+    assert found.sparse is not None
     middle, size = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
     x, radius = middle * field.unit + field.centre, size * field.unit * 3**0.5 / 2
     before = found.too_near_camera(x, radius)
-    away = torch.stack([(x - eye).norm(dim=-1) for eye in found.pixels.c2w[:, :3, 3]])
-    nearest = [found.points.depth[found.points.image == i] for i in range(12)]
-    told = torch.tensor([len(each) >= 20 for each in nearest])
-    assert before.any() and told.any()
-    reach = [0.8 * float(each.quantile(0.02)) if len(each) >= 20 else 0.0 for each in nearest]
-    within = (away < torch.tensor(reach)[:, None]).any(0)
-    assert within[before].all() and away[told].amin(0)[before].max() > 0.7 * max(reach)
+    distance = torch.stack([(x - eye).norm(dim=-1) for eye in found.pixels.c2w[:, :3, 3]])
+    nearest = [found.sparse.depth[found.sparse.image == i] for i in range(12)]
+    enough = torch.tensor([len(each) >= 20 for each in nearest])
+    assert before.any() and enough.any()
+    clearance = [0.8 * float(each.quantile(0.02)) if len(each) >= 20 else 0.0 for each in nearest]
+    within = (distance < torch.tensor(clearance)[:, None]).any(0)
+    assert within[before].all() and distance[enough].amin(0)[before].max() > 0.7 * max(clearance)
     spared = ~occupancy.barred.view(-1)[before]
-    apart = torch.cdist(x[before][spared], found.points.ends).amin(-1)
-    assert spared.float().mean() < 0.5 and (apart < 3 * size.min() * field.unit).all(), "by points"
-    one = int(told.nonzero()[0, 0])
-    found.points = found.points.select(torch.isin(found.points.image, torch.tensor([one])))
-    assert away[one][found.too_near_camera(x, radius)].max() < float(nearest[one].min()) + 1e-3
-    found.points = found.points.select(torch.arange(19))
-    assert not found.too_near_camera(x, radius).any(), "too few points say nothing"
-    found.points = None
+    apart = torch.cdist(x[before][spared], found.sparse.points).amin(-1)
+    assert spared.float().mean() < 0.5 and (apart < 3 * size.min() * field.unit).all(), (
+        "near points"
+    )
+    one = int(enough.nonzero()[0, 0])
+    found.sparse = found.sparse.select(torch.isin(found.sparse.image, torch.tensor([one])))
+    assert distance[one][found.too_near_camera(x, radius)].max() < float(nearest[one].min()) + 1e-3
+    found.sparse = found.sparse.select(torch.arange(19))
+    assert not found.too_near_camera(x, radius).any(), "too few points"
+    found.sparse = None
     assert not found.too_near_camera(x, radius).any()
 
 
-def test_smooth_ground_right_before_a_camera_is_spared():
-    """Its nearest points lie far off: an asphalt road has few."""
-    found = carving()
-    assert found.points is not None and found.ground is not None
+def test_smooth_ground_near_a_camera_is_not_emptied():
+    """An asphalt road has few points, so the nearest ones are far away."""
+    found = free_space()
+    assert found.sparse is not None and found.ground is not None
     middle, size = found.field.occupancy.cell_centres(
         torch.arange(found.field.occupancy.occupied.numel())
     )
     x, radius = middle * found.field.unit + found.field.centre, size * found.field.unit * 3**0.5 / 2
-    some = found.points
-    found.points = SparseDepth(some.rays_o, some.rays_d, some.depth + 4.0, some.image)
-    known = found.ground.height_above(middle)[1]
-    low = known & (x[:, 2].abs() < radius)
-    kept, found.ground = found.too_near_camera(x, radius), None
+    sparse = found.sparse
+    found.sparse = SparseDepth(sparse.rays_o, sparse.rays_d, sparse.depth + 4.0, sparse.image)
+    valid = found.ground.height_above(middle)[1]
+    low = valid & (x[:, 2].abs() < radius)
+    near, found.ground = found.too_near_camera(x, radius), None
     without = found.too_near_camera(x, radius)
-    assert (without & low).sum() > 20 and not (kept & low).any()
-    assert (kept & known).any() and torch.equal(kept & ~known, without & ~known)
+    assert (without & low).sum() > 20 and not (near & low).any()
+    assert (near & valid).any() and torch.equal(near & ~valid, without & ~valid)
 
 
-def test_what_is_below_a_crest_nearby_is_not_taken_to_be_in_the_open():
-    """A ditch 0.3 units deep: what is in it is hidden from most, though they see its far bank."""
+def test_balls_below_a_nearby_crest_are_not_above_crests():
+    """A ditch 0.3 units deep: its inside is hidden from most views, which see the far bank."""
     xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 7
     z = torch.where(xy[:, 0].abs() < 0.5, -0.3, 0.0)
-    ground = ground_map.fit_ground_height(torch.cat([xy, z[:, None]], -1))
+    ground = ground_height.fit_ground_height(torch.cat([xy, z[:, None]], -1))
     assert ground is not None
     q = torch.tensor([[0.0, 0.0, -0.15], [0.0, 0.0, 0.9], [2.5, 0.0, 0.9]])
-    assert ground.clears(q, torch.full((3,), 0.02)).tolist() == [False, True, True]
-    assert not ground.clears(q, torch.full((3,), 0.9)).any()
+    assert ground.is_above_crests(q, torch.full((3,), 0.02)).tolist() == [False, True, True]
+    assert not ground.is_above_crests(q, torch.full((3,), 0.9)).any()
 
 
-def test_where_no_point_lies_nothing_is_taken_to_be_in_the_open():
-    """A lawn without points beside a road with many may lie higher than the road."""
+def test_balls_above_ground_without_points_are_not_above_crests():
+    """A lawn without points beside a road with many can be higher than the road."""
     xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 4
     xy = xy[xy[:, 0] < 0]
-    ground = ground_map.fit_ground_height(torch.cat([xy, torch.zeros(len(xy), 1)], -1))
+    ground = ground_height.fit_ground_height(torch.cat([xy, torch.zeros(len(xy), 1)], -1))
     assert ground is not None
     q = torch.tensor([[-0.5, 0.0, 0.1], [0.1, 0.0, 0.1], [0.35, 0.0, 0.1]])
-    assert ground.height_above(q)[1].all(), "but the map is known there"
-    assert ground.clears(q, torch.full((3,), 0.02)).tolist() == [True, True, False]
+    assert ground.height_above(q)[1].all(), "the height is valid, but not supported"
+    assert ground.is_above_crests(q, torch.full((3,), 0.02)).tolist() == [True, True, False]
 
 
 def refined(found):
-    """With cells of half the size, as later in a fit."""
+    """The same with cells of half the size, as later in a fit."""
     found.field.occupancy.refine()
     found.force_empty(everywhere=False)
     return found
 
 
 def rim(shift):
-    """Samples on rays from the side that graze the tower's left edge at 1 m, some of it beside."""
+    """Samples at 1 m height on rays from +x, shifted along y across the tower's edges."""
     o = torch.tensor([4.0, 0.0, 1.5]).expand(shift.shape[0], 3)
     x = torch.tensor([0.5, 0.0, 1.0]) + shift[:, None] * torch.tensor([0.0, 1.0, 0.0])
     t = (x - o).norm(dim=-1)
     return x, (x - o) / t[:, None], t
 
 
-def asked(found, x, d, t, classed=False):
+def penalised_samples(found, x, d, t, use_classes=False):
     q = found.field.to_grid(x)
-    far, _, pulled = found.ground_offsets(q, d, t / found.field.unit, EXACT, classed)
-    return torch.zeros(len(x), dtype=torch.bool).index_fill(0, far[pulled], True)
+    off, _, penalised = found.ground_offsets(q, d, t / found.field.unit, EXACT, use_classes)
+    return torch.zeros(len(x), dtype=torch.bool).index_fill(0, off[penalised], True)
 
 
-def test_the_air_beside_the_tower_costs_and_the_tower_does_not():
-    found = refined(carving())
+def test_air_beside_the_tower_is_penalised_and_the_tower_is_not():
+    found = refined(free_space())
     x, d, t = rim(torch.linspace(-1.5, 1.5, 61))
-    spared = asked(found, x, d, t)
-    assert spared[x[:, 1].abs() > 1.35].all(), "half of the views see it before or behind the tower"
+    near_tower = penalised_samples(found, x, d, t)
+    assert near_tower[x[:, 1].abs() > 1.35].all(), "closer, half of the views see the tower"
     found.obstacle[:] = False
-    costs = asked(found, x, d, t)
-    assert found.ground is not None and costs[x[:, 1].abs() > 1.0].all()
-    assert not costs[in_matter(x)].any()
-    bare = carving(losses=type(FitSettings().losses)(ground_height=0.0))
-    assert bare.ground is None and not asked(bare, x, d, t).any()
+    without_obstacle = penalised_samples(found, x, d, t)
+    assert found.ground is not None and without_obstacle[x[:, 1].abs() > 1.0].all()
+    assert not without_obstacle[in_matter(x)].any()
+    bare = free_space(losses=type(FitSettings().losses)(ground_height=0.0))
+    assert bare.ground is None and not penalised_samples(bare, x, d, t).any()
 
 
-def test_views_that_take_the_tower_for_ground_do_not_thin_it():
+def test_a_minority_of_wrong_views_does_not_penalise_the_tower():
     def err(count):
         wrong = range(0, 12, 12 // count)
 
@@ -227,93 +229,93 @@ def test_views_that_take_the_tower_for_ground_do_not_thin_it():
         return change
 
     x, d, t = rim(torch.linspace(-0.4, 0.4, 17))
-    for few in (1, 4):
-        assert not asked(carving(err(few)), x, d, t).any()
+    for count in (1, 4):
+        assert not penalised_samples(free_space(err(count)), x, d, t).any()
 
 
-def test_matter_with_points_of_its_own_is_spared():
-    """Most views take the tower for ground, but not those that show the points on it."""
+def test_obstacles_with_points_of_their_own_are_exempt():
+    """Most views label the tower ground, but not those that observe the points on it."""
 
     def err(maps):
         return [*maps[:4], *(np.where(m == 2, 9, m).astype(np.uint8) for m in maps[4:])]
 
-    found = carving(err)
+    found = free_space(err)
     x, d, t = rim(torch.linspace(-0.4, 0.4, 17))
-    assert not asked(found, x, d, t).any()
+    assert not penalised_samples(found, x, d, t).any()
     found.obstacle[:] = False
-    assert asked(found, x, d, t).any()
+    assert penalised_samples(found, x, d, t).any()
 
 
-def test_a_point_is_one_however_many_photos_show_it_and_most_of_them_name_it():
-    found = carving()
-    once = points(poses(12, height=1.5))
-    assert found.points is not None
+def test_points_are_merged_over_views_and_classified_by_majority():
+    found = free_space()
+    once = tower_and_ground(poses(12, height=1.5))
+    assert found.sparse is not None
     many = SparseDepth(*(torch.cat([each] * 3) for each in vars(once).values()))
-    places, lies = found.classify_points(many)
-    single, alone = found.classify_points(once)
-    assert len(places) == len(single) == len(once.depth) and torch.equal(lies, alone)
-    ground = (places * found.field.unit + found.field.centre)[:, 2].abs() < 0.01
-    assert (ground == lies).float().mean() > 0.97, "but for pixels at the tower's foot"
+    q, on_ground = found.classify_points(many)
+    single, single_on_ground = found.classify_points(once)
+    assert len(q) == len(single) == len(once.depth) and torch.equal(on_ground, single_on_ground)
+    ground = (q * found.field.unit + found.field.centre)[:, 2].abs() < 0.01
+    assert (ground == on_ground).float().mean() > 0.97, "except for pixels at the tower's foot"
 
 
-def test_points_off_the_map_are_no_ground_and_spare_what_is_by_them(monkeypatch):
-    """A terrace 60 cm up: the map cannot step, and must not level it."""
-    found = carving()
+def test_ground_points_off_the_fitted_height_are_steps_and_exempt(monkeypatch):
+    """A terrace 60 cm high, a step that the fitted height cannot follow."""
+    found = free_space()
     xy = (torch.rand(3000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 20
     z = torch.where(xy[:, 0] > 0.2, 0.6, 0.0)
     q = found.field.to_grid(torch.cat([xy, z[:, None]], -1))
-    lies = torch.ones(3000, dtype=torch.bool)
-    monkeypatch.setattr(found, "classify_points", lambda _: (q, lies.clone()))
+    on_ground = torch.ones(3000, dtype=torch.bool)
+    monkeypatch.setattr(found, "classify_points", lambda _: (q, on_ground.clone()))
     found.fit_ground()
     found.rasterise_points()
     assert found.ground is not None
-    over, known = found.ground.height_above(q)
-    off = over.abs() > found.ground.tolerance
-    assert known.all() and 0.02 < off.float().mean() < 0.2
+    height, valid = found.ground.height_above(q)
+    off = height.abs() > found.ground.tolerance
+    assert valid.all() and 0.02 < off.float().mean() < 0.2
     cells, _ = found.field._cells(q[off])
-    assert found.obstacle.view(-1)[cells].all() and found.stepped.view(-1)[cells].all()
-    assert not found.stepped.view(-1)[found.field._cells(q[over.abs() < 0.01])[0]].all()
+    assert found.obstacle.view(-1)[cells].all() and found.near_step.view(-1)[cells].all()
+    assert not found.near_step.view(-1)[found.field._cells(q[height.abs() < 0.01])[0]].all()
 
 
-def test_samples_far_from_the_ground_are_told_and_where_they_should_be():
-    found = carving()
+def test_samples_off_the_ground_get_the_depth_of_the_ground():
+    found = free_space()
     o = torch.tensor([4.0, 0.0, 1.5]).expand(4, 3)
     foot = torch.tensor([[2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [2.0, 2.0, 0.0], [0.5, 0.0, 1.0]])
-    way = (foot - o).norm(dim=-1)
-    d = (foot - o) / way[:, None]
-    t = way * torch.tensor([0.7, 1.0, 1.2, 1.0])  # above, on and under the ground; on the tower
+    length = (foot - o).norm(dim=-1)
+    d = (foot - o) / length[:, None]
+    t = length * torch.tensor([0.7, 1.0, 1.2, 1.0])  # above, on and under the ground; on the tower
     x = o + t[:, None] * d
     q = found.field.to_grid(x)
-    far, goal, pulled = found.ground_offsets(q, d, t / found.field.unit, EXACT)
-    assert far[pulled].tolist() == [0, 2]
-    assert torch.allclose(goal[pulled] * found.field.unit, way[[0, 2]], atol=0.15)
+    off, target, penalised = found.ground_offsets(q, d, t / found.field.unit, EXACT)
+    assert off[penalised].tolist() == [0, 2]
+    assert torch.allclose(target[penalised] * found.field.unit, length[[0, 2]], atol=0.15)
 
 
-def test_what_stands_is_spared_with_a_rim_about_it():
-    """Labels alone tell of it: the tower's points are taken for ground's."""
-    found = carving()
-    found.standing = found.standing[:0]
+def test_obstacles_from_labels_are_exempt_with_a_margin():
+    """From labels alone, without obstacle points."""
+    found = free_space()
+    found.obstacle_points = found.obstacle_points[:0]
     found.rasterise_points()
     beside = torch.tensor([0.0, 0.0, 0.9]).repeat(60, 1)
     beside[:, 1] = torch.linspace(0.0, 2.5, 60)
     o = torch.tensor([4.0, 0.0, 1.5]).expand(60, 3)
     t = (beside - o).norm(dim=-1)
-    costs = asked(found, beside, (beside - o) / t[:, None], t)
+    penalised = penalised_samples(found, beside, (beside - o) / t[:, None], t)
     cell = 2 * found.field.unit / found.field.occupancy.side
     off = beside[:, 1] - 0.5
-    assert not costs[off < 0.5 * cell].any() and costs[off > 3 * cell].all()
+    assert not penalised[off < 0.5 * cell].any() and penalised[off > 3 * cell].all()
     hull = found.find_obstacles()
-    beyond = torch.roll(hull, 1, dims=2) & ~hull
-    beyond[:, :, 0] = False
-    assert beyond.any() and found.obstacle[beyond].all(), "neighbours along y"
+    margin = torch.roll(hull, 1, dims=2) & ~hull
+    margin[:, :, 0] = False
+    assert margin.any() and found.obstacle[margin].all(), "neighbours along y"
     found.obstacle[:] = False
-    bare = asked(found, beside, (beside - o) / t[:, None], t)
-    assert bare[off > 0].sum() > costs.sum() and not bare[off < 0].any()
+    bare = penalised_samples(found, beside, (beside - o) / t[:, None], t)
+    assert bare[off > 0].sum() > penalised.sum() and not bare[off < 0].any()
 
 
-def test_lumps_by_the_tower_cost_once_the_field_takes_them_for_ground(monkeypatch):
-    """It takes all that is more than 5 cm beside the tower for ground; a step is let be."""
-    found = carving()
+def test_the_margin_is_penalised_where_the_field_classifies_ground(monkeypatch):
+    """The field classifies everything more than 5 cm beside the tower as ground."""
+    found = free_space()
     field, edge = found.field, 0.55
 
     def surface_at(u):
@@ -325,28 +327,34 @@ def test_lumps_by_the_tower_cost_once_the_field_takes_them_for_ground(monkeypatc
 
     monkeypatch.setattr(field, "surface_at", surface_at)
     x, d, t = rim(torch.linspace(-0.5, 1.5, 41))
-    before, later = asked(found, x, d, t), asked(found, x, d, t, classed=True)
+    before, later = (
+        penalised_samples(found, x, d, t),
+        penalised_samples(found, x, d, t, use_classes=True),
+    )
     by_class = x[:, 1] > edge
-    spared = found.obstacle.view(-1)[field._cells(field.to_grid(x))[0]]
-    assert (by_class & spared).any() and not before[spared].any()
+    exempt = found.obstacle.view(-1)[field._cells(field.to_grid(x))[0]]
+    assert (by_class & exempt).any() and not before[exempt].any()
     assert later[by_class].all() and torch.equal(later[~by_class], before[~by_class])
-    found.steps = found.standing = field.to_grid(x[by_class])
+    found.step_points = found.obstacle_points = field.to_grid(x[by_class])
     found.rasterise_points()
-    stepped = asked(found, x, d, t, classed=True)
+    stepped = penalised_samples(found, x, d, t, use_classes=True)
     assert not stepped[by_class].any()
 
 
-def test_what_stands_is_kept_when_cells_are_halved():
-    found = refined(carving())
-    asked_again = found.find_obstacles()
-    assert found.hull is not None and found.hull.shape == asked_again.shape
-    both, either = (found.hull & asked_again).sum(), (found.hull | asked_again).sum()
-    assert asked_again.any() and both > 0.6 * either, (both, either)
-    assert (found.obstacle | ~asked_again).float().mean() > 0.999
+def test_obstacles_are_upsampled_when_the_occupancy_is_refined():
+    found = refined(free_space())
+    recomputed = found.find_obstacles()
+    assert found.obstacle_hull is not None and found.obstacle_hull.shape == recomputed.shape
+    both, either = (
+        (found.obstacle_hull & recomputed).sum(),
+        (found.obstacle_hull | recomputed).sum(),
+    )
+    assert recomputed.any() and both > 0.6 * either, (both, either)
+    assert (found.obstacle | ~recomputed).float().mean() > 0.999
 
 
-def test_a_label_is_looked_up_where_a_ray_goes_through_the_picture():
-    found = carving()
+def test_labels_are_looked_up_at_the_pixel_of_a_direction():
+    found = free_space()
     pixels = found.pixels
     batch = pixels.draw(500, torch.Generator().manual_seed(0))
     assert torch.equal(pixels.label_towards(batch.image, batch.rays_d), batch.label)

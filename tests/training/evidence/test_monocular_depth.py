@@ -1,3 +1,5 @@
+"""Alignment of relative depth: recovered scale and shift, gradients, and degenerate input."""
+
 import numpy as np
 import pytest
 import torch
@@ -15,27 +17,29 @@ def rays(n=4000, images=3, seed=0):
 SCALE, SHIFT = torch.tensor([2.0, 0.5, 30.0]), torch.tensor([-1.0, 4.0, 0.1])
 
 
-def test_scale_and_shift_of_each_image_are_found():
+def test_scale_and_shift_of_each_image_are_recovered():
     image, inverse = rays()
     relative = DepthAlignment(3)
     loss = relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)
-    scale, shift, spread = relative.affine()
+    scale, shift, variance = relative.scale_and_shift()
     assert torch.allclose(scale, SCALE, rtol=1e-3) and torch.allclose(shift, SHIFT, atol=1e-2)
-    assert (spread > 0).all() and loss < 1e-6
+    assert (variance > 0).all() and loss < 1e-6
 
 
-def test_the_loss_does_not_depend_on_the_networks_units():
+def test_loss_is_invariant_to_scale_and_shift():
     image, inverse = rays()
-    bent = inverse + 0.1 * torch.sin(20 * inverse)
-    first = DepthAlignment(3).loss(inverse, bent, image, inverse > 0)
-    second = DepthAlignment(3).loss(inverse, SCALE[image] * bent + SHIFT[image], image, inverse > 0)
+    distorted = inverse + 0.1 * torch.sin(20 * inverse)
+    first = DepthAlignment(3).loss(inverse, distorted, image, inverse > 0)
+    second = DepthAlignment(3).loss(
+        inverse, SCALE[image] * distorted + SHIFT[image], image, inverse > 0
+    )
     assert first == pytest.approx(float(second), rel=1e-3) and first > 1e-3
 
 
-def test_gradients_move_a_wrong_depth_towards_the_right_one():
+def test_gradient_descent_reduces_a_wrong_depth():
     image, inverse = rays()
     given = inverse.clone()
-    given[0] += 0.3  # nearer than it should be
+    given[0] += 0.3  # too near
     given.requires_grad_()
     DepthAlignment(3).loss(
         given, SCALE[image] * inverse + SHIFT[image], image, inverse > 0
@@ -44,12 +48,12 @@ def test_gradients_move_a_wrong_depth_towards_the_right_one():
     assert given.grad[0] > 0 and given.grad[0] > 10 * given.grad[1:].abs().median()
 
 
-def test_what_is_not_known_or_inside_out_says_nothing():
+def test_unusable_or_inverted_depth_gives_no_loss():
     image, inverse = rays()
     relative = DepthAlignment(3)
-    bent = inverse + 0.1 * torch.sin(20 * inverse)
-    assert relative.loss(inverse, -bent, image, inverse > 0) == 0  # far would be near
-    assert DepthAlignment(3).loss(inverse, bent, image, inverse > 0) > 0
+    distorted = inverse + 0.1 * torch.sin(20 * inverse)
+    assert relative.loss(inverse, -distorted, image, inverse > 0) == 0  # inverted depth order
+    assert DepthAlignment(3).loss(inverse, distorted, image, inverse > 0) > 0
     none = torch.zeros(len(image), dtype=torch.bool)
     assert relative.loss(inverse, inverse, image, none) == 0
     few = torch.arange(len(image)) < 10
@@ -58,16 +62,16 @@ def test_what_is_not_known_or_inside_out_says_nothing():
     assert flat == 0 and torch.isfinite(flat)
 
 
-def test_sums_from_earlier_steps_help_when_a_step_has_few_rays():
+def test_sums_accumulate_over_steps_with_few_rays():
     image, inverse = rays(60)
     relative = DepthAlignment(3)
     for seed in range(5):
         image, inverse = rays(60, seed=seed)
         relative.loss(inverse, SCALE[image] * inverse + SHIFT[image], image, inverse > 0)
-    assert (relative.affine()[2] > 0).all()
+    assert (relative.scale_and_shift()[2] > 0).all()
 
 
-def test_relative_depth_of_any_unit_fits_into_half_floats():
+def test_relative_depth_is_scaled_to_fit_half_floats():
     disparity = np.array([[1.0, 2.0], [60_000.0, np.nan]]) * 100
     kept = in_units(disparity).astype(np.float16)
     assert kept[1, 0] == 1 and kept[0, 1] == pytest.approx(2 * kept[0, 0], rel=1e-2)

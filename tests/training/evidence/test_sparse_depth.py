@@ -1,3 +1,5 @@
+"""Sparse depth: which rays a scene gives, and how masks hide some of them."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +14,14 @@ from climatenerf.training.run import load_pixels
 
 @pytest.fixture
 def scene(tmp_path):
-    """The toy with three points, of which its views show none, one, two and three in turn."""
+    """The toy scene with three points; views observe none, one, two and three in turn."""
     points = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 0.2], [-1.0, 0.5, 0.3]])
     scene = make_scene(tmp_path)
     views = tuple(replace(v, seen=np.arange(i % 4)) for i, v in enumerate(scene.views))
     return replace(scene, points=points, views=views)
 
 
-def test_rays_end_on_their_points_and_held_out_views_give_none(scene):
+def test_rays_end_at_their_points_and_skip_held_out_views(scene):
     found = read_sparse_depth(scene)
     assert found is not None
     training = scene.of_split("train")
@@ -29,7 +31,7 @@ def test_rays_end_on_their_points_and_held_out_views_give_none(scene):
     expected = np.concatenate([scene.points_world()[v.seen] for v in training])
     np.testing.assert_allclose(ends, expected, atol=1e-5)
     assert torch.allclose(found.rays_d.norm(dim=-1), torch.ones(len(ends)))
-    # They are rays of the photos: the points project into the pictures along them.
+    # The direction is that of the pixel onto which the point projects.
     view = next(v for v in training if len(v.seen))
     local = (expected[0] - scene.c2w_world(view)[:3, 3]) @ scene.c2w_world(view)[:3, :3]
     pixel = CAMERA.project(local)
@@ -37,7 +39,7 @@ def test_rays_end_on_their_points_and_held_out_views_give_none(scene):
     np.testing.assert_allclose(found.rays_d[0], direction, atol=1e-5)
 
 
-def test_drawn_rays_stay_whole(scene):
+def test_drawn_rays_keep_origin_direction_and_depth_together(scene):
     found = read_sparse_depth(scene)
     drawn = found.draw(50, torch.Generator().manual_seed(0))
     ends = drawn.rays_o + drawn.depth[:, None] * drawn.rays_d
@@ -47,7 +49,7 @@ def test_drawn_rays_stay_whole(scene):
     assert distance.min(dim=1).values.max() < 1e-5
 
 
-def test_without_knowledge_of_who_sees_what_there_are_none(scene):
+def test_no_sparse_depth_without_points_or_observations(scene):
     unknown = tuple(replace(v, seen=None) for v in scene.views)
     assert read_sparse_depth(replace(scene, views=unknown)) is None
     assert read_sparse_depth(replace(scene, points=None)) is None
@@ -55,9 +57,9 @@ def test_without_knowledge_of_who_sees_what_there_are_none(scene):
     assert read_sparse_depth(replace(scene, views=nothing)) is None
 
 
-def test_what_a_mask_hides_is_no_measured_depth(scene, tmp_path):
-    """A mirror's points lie behind it: where it is masked they tell nothing of the wall."""
-    every = read_sparse_depth(scene)
+def test_masked_pixels_give_no_sparse_depth(scene, tmp_path):
+    """A masked mirror, for example: its points lie behind the wall."""
+    unmasked = read_sparse_depth(scene)
     views = scene.of_split("train")
     view = next(v for v in views if len(v.seen) == 3)
     c2w, points = scene.c2w_world(view), scene.points_world()[view.seen]
@@ -73,9 +75,9 @@ def test_what_a_mask_hides_is_no_measured_depth(scene, tmp_path):
     masked = replace(scene, views=masked)
     found = unmasked_sparse_depth(masked, load_pixels(masked, 1))
     image = [v.name for v in views].index(view.name)
-    assert (every.image == image).sum() == 3 and (found.image == image).sum() == 2
-    assert (found.image != image).sum() == (every.image != image).sum()
-    left = points[np.argmin(column)]
-    ends = found.ends[found.image == image].numpy()
-    assert np.linalg.norm(ends - left, axis=-1).min() > 0.1
-    assert unmasked_sparse_depth(scene, load_pixels(scene, 1)).depth.shape == every.depth.shape
+    assert (unmasked.image == image).sum() == 3 and (found.image == image).sum() == 2
+    assert (found.image != image).sum() == (unmasked.image != image).sum()
+    hidden = points[np.argmin(column)]
+    ends = found.points[found.image == image].numpy()
+    assert np.linalg.norm(ends - hidden, axis=-1).min() > 0.1
+    assert unmasked_sparse_depth(scene, load_pixels(scene, 1)).depth.shape == unmasked.depth.shape
