@@ -1,11 +1,16 @@
-"""Fixtures shared by all tests."""
+"""Fixtures and settings shared by all tests."""
 
 import os
 from pathlib import Path
 
 import pytest
+from jaxtyping import install_import_hook
+from support.shape_checks import MODULES
 
-from climatenerf.cli import THREADING
+# Before any of these modules is imported.
+install_import_hook(MODULES, "support.shape_checks.checked")
+
+from climatenerf.cli import THREADING  # noqa: E402
 
 # Before any test imports torch: without it two OpenMP run times spin against each other.
 for variable, value in THREADING.items():

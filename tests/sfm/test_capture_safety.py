@@ -16,7 +16,7 @@ from support.photo_builders import exif, photo
 from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.export import export_colmap
-from climatenerf.sfm.scene_folder import FORMER, RECORD
+from climatenerf.sfm.scene_folder import OLD_RECORD, RECORD
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
 
@@ -176,7 +176,7 @@ def test_a_record_without_a_list_is_read_with_care(posed, capsys):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
     (out / RECORD).unlink()
-    (out / "work" / FORMER).write_text('{"places": ["images"]}')
+    (out / "work" / OLD_RECORD).write_text('{"places": ["images"]}')
     mine = out / "labels" / "mine.png"
     Image.new("L", (384, 216), 10).save(mine)
     assert capture(posed, out) == 0

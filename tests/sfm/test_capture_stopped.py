@@ -115,7 +115,7 @@ def others(folder):
 @pytest.mark.slow
 def test_a_photo_of_200_megapixels(tmp_path):
     """Of noise, so that it is no easy one; decoding it may take memory, but not many times over."""
-    from climatenerf.sfm.photo_import import LONGEST, take_in
+    from climatenerf.sfm.photo_import import MAX_SIDE, import_photos
 
     (tmp_path / "in").mkdir()
     rng = np.random.default_rng(0)
@@ -127,6 +127,6 @@ def test_a_photo_of_200_megapixels(tmp_path):
     large.save(tmp_path / "in" / "large.png", compress_level=1)
     large.save(tmp_path / "in" / "large.jpg", quality=80)
     tile.save(tmp_path / "in" / "small.jpg")
-    taken = take_in(tmp_path / "in", tmp_path / "work", lambda done, total: None)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", lambda done, total: None)
     assert not taken.unusable
-    assert {max(p.width, p.height) for p in taken.pictures} == {LONGEST, 1000}
+    assert {max(p.width, p.height) for p in taken.pictures} == {MAX_SIDE, 1000}

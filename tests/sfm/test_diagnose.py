@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from climatenerf.sfm.diagnose import diagnose, turned_only, verified_matches
+from climatenerf.sfm.diagnose import diagnose, is_pure_rotation, verified_matches
 from climatenerf.sfm.exif import Exif
-from climatenerf.sfm.photo_import import Intake, Picture
-from climatenerf.sfm.reconstruct import _names, groups_of
+from climatenerf.sfm.photo_import import PhotoImport, Picture
+from climatenerf.sfm.reconstruct import _names, group_sizes
 
 PAIR = 2147483647
 
@@ -44,8 +44,8 @@ def test_each_reason(tmp_path):
         picture("lone"), picture("far1"), picture("far2"), picture("odd"),
         picture("plain", sharp=20),
     )  # fmt: skip
-    lost = diagnose(Intake(tmp_path, pictures, {}, False), ("a.jpg", "b.jpg"), path)
-    reasons = {one.name.removesuffix(".jpg"): one for one in lost}
+    unposed = diagnose(PhotoImport(tmp_path, pictures, {}, False), ("a.jpg", "b.jpg"), path)
+    reasons = {one.name.removesuffix(".jpg"): one for one in unposed}
     assert set(reasons) == {"soft", "dark", "lone", "far1", "far2", "odd", "plain"}
     # Sharp, but of a subject with less detail: not called blurred.
     assert "few matches" in reasons["plain"].reason and "20%" in reasons["plain"].reason
@@ -67,8 +67,8 @@ def test_a_folder_whose_name_an_address_would_read_otherwise(tmp_path, monkeypat
     path = database(tmp_path / name / "d.db", {("a", "b"): 500})
     assert verified_matches(path) == {("a.jpg", "b.jpg"): 500}
     assert sorted(_names(path)) == ["a.jpg", "b.jpg"]
-    intake = flat_pairs(tmp_path / name / "flat.db", plane_maps(0.0))
-    assert turned_only(*intake)
+    imported = flat_pairs(tmp_path / name / "flat.db", plane_maps(0.0))
+    assert is_pure_rotation(*imported)
     assert not list((tmp_path / "here").iterdir())
 
 
@@ -90,7 +90,7 @@ def flat_pairs(path, maps, general=0):
             connection.execute("INSERT INTO two_view_geometries VALUES (?, ?, ?, ?)", row)
     pictures = tuple(picture(str(i)) for i in range(len(maps) + general + 1))
     pictures = tuple(replace(p, name=f"{i}.jpg") for i, p in enumerate(pictures))
-    return Intake(path.parent, pictures, {}, False), path
+    return PhotoImport(path.parent, pictures, {}, False), path
 
 
 def plane_maps(step, count=8, focal=1.3):
@@ -107,13 +107,13 @@ def plane_maps(step, count=8, focal=1.3):
 
 
 def test_turning_alone_is_told_from_walking_past_a_wall(tmp_path):
-    assert turned_only(*flat_pairs(tmp_path / "a.db", plane_maps(0.0)))
-    assert turned_only(*flat_pairs(tmp_path / "b.db", plane_maps(0.02)))
-    assert not turned_only(*flat_pairs(tmp_path / "c.db", plane_maps(0.5)))
-    assert not turned_only(*flat_pairs(tmp_path / "d.db", plane_maps(0.0), general=4))
-    assert not turned_only(*flat_pairs(tmp_path / "e.db", []))
+    assert is_pure_rotation(*flat_pairs(tmp_path / "a.db", plane_maps(0.0)))
+    assert is_pure_rotation(*flat_pairs(tmp_path / "b.db", plane_maps(0.02)))
+    assert not is_pure_rotation(*flat_pairs(tmp_path / "c.db", plane_maps(0.5)))
+    assert not is_pure_rotation(*flat_pairs(tmp_path / "d.db", plane_maps(0.0), general=4))
+    assert not is_pure_rotation(*flat_pairs(tmp_path / "e.db", []))
 
 
 def test_a_group_is_what_no_larger_one_holds():
-    assert groups_of([set("abc"), set("abcdefg"), set("defgx"), set("uvwa")]) == [7, 3]
-    assert groups_of([set("abcd")]) == [4]
+    assert group_sizes([set("abc"), set("abcdefg"), set("defgx"), set("uvwa")]) == [7, 3]
+    assert group_sizes([set("abcd")]) == [4]

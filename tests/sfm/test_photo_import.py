@@ -10,12 +10,12 @@ from support.photo_builders import exif, photo
 
 from climatenerf.core.errors import UserError
 from climatenerf.sfm import photo_import as module
-from climatenerf.sfm.photo_import import open_upright, sharpness, small_grey, take_in
+from climatenerf.sfm.photo_import import import_photos, open_upright, sharpness, small_grey
 from climatenerf.sfm.reconstruct import (
     EXHAUSTIVE_UP_TO,
     camera_groups,
-    pairs_of,
-    pairs_of_lost,
+    image_pairs,
+    retry_pairs,
 )
 
 
@@ -47,7 +47,7 @@ def test_pictures_stand_as_they_are_meant_to_be_seen(tmp_path, orientation):
     shown = photo(tmp_path / "x.png", (80, 48))
     stored = shown if TURN[orientation] is None else shown.transpose(TURN[orientation])
     stored.save(tmp_path / "in" / "turned.jpg", quality=98, exif=exif(orientation))
-    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     one = next(p for p in taken.pictures if p.source == "turned.jpg")
     assert (one.width, one.height) == (80, 48)
     image = Image.open(taken.folder / one.name)
@@ -67,7 +67,7 @@ def test_all_kinds_and_sizes_and_what_shares_a_camera(tmp_path, monkeypatch):
     (folder / "notes.txt").write_text("not a photo")
     photo(folder / ".thumbnails" / "a.jpg")
     monkeypatch.chdir(folder / "sub")
-    taken = take_in(Path(".."), tmp_path / "work", quiet)
+    taken = import_photos(Path(".."), tmp_path / "work", quiet)
     assert [p.source for p in taken.pictures] == [
         "a.jpg", "b.jpg", "c.jpg", "grey.png", "sub/a.png", "wide.webp",
     ]  # fmt: skip
@@ -82,16 +82,16 @@ def test_heic(tmp_path):
     (tmp_path / "in" / "bad.heic").write_bytes(b"\x00" * 100)
     # Stored lying, with a tag that turns it and a phone's EXIF: written by pillow-heif 1.4.
     shutil.copy(Path(__file__).with_name("upright.heic"), tmp_path / "in")
-    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     assert len(taken.pictures) == 4 and "bad.heic" in taken.unusable
     one = next(p for p in taken.pictures if p.source == "upright.heic")
     assert (one.width, one.height) == (48, 64) and one.exif.camera == "Apple iPhone 12"
     assert one.exif.focal == pytest.approx(26 / 43.2666 * 80 / 64, rel=1e-3)
-    assert one.exif.place == pytest.approx((47.3769, 8.5417, 410))
+    assert one.exif.gps == pytest.approx((47.3769, 8.5417, 410))
     assert one.exif.down_as_shown == pytest.approx((0.08, 0.87, 0.48), abs=0.02)
     r, g, _ = Image.open(taken.folder / one.name).getpixel((4, 4))
     assert r > 200 and g < 60, "the red block is at the upper left"
-    again = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    again = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     assert again.pictures == taken.pictures, "the record keeps all of it"
 
 
@@ -101,7 +101,7 @@ def test_what_is_no_picture_is_left_out_with_the_reason(tmp_path):
     (tmp_path / "in" / "empty.jpg").write_bytes(b"")
     whole = (tmp_path / "in" / "0.jpg").read_bytes()
     (tmp_path / "in" / "cut.jpg").write_bytes(whole[: len(whole) // 2])
-    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     assert len(taken.pictures) == 4
     assert set(taken.unusable) == {"text.png", "empty.jpg", "cut.jpg"}
     assert "empty" in taken.unusable["empty.jpg"]
@@ -109,7 +109,7 @@ def test_what_is_no_picture_is_left_out_with_the_reason(tmp_path):
     assert "damaged or cut off" in taken.unusable["cut.jpg"]
     (tmp_path / "in" / "gone.jpg").symlink_to("nowhere")
     (tmp_path / "in" / "folder.jpg").mkdir()
-    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     assert "link to a file that is not there" in taken.unusable["gone.jpg"]
     for words in taken.unusable.values():
         assert "<" not in words and "Errno" not in words
@@ -120,16 +120,16 @@ def test_too_few(tmp_path, count):
     (tmp_path / "in").mkdir()
     fill(tmp_path / "in", count)
     with pytest.raises(UserError, match="no photos" if count == 0 else "2 usable"):
-        take_in(tmp_path / "in", tmp_path / "work", quiet)
+        import_photos(tmp_path / "in", tmp_path / "work", quiet)
 
 
 def test_large_pictures_are_made_smaller_and_huge_ones_refused(tmp_path, monkeypatch):
     fill(tmp_path / "in", 3)
-    monkeypatch.setattr(module, "LONGEST", 100)
+    monkeypatch.setattr(module, "MAX_SIDE", 100)
     monkeypatch.setattr(module, "MAX_PIXELS", 100_000)
     photo(tmp_path / "in" / "large.jpg", (300, 150))
     photo(tmp_path / "in" / "huge.png", (600, 400))
-    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     large = next(p for p in taken.pictures if p.source == "large.jpg")
     assert (large.width, large.height) == (100, 50)
     assert "600x400" in taken.unusable["huge.png"] or "exceeds" in taken.unusable["huge.png"]
@@ -137,16 +137,16 @@ def test_large_pictures_are_made_smaller_and_huge_ones_refused(tmp_path, monkeyp
 
 def test_a_second_run_reads_nothing_again_but_what_changed(tmp_path, monkeypatch):
     fill(tmp_path / "in")
-    first = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    first = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     opened = []
     original = module.open_upright
     monkeypatch.setattr(module, "open_upright", lambda p: opened.append(p.name) or original(p))
-    assert take_in(tmp_path / "in", tmp_path / "work", quiet).pictures == first.pictures
+    assert import_photos(tmp_path / "in", tmp_path / "work", quiet).pictures == first.pictures
     assert not opened
     photo(tmp_path / "in" / "2.jpg", (48, 64), seed=9)
     record = first.folder / "1.json"
     record.write_text(record.read_text()[:20])  # killed while writing
-    again = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    again = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     assert opened == ["1.jpg", "2.jpg"]
     assert (again.pictures[2].width, again.pictures[2].height) == (48, 64)
 
@@ -180,38 +180,40 @@ def video(tmp_path):
 
 def test_the_sharpest_frame_of_each_interval(video, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "VIDEO_FRAMES", 6)
-    taken = take_in(video, tmp_path / "work", quiet)
+    taken = import_photos(video, tmp_path / "work", quiet)
     assert taken.is_video and 5 <= len(taken.pictures) <= 7
     sharp = [p.sharpness for p in taken.pictures]
     assert min(sharp) > 0.5 * max(sharp), "no blurred one was taken"
     stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "work" / "frames").glob("*.jpg")}
-    take_in(video, tmp_path / "work", quiet)
+    import_photos(video, tmp_path / "work", quiet)
     assert stamps == {p: p.stat().st_mtime_ns for p in stamps}, "frames are kept"
 
 
 def test_a_video_that_cannot_be_decoded(tmp_path):
     (tmp_path / "bad.mp4").write_bytes(b"not a video" * 100)
     with pytest.raises(UserError, match="cannot be decoded"):
-        take_in(tmp_path / "bad.mp4", tmp_path / "work", quiet)
+        import_photos(tmp_path / "bad.mp4", tmp_path / "work", quiet)
     (tmp_path / "song.mp3").write_bytes(b"x")
     with pytest.raises(UserError, match="neither .*; give the folder"):
-        take_in(tmp_path / "song.mp3", tmp_path / "work", quiet)
+        import_photos(tmp_path / "song.mp3", tmp_path / "work", quiet)
     with pytest.raises(UserError, match="does not exist"):
-        take_in(tmp_path / "absent", tmp_path / "work", quiet)
+        import_photos(tmp_path / "absent", tmp_path / "work", quiet)
 
 
 def test_records_are_plain_json(tmp_path):
     fill(tmp_path / "in", 3)
-    taken = take_in(tmp_path / "in", tmp_path / "work", quiet)
+    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
     record = json.loads((taken.folder / "0.json").read_text())
     assert record["source"] == "0.jpg" and record["width"] == 64
 
 
 def test_which_pictures_are_compared():
-    assert len(pairs_of(20, False)) == 190
-    assert len(pairs_of(EXHAUSTIVE_UP_TO, False)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) / 2
+    assert len(image_pairs(20, False)) == 190
+    assert (
+        len(image_pairs(EXHAUSTIVE_UP_TO, False)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) / 2
+    )
     for n, is_video in ((500, False), (90, True)):
-        pairs = pairs_of(n, is_video)
+        pairs = image_pairs(n, is_video)
         assert len(set(pairs)) == len(pairs) and all(0 <= i < j < n for i, j in pairs)
         assert len(pairs) < 0.5 * n * (n - 1) / 2
         for i in range(n - 1):
@@ -222,16 +224,16 @@ def test_which_pictures_are_compared():
 def test_a_scene_among_the_photos_is_not_taken_for_photos(tmp_path):
     fill(tmp_path / "in", 3)
     work = tmp_path / "in" / "scene" / "work"
-    take_in(tmp_path / "in", work, quiet)
+    import_photos(tmp_path / "in", work, quiet)
     photo(tmp_path / "in" / "scene" / "images" / "x.jpg")
-    assert len(take_in(tmp_path / "in", work, quiet).pictures) == 3
+    assert len(import_photos(tmp_path / "in", work, quiet).pictures) == 3
 
 
 def test_pictures_without_pose_get_a_second_chance():
-    assert pairs_of_lost([True, False, True], [(0, 1)]) == [(1, 2)]
-    assert pairs_of_lost([True, True, True], [(0, 1)]) == []
-    assert pairs_of_lost([True, False, True], pairs_of(3, False)) == []
-    many = pairs_of_lost([i % 2 == 0 for i in range(400)], [])
+    assert retry_pairs([True, False, True], [(0, 1)]) == [(1, 2)]
+    assert retry_pairs([True, True, True], [(0, 1)]) == []
+    assert retry_pairs([True, False, True], image_pairs(3, False)) == []
+    many = retry_pairs([i % 2 == 0 for i in range(400)], [])
     assert 5_000 < len(many) <= 10_000 and len(set(many)) == len(many)
 
 

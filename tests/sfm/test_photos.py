@@ -5,7 +5,7 @@ from support.photo_builders import photo
 
 from climatenerf.core.errors import UserError
 from climatenerf.sfm.photos import find_photos
-from climatenerf.sfm.scene_folder import FORMER, RECORD
+from climatenerf.sfm.scene_folder import OLD_RECORD, RECORD
 
 
 def names(found):
@@ -19,7 +19,7 @@ def folder(tmp_path):
     return tmp_path / "in"
 
 
-@pytest.mark.parametrize("mark", ["scene.json", RECORD, f"work/{FORMER}"])
+@pytest.mark.parametrize("mark", ["scene.json", RECORD, f"work/{OLD_RECORD}"])
 def test_pictures_of_another_scene_are_no_photos(folder, mark):
     scene = folder / "more" / "scene"
     photo(scene / "images" / "a.jpg")

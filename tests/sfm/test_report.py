@@ -3,9 +3,9 @@ import pytest
 from PIL import Image
 
 from climatenerf.scene import Camera, Scene, View
-from climatenerf.sfm.diagnose import Lost
+from climatenerf.sfm.diagnose import Unposed
 from climatenerf.sfm.exif import Exif
-from climatenerf.sfm.photo_import import Intake, Picture
+from climatenerf.sfm.photo_import import PhotoImport, Picture
 from climatenerf.sfm.reconstruct import Model
 from climatenerf.sfm.report import ground_coverage, sky_coverage, write_report
 
@@ -51,14 +51,14 @@ def test_ground_that_three_pictures_look_at(tmp_path):
 def test_the_report_names_what_to_do(tmp_path):
     scene = scene_of([look((0, 1, -0.1), (x, 0, 1.6)) for x in range(5)], tmp_path)
     pictures = tuple(Picture(f"{i}.jpg", f"{i}.jpg", 100, 100, Exif(), 1.0, 0.5) for i in range(6))
-    intake = Intake(tmp_path, pictures, {"bad.png": "bad.png is empty"}, False)
+    imported = PhotoImport(tmp_path, pictures, {"bad.png": "bad.png is empty"}, False)
     model = Model({}, tuple(v.name for v in scene.views), (5, 3), 0.71, 200)
-    lost = [
-        Lost(
+    unposed = [
+        Unposed(
             "5.jpg", "5.jpg", "blurred (9% of the usual detail)", "take it again", (("4.jpg", 12),)
         )
     ]
-    text, picture = write_report(tmp_path, scene, intake, model, lost)
+    text, picture = write_report(tmp_path, scene, imported, model, unposed)
     words = text.read_text()
     assert "5 of 6" in words and "0.71 px" in words and "5, 3" in words
     row = "| 5.jpg | blurred (9% of the usual detail) | take it again | 4.jpg (12) |"

@@ -9,7 +9,7 @@ from PIL import Image
 from climatenerf.core.errors import UserError
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.scene.images import load_depth, load_labels, load_mask
-from climatenerf.sfm.sidecars import Photo, bring_along, turned
+from climatenerf.sfm.sidecars import Photo, import_sidecars, orient
 
 LENS = Camera(160, 120, 130.0, 130.0, 80.0, 60.0, k1=-0.15)
 FLAT = Camera(150, 112, 128.0, 128.0, 75.0, 56.0)
@@ -36,7 +36,7 @@ def brought(scene, kind, folder, orientation=1, lens=LENS, shown=True):
         view.name: Photo(f"sub/{view.name[0].upper()}.HEIC", lens, orientation, shown)
         for view in scene.views
     }
-    return bring_along(scene, kind, folder, photos)
+    return import_sidecars(scene, kind, folder, photos)
 
 
 def edges(label):
@@ -80,7 +80,7 @@ def test_files_of_photos_as_stored_are_turned_as_the_photo_is(scene, tmp_path, o
 
 def stored(values, orientation):
     """What is stored when a picture is to be shown as `values`."""
-    return turned(values, {6: 8, 8: 6}.get(orientation, orientation))
+    return orient(values, {6: 8, 8: 6}.get(orientation, orientation))
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -92,8 +92,8 @@ def test_turning_is_what_pillow_does(tmp_path, orientation):
     values = np.arange(12, dtype=np.uint8).reshape(3, 4)
     Image.fromarray(values).save(tmp_path / "a.png", exif=data)
     shown = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
-    np.testing.assert_array_equal(turned(values, orientation), shown)
-    np.testing.assert_array_equal(turned(stored(values, orientation), orientation), values)
+    np.testing.assert_array_equal(orient(values, orientation), shown)
+    np.testing.assert_array_equal(orient(stored(values, orientation), orientation), values)
 
 
 @pytest.mark.parametrize("as_stored", [False, True])
@@ -107,7 +107,7 @@ def test_photos_turned_by_half_follow_those_on_edge(scene, tmp_path, as_stored):
         values = stored(values, orientation) if as_stored else values
         Image.fromarray(values).save(tmp_path / "labels" / f"{name[0]}.png")
         photos[name] = Photo(name, LENS, orientation, True)
-    out = bring_along(scene, "labels", tmp_path / "labels", photos)
+    out = import_sidecars(scene, "labels", tmp_path / "labels", photos)
     for view in out.views:
         assert (load_labels(view, out) == true)[~edges(true)].all(), view.name
     assert out.warnings == ()
@@ -115,7 +115,7 @@ def test_photos_turned_by_half_follow_those_on_edge(scene, tmp_path, as_stored):
     alone = {**photos, "b.jpg": Photo("b.jpg", LENS, 1, True)}
     Image.fromarray(classes(LENS)[0]).save(tmp_path / "labels" / "b.png")
     fresh = replace(scene, root=tmp_path / "other")
-    out = bring_along(fresh, "labels", tmp_path / "labels", alone)
+    out = import_sidecars(fresh, "labels", tmp_path / "labels", alone)
     assert any("turned by half" in w for w in out.warnings)
 
 
@@ -123,7 +123,7 @@ def test_photos_turned_by_half_follow_those_on_edge(scene, tmp_path, as_stored):
 def test_poses_of_pixels_as_stored_want_files_of_them(scene, tmp_path, as_stored):
     (tmp_path / "labels").mkdir()
     of_pixels = classes(LENS)[0]
-    values = of_pixels if as_stored else turned(of_pixels, 6)
+    values = of_pixels if as_stored else orient(of_pixels, 6)
     Image.fromarray(values).save(tmp_path / "labels" / "A.png")
     out = brought(scene, "labels", tmp_path / "labels", orientation=6, shown=False)
     true = classes(FLAT)[0]

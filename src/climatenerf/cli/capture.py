@@ -38,12 +38,12 @@ from climatenerf.scene.images import picture_header
 from climatenerf.scene.readers.colmap import read_colmap
 from climatenerf.scene.scene import FILE_NAME as SCENE
 from climatenerf.sfm.scene_folder import (
-    KINDS,
+    SIDECAR_KINDS,
     WORK,
-    begin,
-    check_place,
-    leave,
-    take_place,
+    check_output,
+    discard_scene,
+    install_scene,
+    start_scene,
 )
 from climatenerf.weather.units import OptionalLength
 
@@ -80,14 +80,14 @@ def run(options: Capture) -> int:
     """Takes pictures in, finds poses, levels the scene and says what came of it."""
     check(options)
     finished, fresh = (options.out / SCENE).is_file(), not os.path.lexists(options.out)
-    new = begin(options.out)
+    new = start_scene(options.out)
     try:
         scene, model, lost, refused = make_scene(options, new, finished)
     except UserError:
-        leave(options.out, fresh)
+        discard_scene(options.out, fresh)
         raise
-    kept = take_place(options.out, new, given_kinds(options))
-    for kind in KINDS:
+    kept = install_scene(options.out, new, given_kinds(options))
+    for kind in SIDECAR_KINDS:
         if mine := [path for path in kept if path.startswith(f"{kind}/")]:
             progress.say(f"Files of yours stay in {options.out / kind}: {listed(mine)}.")
     for warning in scene.warnings:
@@ -166,7 +166,7 @@ def naming_photos(options: Capture, new: Path) -> Iterator[None]:
 
 def given_kinds(options: Capture) -> list[str]:
     """Which of labels, masks and depths the user gives a folder for."""
-    return [kind for kind in KINDS if getattr(options, kind) is not None]
+    return [kind for kind in SIDECAR_KINDS if getattr(options, kind) is not None]
 
 
 def no_photos(options: Capture) -> list[Path]:
@@ -202,11 +202,11 @@ def check(options: Capture) -> None:
             " that folder, or choose another with -o"
         )
     out = options.out.resolve()
-    for name in ("photos", *KINDS, "from_colmap"):
+    for name in ("photos", *SIDECAR_KINDS, "from_colmap"):
         path = getattr(options, name)
         if path is not None and path.resolve().is_relative_to(out):
             raise UserError(f"{path} lies in {options.out}; choose another folder with -o")
-    check_place(options.out, given_kinds(options))
+    check_output(options.out, given_kinds(options))
     if options.from_colmap is None:
         require_pycolmap()
         if not is_video(options.photos):
@@ -242,21 +242,23 @@ def marks_of(options: Capture) -> Path:
 def poses_by_motion(options: Capture, new: Path):
     """The pictures, their poses by structure from motion, and those without with the reason."""
     from climatenerf.sfm.diagnose import diagnose
-    from climatenerf.sfm.photo_import import take_in
+    from climatenerf.sfm.photo_import import import_photos
     from climatenerf.sfm.reconstruct import DATABASE
-    from climatenerf.sfm.worker import reconstruct_apart
+    from climatenerf.sfm.worker import reconstruct_in_subprocess
 
     work = options.out / WORK
     with progress.Bar("pictures", 1.0) as bar:
         besides = no_photos(options)
-        intake = take_in(options.photos, work, lambda n, all: bar.update(n / all), besides)
+        intake = import_photos(options.photos, work, lambda n, all: bar.update(n / all), besides)
     for note in intake.notes:
         progress.say(note)
     for name, reason in intake.unusable.items():
         progress.warn(f"{name} is left out: {reason}")
     flat = new / "flat"
     with progress.StageBars() as report:
-        model = reconstruct_apart(intake, work, flat, options.features, options.seed, report)
+        model = reconstruct_in_subprocess(
+            intake, work, flat, options.features, options.seed, report
+        )
     if len(model.groups) > 1:
         progress.warn(
             f"the pictures fall into {len(model.groups)} groups that do not fit together"
@@ -274,11 +276,11 @@ def poses_by_motion(options: Capture, new: Path):
 
 def poses_of_colmap(options: Capture, new: Path):
     """The pictures, the poses that COLMAP found before, and the photos that it has none for."""
-    from climatenerf.sfm.from_colmap import take_posed
+    from climatenerf.sfm.from_colmap import import_posed
 
     assert options.from_colmap is not None
     with progress.StageBars() as report:
-        found = take_posed(options.photos, options.from_colmap, new, no_photos(options), report)
+        found = import_posed(options.photos, options.from_colmap, new, no_photos(options), report)
     for note in found[0].notes:
         progress.say(note)
     return found
@@ -298,7 +300,7 @@ def in_metres(options: Capture, new: Path, intake) -> Scene:
                 gravity[view.name] = down
     scene = read_scene(new, camera_height=options.camera_height, gravity=gravity)
     scene = with_capture_flags(scene)
-    places = {name: exif.place for name, exif in known.items() if exif.place is not None}
+    places = {name: exif.gps for name, exif in known.items() if exif.gps is not None}
     found = find_georeference(scene, places)
     note = gps_warning(found, {picture.name: picture.source for picture in intake.pictures})
     if note is not None:
@@ -315,7 +317,7 @@ def as_shown(options: Capture, path: Path, camera: Camera) -> bool:
 
 def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
     """The scene with the labels, masks and depths that the user has for the photos."""
-    from climatenerf.sfm.sidecars import Photo, bring_along
+    from climatenerf.sfm.sidecars import Photo, import_sidecars
 
     known = {picture.name: picture for picture in intake.pictures}
     photos = {
@@ -328,7 +330,7 @@ def with_files(options: Capture, scene: Scene, intake, model) -> Scene:
         for view in scene.views
     }
     for kind in given_kinds(options):
-        scene = bring_along(scene, kind, getattr(options, kind), photos)
+        scene = import_sidecars(scene, kind, getattr(options, kind), photos)
     if options.depth is None:
         return scene
     said = scale_from_depth_files(scene)

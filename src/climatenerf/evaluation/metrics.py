@@ -3,10 +3,12 @@
 All take display-encoded (sRGB) pictures in [0, 1], or 8-bit ones, and work in float64.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, UInt8
 
-Picture = Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"]
+Picture = Float[Any, "h w c"] | UInt8[Any, "h w c"]  # NumPy, or torch on the CPU
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5

@@ -8,7 +8,7 @@ samples; gradients come from autograd. Tests hold the fast kernels against these
 """
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
 from climatenerf.core.vectors import unit
@@ -163,7 +163,7 @@ def march(
     ray_o: Float[Tensor, "3"],
     ray_d: Float[Tensor, "3"],
     span: tuple[float, float, float],
-    occupied: Int[Tensor, "k g g g"],
+    occupied: Integer[Tensor, "k g g g"],
     steps: tuple[float, float, float],
     stop: float,
     density_at,

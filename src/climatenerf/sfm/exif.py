@@ -12,7 +12,7 @@ SUBSECONDS = ExifTags.Base.SubsecTimeOriginal
 MAX_ROLL = 2.0  # degrees of a gimbal: beyond, the camera was being turned
 Down = tuple[float, float, float]
 # Where a direction (x right, y down) comes to lie when a picture is turned as EXIF's tag says.
-_TURNED = {
+_ROTATE = {
     1: lambda x, y: (x, y),
     3: lambda x, y: (-x, -y),
     6: lambda x, y: (-y, x),
@@ -28,7 +28,7 @@ class Exif:
     Attributes:
         camera: Words that differ between cameras and lenses; "" if nothing is known.
         focal: Focal length over the longer side of the picture; None if unknown.
-        place: (latitude deg, longitude deg, altitude m) by GPS; altitude NaN if unknown.
+        gps: (latitude deg, longitude deg, altitude m) ; altitude NaN if unknown.
         down: Direction of gravity as the camera's own sensor told, unit vector in the axes of the
             picture as stored (x right, y down, z forward); None if unknown.
         orientation: How the stored picture is turned to be shown, EXIF's 1 to 8.
@@ -37,7 +37,7 @@ class Exif:
 
     camera: str = ""
     focal: float | None = None
-    place: tuple[float, float, float] | None = None
+    gps: tuple[float, float, float] | None = None
     down: tuple[float, float, float] | None = None
     orientation: int = 1
     taken: str = ""
@@ -45,7 +45,7 @@ class Exif:
     @property
     def down_as_shown(self) -> tuple[float, float, float] | None:
         """`down` in the axes of the picture as shown; None for mirrored ones."""
-        turn = _TURNED.get(self.orientation)
+        turn = _ROTATE.get(self.orientation)
         if self.down is None or turn is None:
             return None
         return *turn(*self.down[:2]), self.down[2]
@@ -59,25 +59,25 @@ def read_exif(image: Image.Image) -> Exif:
     words += [detail.get(ExifTags.Base.LensModel)]
     words += [f"{f:g}mm" for f in [_number(detail.get(ExifTags.Base.FocalLength))] if f]
     camera = " ".join(str(word).strip("\0 ") for word in words if word)
-    place = _place(base.get_ifd(ExifTags.IFD.GPSInfo))
+    gps = _gps(base.get_ifd(ExifTags.IFD.GPSInfo))
     orientation = base.get(ExifTags.Base.Orientation, 1)
     orientation = orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
-    down = _gimbal(image.info.get("xmp"))
+    down = _gimbal_gravity(image.info.get("xmp"))
     if down is None and "front" not in camera.lower():  # selfies are mirrored
         # A HEIC decoder turns the picture itself, and tells here which tag it obeyed.
         decoder = image.info.get("original_orientation") or 1
         upright = decoder == orientation == 1 and image.width < image.height
         # A copy that was stored upright: the sensor's own pictures are wide.
-        down = _phone(detail.get(ExifTags.Base.MakerNote), 6 if upright else decoder)
+        down = _phone_gravity(detail.get(ExifTags.Base.MakerNote), 6 if upright else decoder)
     words = [detail.get(tag) for tag in (ExifTags.Base.DateTimeOriginal, SUBSECONDS)]
     taken = ".".join(str(word).strip("\0 ") for word in words if word) if words[0] else ""
-    found = Exif(camera, _focal(detail, *image.size), place, down, orientation, taken)
+    found = Exif(camera, _focal(detail, *image.size), gps, down, orientation, taken)
     shown = found.down_as_shown
     # A picture that would stand on its head has a stale tag: then the axes are not known.
     return replace(found, down=None) if shown and shown[1] < -0.5 else found
 
 
-def _phone(note: object, decoder: object) -> Down | None:
+def _phone_gravity(note: object, decoder: object) -> Down | None:
     """Gravity from an iPhone's maker note, tag 8 (ExifTool's AccelerationVector), three numbers, g.
 
     They follow Core Motion: x to the right of the screen, y to its top, z out of it, and the
@@ -92,7 +92,7 @@ def _phone(note: object, decoder: object) -> Down | None:
     if g is None:
         return None
     x, y, z = -g[1], -g[0], -g[2]
-    turn = _TURNED.get(decoder)  # type: ignore[call-overload]
+    turn = _ROTATE.get(decoder)  # type: ignore[call-overload]
     length = math.hypot(x, y, z)
     if turn is None or not 0.9 < length < 1.1:  # a hand that shakes adds to gravity
         return None
@@ -116,7 +116,7 @@ def _apple_vector(note: object) -> list[float] | None:
     return None
 
 
-def _gimbal(xmp: object) -> Down | None:
+def _gimbal_gravity(xmp: object) -> Down | None:
     """Gravity from the pitch that a DJI drone's gimbal keeps, where its roll is kept at 0."""
     if not isinstance(xmp, bytes | str):
         return None
@@ -135,27 +135,29 @@ def _focal(detail: dict, width: int, height: int) -> float | None:
     longer = max(width, height)
     equivalent = _number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if equivalent:
-        return _sane(equivalent / FULL_FRAME * math.hypot(width, height) / longer)
+        return _plausible(equivalent / FULL_FRAME * math.hypot(width, height) / longer)
     focal = _number(detail.get(ExifTags.Base.FocalLength))
     dense = _number(detail.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _UNITS.get(detail.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     if focal and dense and unit:
-        return _sane(focal * dense / unit / longer)
+        return _plausible(focal * dense / unit / longer)
     return None
 
 
-def _sane(share: float) -> float | None:
+def _plausible(share: float) -> float | None:
     """From fisheye (0.2) to a long tele lens (20)."""
     return share if 0.2 < share < 20 else None
 
 
-def _place(gps: dict) -> tuple[float, float, float] | None:
-    latitude = _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef))
-    longitude = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef))
+def _gps(tags: dict) -> tuple[float, float, float] | None:
+    latitude = _degrees(tags.get(ExifTags.GPS.GPSLatitude), tags.get(ExifTags.GPS.GPSLatitudeRef))
+    longitude = _degrees(
+        tags.get(ExifTags.GPS.GPSLongitude), tags.get(ExifTags.GPS.GPSLongitudeRef)
+    )
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         return None
-    altitude = _number(gps.get(ExifTags.GPS.GPSAltitude))
-    if altitude is not None and gps.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01"):
+    altitude = _number(tags.get(ExifTags.GPS.GPSAltitude))
+    if altitude is not None and tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01"):
         altitude = -altitude
     return latitude, longitude, math.nan if altitude is None else altitude
 

@@ -19,13 +19,13 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, explain, make_folder, read_json, write_json
 from climatenerf.scene.images import EXIF_TRANSPOSES, to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
-from climatenerf.sfm.photos import FEWEST, find_photos, is_video, too_few
+from climatenerf.sfm.photos import MIN_PHOTOS, find_photos, is_video, too_few_photos
 
-LONGEST = 2000  # pixels: more than a radiance field of a place resolves, and features need less
+MAX_SIDE = 2000  # pixels: more than a radiance field of a place resolves, and features need less
 MAX_PIXELS = 400_000_000  # of a picture that is decoded at all: 1.2 GB
 JPEG_QUALITY = 96
 VIDEO_FRAMES = 100  # frames taken from a video, the sharpest of as many intervals
-CANDIDATES = 5  # looked at in each interval
+CANDIDATES_PER_INTERVAL = 5  # looked at in each interval
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Intake:
+class PhotoImport:
     """All usable pictures, what could not be used with the reason, and notes for the user."""
 
     folder: Path
@@ -62,13 +62,13 @@ class Intake:
     notes: tuple[str, ...] = ()
 
 
-def take_in(
+def import_photos(
     source: Path,
     work: Path,
     progress: Callable[[int, int], None],
-    besides: Collection[Path] = (),
-) -> Intake:
-    """Makes upright pictures of at most `LONGEST` pixels from photos or a video.
+    excluded: Collection[Path] = (),
+) -> PhotoImport:
+    """Makes upright pictures of at most `MAX_SIDE` pixels from photos or a video.
 
     Finished pictures are kept, so that an interrupted run goes on where it was.
 
@@ -76,44 +76,44 @@ def take_in(
         source: folder of photos, or a video file.
         work: work folder; pictures go to `work/pictures`.
         progress: told (done, all).
-        besides: folders whose pictures are no photos; the scene that is being made is one always.
+        excluded: folders whose pictures are no photos; the scene that is being made is one always.
 
     Raises:
         UserError: nothing to read, a video that cannot be decoded, or fewer than three pictures.
     """
     video = is_video(source)
     if video:
-        files, base, notes = take_frames(source, work / "frames", progress), work / "frames", ()
+        files, base, notes = extract_frames(source, work / "frames", progress), work / "frames", ()
     else:
-        found = find_photos(source, (work.parent, *besides))
+        found = find_photos(source, (work.parent, *excluded))
         files, base, notes = found.files, found.folder, found.notes
     folder = make_folder(work / "pictures")
     pictures, unusable, taken = [], {}, set()
     for index, path in enumerate(files):
-        name = _free_name(path.relative_to(base), taken)
-        picture = _known(path, folder / name)
+        name = _unique_name(path.relative_to(base), taken)
+        picture = _read_cached(path, folder / name)
         if picture is None:
             try:
                 image, exif = open_upright(path)
             except UserError as error:
-                unusable[_words(path.relative_to(base))] = str(error)
+                unusable[_printable(path.relative_to(base))] = str(error)
             else:
-                picture = _keep(path, base, folder / name, image, exif)
+                picture = _write_picture(path, base, folder / name, image, exif)
         if picture is not None:
             pictures.append(picture)
         progress(index + 1, len(files))
-    if len(pictures) < FEWEST:
+    if len(pictures) < MIN_PHOTOS:
         why = f"; unusable: {next(iter(unusable.values()))}" if unusable else ""
-        raise too_few(source, len(pictures), why)
-    return Intake(folder, tuple(pictures), unusable, video, notes)
+        raise too_few_photos(source, len(pictures), why)
+    return PhotoImport(folder, tuple(pictures), unusable, video, notes)
 
 
-def _words(path: Path) -> str:
+def _printable(path: Path) -> str:
     """A path as text that can be printed and kept, whatever bytes its name is made of."""
     return path.as_posix().encode("utf-8", "replace").decode()
 
 
-def _free_name(path: Path, taken: set[str]) -> str:
+def _unique_name(path: Path, taken: set[str]) -> str:
     """A flat JPEG name of plain letters: folders become part of it; two photos never share one.
 
     COLMAP's lists and a page's addresses give a meaning to blanks, "#", "%" and more.
@@ -128,7 +128,7 @@ def _free_name(path: Path, taken: set[str]) -> str:
     return name
 
 
-def _known(path: Path, out: Path) -> Picture | None:
+def _read_cached(path: Path, out: Path) -> Picture | None:
     """The picture that an earlier run has made of this very photo, if it has."""
     record = out.with_suffix(".json")
     try:
@@ -140,11 +140,11 @@ def _known(path: Path, out: Path) -> Picture | None:
         return None  # none yet, half written or of an older version: made again
 
 
-def _keep(path: Path, base: Path, out: Path, image: Image.Image, exif: Exif) -> Picture:
+def _write_picture(path: Path, base: Path, out: Path, image: Image.Image, exif: Exif) -> Picture:
     with atomic_path(out) as temporary:
         image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     grey = small_grey(image)
-    source = _words(path.relative_to(base))
+    source = _printable(path.relative_to(base))
     measured = sharpness(grey), float(grey.mean() / 255)
     picture = Picture(out.name, source, *image.size, exif, *measured)
     stamp = [*_stamp(path), out.stat().st_size]
@@ -159,19 +159,21 @@ def _stamp(path: Path) -> list[int]:
 def picture_from_json(data: dict) -> Picture:
     """A picture from the JSON of its fields; numbers that were not finite come back as NaN."""
     exif = dict(data["exif"])
-    for key in ("place", "down"):
+    if "place" in exif:  # a record of an earlier version
+        exif["gps"] = exif.pop("place")
+    for key in ("gps", "down"):
         if exif[key] is not None:
             exif[key] = tuple(math.nan if x is None else x for x in exif[key])
     return Picture(**{**data, "exif": Exif(**exif)})
 
 
 def open_upright(path: Path) -> tuple[Image.Image, Exif]:
-    """A photo as it is meant to be seen, in RGB of at most `LONGEST` pixels, with its EXIF.
+    """A photo as it is meant to be seen, in RGB of at most `MAX_SIDE` pixels, with its EXIF.
 
     Raises:
         UserError: empty, damaged, no picture at all, or too large to decode.
     """
-    name = _words(Path(path.name))
+    name = _printable(Path(path.name))
     if path.suffix.lower() in (".heic", ".heif"):
         _register_heif(name)
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MAX_PIXELS
@@ -183,25 +185,25 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
             if image.width * image.height > MAX_PIXELS:
                 raise UserError(f"{name} has {image.width}x{image.height} pixels: too large")
             exif, profile = read_exif(image), image.info.get("icc_profile")
-            image.draft("RGB", (LONGEST, LONGEST))  # a JPEG is decoded smaller at once
+            image.draft("RGB", (MAX_SIDE, MAX_SIDE))  # a JPEG is decoded smaller at once
             image.load()
             # A TIFF's decoder has turned the picture already and taken the tag away.
             kept = image.getexif().get(ExifTags.Base.Orientation, 1) == exif.orientation
             turn = EXIF_TRANSPOSES.get(exif.orientation) if kept else None
             # Made smaller before all else: a copy of 200 megapixels takes 600 MB.
             small = image if image.mode in ("RGB", "L") else Image.fromarray(to_rgb(image))
-            small.thumbnail((LONGEST, LONGEST), Image.Resampling.LANCZOS, reducing_gap=3.0)
+            small.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS, reducing_gap=3.0)
             small = small.convert("RGB") if turn is None else small.transpose(turn).convert("RGB")
             return _as_srgb(small, profile), exif
     except UserError:
         raise
     except Exception as error:  # decoders raise all kinds for damaged files
-        raise UserError(f"{name} {_in_words(error)}") from error
+        raise UserError(f"{name} {_cause(error)}") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def _in_words(error: Exception) -> str:
+def _cause(error: Exception) -> str:
     """What is wrong with a photo, said of it; a decoder's own words name its internals."""
     if isinstance(error, UnidentifiedImageError):
         return "is no picture, or is damaged from its first bytes on"
@@ -253,7 +255,7 @@ def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
     return float((around - 4 * g[1:-1, 1:-1]).var())
 
 
-def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None]) -> list[Path]:
+def extract_frames(video: Path, folder: Path, progress: Callable[[int, int], None]) -> list[Path]:
     """The sharpest frame of each of `VIDEO_FRAMES` intervals, as JPEG files named by number.
 
     Raises:
@@ -279,10 +281,10 @@ def take_frames(video: Path, folder: Path, progress: Callable[[int, int], None])
     make_folder(folder)
     if not count or not seconds or seconds <= 0:
         raise UserError(f"{video} holds no frames; record it again or give photos")
-    wanted = min(count, VIDEO_FRAMES * CANDIDATES)
+    wanted = min(count, VIDEO_FRAMES * CANDIDATES_PER_INTERVAL)
     # Of a short video all frames are candidates: at a higher rate some would come twice.
     rate = [] if wanted == count else [f"fps={wanted / seconds:.6f}"]
-    scale = ",".join([*rate, f"scale='min({LONGEST},iw)':-2"])
+    scale = ",".join([*rate, f"scale='min({MAX_SIDE},iw)':-2"])
     command = [ffmpeg, "-y", "-loglevel", "error", "-nostdin", "-i", str(video), "-vf", scale]
     command += ["-fps_mode", "passthrough", "-q:v", "2", str(folder / "candidate_%05d.jpg")]
     words = _run_ffmpeg(command, folder, lambda: progress(_count(folder), 2 * wanted))

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from climatenerf.core.errors import UserError
-from climatenerf.sfm.scene_folder import KINDS, is_scene, walk_once
+from climatenerf.sfm.scene_folder import SIDECAR_KINDS, is_scene, walk_once
 
 PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp"}
-FEWEST = 3
+MIN_PHOTOS = 3
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,12 @@ class Photos:
     notes: tuple[str, ...]
 
 
-def find_photos(source: Path, besides: Collection[Path]) -> Photos:
+def find_photos(source: Path, excluded: Collection[Path]) -> Photos:
     """The photos of a place: those of a folder, or the pictures of a scene that is there already.
 
     Args:
         source: folder to look in.
-        besides: folders whose files are none.
+        excluded: folders whose files are none.
 
     Raises:
         UserError: fewer than a place needs.
@@ -42,7 +42,7 @@ def find_photos(source: Path, besides: Collection[Path]) -> Photos:
     if is_scene(source) and (source / "images").is_dir():
         notes.append(f"{source} is a scene; the pictures in {source / 'images'} are the photos.")
         source = source / "images"
-    found = photos_in(source, besides)
+    found = photos_in(source, excluded)
     if not found.files:
         videos = sorted(p for p in source.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
         remedy = f"the video itself, such as {videos[0]}" if videos else "the folder that has them"
@@ -50,15 +50,15 @@ def find_photos(source: Path, besides: Collection[Path]) -> Photos:
         raise UserError(
             f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP); give {remedy}{said}"
         )
-    if len(found.files) < FEWEST:
-        raise too_few(source, len(found.files), "")
+    if len(found.files) < MIN_PHOTOS:
+        raise too_few_photos(source, len(found.files), "")
     return Photos(source, found.files, (*notes, *found.notes))
 
 
-def too_few(source: Path, count: int, why: str) -> UserError:
+def too_few_photos(source: Path, count: int, why: str) -> UserError:
     """The sentence for `count` pictures that can be used, and the reason for those that cannot."""
     return UserError(
-        f"{source} holds {count} usable pictures, and a place needs at least {FEWEST}"
+        f"{source} holds {count} usable pictures, and a place needs at least {MIN_PHOTOS}"
         f" (40 to 100 are good); take more{why}"
     )
 
@@ -82,16 +82,16 @@ def is_video(source: Path) -> bool:
     return True
 
 
-def photos_in(folder: Path, besides: Collection[Path]) -> Photos:
+def photos_in(folder: Path, excluded: Collection[Path]) -> Photos:
     """All photos below a folder, through linked folders too, each real folder once.
 
     Hidden ones, those of scenes, and labels, masks and depths beside `images` are left out.
 
     Args:
         folder: to look in.
-        besides: folders whose files are none.
+        excluded: folders whose files are none.
     """
-    none = {path.resolve() for path in besides}
+    none = {path.resolve() for path in excluded}
     files: list[Path] = []
     scenes: list[Path] = []
     extras: list[Path] = []
@@ -100,7 +100,7 @@ def photos_in(folder: Path, besides: Collection[Path]) -> Photos:
         seen = [path for path in seen if path.resolve() not in none]
         scenes += [path for path in seen if is_scene(path)]
         if "images" in folders:
-            extras += [path for path in seen if path.name in KINDS]
+            extras += [path for path in seen if path.name in SIDECAR_KINDS]
         folders[:] = [path.name for path in seen if path not in scenes and path not in extras]
         files += [here / name for name in names if _is_photo(name)]
     return Photos(folder, tuple(sorted(files)), tuple(_notes(folder, scenes, extras)))

@@ -16,26 +16,26 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import make_folder, read_json, write_json
 from climatenerf.scene.readers.colmap import read_colmap
-from climatenerf.sfm.diagnose import read_only, turned_only
-from climatenerf.sfm.photo_import import Intake, Picture
-from climatenerf.sfm.photos import FEWEST
+from climatenerf.sfm.diagnose import is_pure_rotation, read_only
+from climatenerf.sfm.photo_import import PhotoImport, Picture
+from climatenerf.sfm.photos import MIN_PHOTOS
 
 EXHAUSTIVE_UP_TO = 120  # photos; beyond, and for video, neighbours in time and loops are compared
 OVERLAP = 10  # neighbours in time to each side
-PICTURES_AT_ONCE = 6  # in one call for features: the bar moves in between
+EXTRACTION_BATCH = 6  # in one call for features: the bar moves in between
 TILE = 16  # pictures against as many in one call for matches
 ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
-MORE_PAIRS = 10_000  # of the second chance: ten minutes or so
-TRIES = 4  # of the mapper at most
-AGREEING = 0.95  # of the observations: two models that explain as much are sound
-LARGE_TRIANGULATION = 16.0  # degrees between the first two photos
-MIN_TRIANGULATION = 4.0  # degrees between the first two photos, on the second try
+MAX_RETRY_PAIRS = 10_000  # of the second chance: ten minutes or so
+MAX_ATTEMPTS = 4  # of the mapper at most
+MIN_AGREEMENT = 0.95  # of the observations: two models that explain as much are sound
+INITIAL_ANGLE = 16.0  # degrees between the first two photos
+RETRY_ANGLE = 4.0  # degrees between the first two photos, on the second try
 
 DATABASE, CHOSEN, RESULT = "database.db", "chosen", "poses.json"  # in the work folder
 NO_PYCOLMAP = 'poses need pycolmap; run `pip install "climatenerf[capture]"`'
 MIN_POINTS = 30  # of a model: with fewer its poses mean nothing
 
-Told = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
@@ -84,68 +84,70 @@ def require_pycolmap() -> None:
 
 
 def reconstruct(
-    intake: Intake, work: Path, out: Path, features: int, seed: int, tell: Told
+    imported: PhotoImport, work: Path, out: Path, features: int, seed: int, progress: Progress
 ) -> None:
     """Poses of as many pictures as possible, the largest connected group, and flat pictures.
 
     COLMAP may end the process (a full disk) and does not hear Ctrl-C: see `worker`. The result is
-    for `known_result`.
+    for `read_result`.
 
     Args:
-        intake: the pictures.
+        imported: the pictures.
         work: work folder, with what earlier runs left there.
         out: folder to write undistorted pictures (`images`) and their model (`sparse`) into.
         features: most features in a picture.
         seed: of all random choices.
-        tell: told (stage, share of it that is done).
+        progress: told (stage, share of it that is done).
 
     Raises:
         UserError: no two pictures fit together, or all are taken from one spot.
     """
     pycolmap = load_pycolmap()
-    if known_result(intake, work, features, seed) is None:
-        _find_poses(pycolmap, intake, work, features, seed, tell)
-    tell("undistort", 0.0)
+    if read_result(imported, work, features, seed) is None:
+        _find_poses(pycolmap, imported, work, features, seed, progress)
+    progress("undistort", 0.0)
     model = work / CHOSEN
-    pycolmap.undistort_images(out, model, intake.folder, jpeg_quality=95, output_type="COLMAP")
-    tell("undistort", 1.0)
+    pycolmap.undistort_images(out, model, imported.folder, jpeg_quality=95, output_type="COLMAP")
+    progress("undistort", 1.0)
 
 
-def _find_poses(pycolmap, intake: Intake, work: Path, features: int, seed: int, tell: Told) -> None:
+def _find_poses(
+    pycolmap, imported: PhotoImport, work: Path, features: int, seed: int, progress: Progress
+) -> None:
     database = work / DATABASE
-    _forget_if_changed(intake, database, features)
-    names = in_order(intake)
-    _import(pycolmap, intake, database)
-    _extract(pycolmap, intake, database, names, features, tell)
-    pairs = pairs_of(len(names), intake.is_video)
-    _match(pycolmap, database, names, pairs, seed, tell)
-    if turned_only(intake, database):
+    _reset_if_changed(imported, database, features)
+    names = names_in_order(imported)
+    _import(pycolmap, imported, database)
+    _extract(pycolmap, imported, database, names, features, progress)
+    pairs = image_pairs(len(names), imported.is_video)
+    _match(pycolmap, database, names, pairs, seed, progress)
+    if is_pure_rotation(imported, database):
         raise UserError(
             "all pictures were taken from one spot: they differ by turning the camera alone and"
             " hold no depth; walk around the place and take each photo a step further"
         )
     (work / RESULT).unlink(missing_ok=True)
-    models = _map(pycolmap, intake, database, work / "models", seed, tell)
+    models = _map(pycolmap, imported, database, work / "models", seed, progress)
     best = max(models, key=lambda m: m.num_reg_images())
-    more = pairs_of_lost([name in _registered(best) for name in names], pairs)
+    more = retry_pairs([name in _registered(best) for name in names], pairs)
     if more:
-        _match(pycolmap, database, names, more, seed, tell, "more matches")
-        models = _map(pycolmap, intake, database, work / "models", seed, tell)
+        _match(pycolmap, database, names, more, seed, progress, "more matches")
+        models = _map(pycolmap, imported, database, work / "models", seed, progress)
         best = max(models, key=lambda m: m.num_reg_images())
     shutil.rmtree(work / CHOSEN, ignore_errors=True)
     best.write(make_folder(work / CHOSEN))
     result = {
-        "made_of": _made_of(intake, features, seed),
-        "groups": groups_of([_registered(model) for model in models]),
+        "made_of": _inputs(imported, features, seed),
+        "groups": group_sizes([_registered(model) for model in models]),
         "reprojection_error": float(best.compute_mean_reprojection_error()),
         "points": best.num_points3D(),
     }
     write_json(work / RESULT, result)
 
 
-def in_order(intake: Intake) -> list[str]:
+def names_in_order(imported: PhotoImport) -> list[str]:
     """Names of the pictures in the order they were taken, where all know it, else by name."""
-    pictures = intake.pictures
+    pictures = imported.pictures
     if all(picture.exif.taken for picture in pictures):
         pictures = sorted(pictures, key=lambda picture: (picture.exif.taken, picture.name))
     return [picture.name for picture in pictures]
@@ -155,7 +157,7 @@ def _registered(model) -> set[str]:
     return {model.image(i).name for i in model.reg_image_ids()}
 
 
-def groups_of(models: list[set[str]]) -> list[int]:
+def group_sizes(models: list[set[str]]) -> list[int]:
     """Pictures in the largest model, then those that each further one has beyond the larger ones.
 
     The mapper tries again with pictures that it has placed; a group is what no larger one holds.
@@ -163,17 +165,20 @@ def groups_of(models: list[set[str]]) -> list[int]:
     seen: set[str] = set()
     sizes = []
     for names in sorted(models, key=len, reverse=True):
-        if len(names - seen) >= FEWEST:
+        if len(names - seen) >= MIN_PHOTOS:
             sizes.append(len(names - seen))
         seen |= names
     return sizes
 
 
-def known_result(intake: Intake, work: Path, features: int, seed: int) -> Model | None:
+def read_result(imported: PhotoImport, work: Path, features: int, seed: int) -> Model | None:
     """What a run over the same pictures with the same settings has found; None if none has."""
     try:
         result = read_json(work / RESULT)
-        if result["made_of"] != _made_of(intake, features, seed) or not (work / DATABASE).is_file():
+        if (
+            result["made_of"] != _inputs(imported, features, seed)
+            or not (work / DATABASE).is_file()
+        ):
             return None
         posed = read_colmap(work / CHOSEN)
         return Model(
@@ -187,22 +192,22 @@ def known_result(intake: Intake, work: Path, features: int, seed: int) -> Model 
         return None  # none yet, or damaged: found anew
 
 
-def _made_of(intake: Intake, features: int, seed: int) -> dict:
-    return {"pictures": _stamps(intake), "features": features, "seed": seed}
+def _inputs(imported: PhotoImport, features: int, seed: int) -> dict:
+    return {"pictures": _stamps(imported), "features": features, "seed": seed}
 
 
-def _stamps(intake: Intake) -> dict[str, int]:
+def _stamps(imported: PhotoImport) -> dict[str, int]:
     """When each picture was written: a changed photo makes a new one."""
-    return {p.name: (intake.folder / p.name).stat().st_mtime_ns for p in intake.pictures}
+    return {p.name: (imported.folder / p.name).stat().st_mtime_ns for p in imported.pictures}
 
 
-def _forget_if_changed(intake: Intake, database: Path, features: int) -> None:
+def _reset_if_changed(imported: PhotoImport, database: Path, features: int) -> None:
     """Begins anew where a picture was replaced or taken away, or other features are wanted.
 
     Pictures that have come in are added to what is there.
     """
     record = database.with_name("database.json")
-    stamps = _stamps(intake)
+    stamps = _stamps(imported)
     kept = False
     with contextlib.suppress(UserError, ValueError, KeyError, AttributeError):
         before = read_json(record)
@@ -224,11 +229,11 @@ def camera_groups(pictures: tuple[Picture, ...]) -> list[list[Picture]]:
     return list(groups.values())
 
 
-def _import(pycolmap, intake: Intake, database: Path) -> None:
+def _import(pycolmap, imported: PhotoImport, database: Path) -> None:
     known = set(_names(database))
     if not database.exists():
         pycolmap.Database.open(database).close()
-    for group in camera_groups(intake.pictures):
+    for group in camera_groups(imported.pictures):
         new = [picture.name for picture in group if picture.name not in known]
         if not new:
             continue
@@ -239,22 +244,27 @@ def _import(pycolmap, intake: Intake, database: Path) -> None:
         if first.exif.focal is not None:
             focal = first.exif.focal * max(first.width, first.height)
             options.camera_params = f"{focal:.3f},{first.width / 2},{first.height / 2},0"
-        pycolmap.import_images(database, intake.folder, pycolmap.CameraMode.SINGLE, new, options)
+        pycolmap.import_images(database, imported.folder, pycolmap.CameraMode.SINGLE, new, options)
 
 
 def _extract(
-    pycolmap, intake: Intake, database: Path, names: list[str], features: int, tell: Told
+    pycolmap,
+    imported: PhotoImport,
+    database: Path,
+    names: list[str],
+    features: int,
+    progress: Progress,
 ) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = features
-    for start in range(0, len(names), PICTURES_AT_ONCE):
-        tell("features", start / len(names))
-        some = names[start : start + PICTURES_AT_ONCE]
-        pycolmap.extract_features(database, intake.folder, some, extraction_options=options)
-    tell("features", 1.0)
+    for start in range(0, len(names), EXTRACTION_BATCH):
+        progress("features", start / len(names))
+        some = names[start : start + EXTRACTION_BATCH]
+        pycolmap.extract_features(database, imported.folder, some, extraction_options=options)
+    progress("features", 1.0)
 
 
-def pairs_of(n: int, is_video: bool) -> list[tuple[int, int]]:
+def image_pairs(n: int, is_video: bool) -> list[tuple[int, int]]:
     """Which pictures are compared: all with all, or in long sequences neighbours and loops.
 
     Neighbours are those up to `OVERLAP` apart, and 16, 32, ... apart; every tenth picture is
@@ -268,13 +278,13 @@ def pairs_of(n: int, is_video: bool) -> list[tuple[int, int]]:
     return sorted(near | {(i, j) for i in some for j in some if i < j})
 
 
-def pairs_of_lost(posed: list[bool], done: list[tuple[int, int]]) -> list[tuple[int, int]]:
+def retry_pairs(posed: list[bool], done: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Pictures without pose with all others, as far as they were not compared: a second chance."""
     known = set(done)
     n = len(posed)
     every = ((i, j) for i in range(n) for j in range(i + 1, n) if not (posed[i] and posed[j]))
     more = [pair for pair in every if pair not in known]
-    return more[:: -(-len(more) // MORE_PAIRS)] if more else []
+    return more[:: -(-len(more) // MAX_RETRY_PAIRS)] if more else []
 
 
 def _match(
@@ -283,7 +293,7 @@ def _match(
     names: list[str],
     pairs: list[tuple[int, int]],
     seed: int,
-    tell: Told,
+    progress: Progress,
     stage: str = "matches",
 ) -> None:
     pycolmap.set_random_seed(seed)
@@ -297,7 +307,7 @@ def _match(
     done = 0
     listing = database.with_name("pairs.txt")
     for key in sorted(tiles):
-        tell(stage, done / len(pairs))
+        progress(stage, done / len(pairs))
         listing.write_text("\n".join(tiles[key]) + "\n")
         options = pycolmap.ImportedPairingOptions()
         options.match_list_path = listing
@@ -305,29 +315,33 @@ def _match(
             database, pairing_options=options, verification_options=verification
         )
         done += len(tiles[key])
-    tell(stage, 1.0)
+    progress(stage, 1.0)
 
 
-def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell: Told) -> list:
+def _map(
+    pycolmap, imported: PhotoImport, database: Path, folder: Path, seed: int, progress: Progress
+) -> list:
     """Incremental mapping, several times: one wrong link bends a whole model, but not in each.
 
     A bent model explains fewer of the matches, so the one with most observations is taken as soon
     as another agrees with it. Where nothing comes out a smaller baseline is accepted.
     """
-    for least_angle in (LARGE_TRIANGULATION, MIN_TRIANGULATION):
+    for least_angle in (INITIAL_ANGLE, RETRY_ANGLE):
         tries: list[tuple[int, list]] = []
-        for number in range(TRIES):
+        for number in range(MAX_ATTEMPTS):
             start = seed + number
-            found = _map_once(pycolmap, intake, database, folder, start, least_angle, tell, number)
+            found = _map_once(
+                pycolmap, imported, database, folder, start, least_angle, progress, number
+            )
             good = [
                 m
                 for m in found.values()
-                if m.num_reg_images() >= FEWEST and m.num_points3D() >= MIN_POINTS
+                if m.num_reg_images() >= MIN_PHOTOS and m.num_points3D() >= MIN_POINTS
             ]
             best = max((m.compute_num_observations() for m in good), default=0)
             tries.append((best, good))
             ranked = sorted((count for count, _ in tries), reverse=True)
-            if len(ranked) > 1 and ranked[1] >= AGREEING * ranked[0]:
+            if len(ranked) > 1 and ranked[1] >= MIN_AGREEMENT * ranked[0]:
                 break
         best, good = max(tries, key=lambda one: one[0])
         if best:
@@ -341,12 +355,12 @@ def _map(pycolmap, intake: Intake, database: Path, folder: Path, seed: int, tell
 
 def _map_once(
     pycolmap,
-    intake: Intake,
+    imported: PhotoImport,
     database: Path,
     folder: Path,
     seed: int,
     least_angle: float,
-    tell: Told,
+    progress: Progress,
     number: int,
 ) -> dict:
     pycolmap.set_random_seed(seed)
@@ -355,7 +369,7 @@ def _map_once(
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
     options.mapper.random_seed = seed
-    options.min_model_size = FEWEST
+    options.min_model_size = MIN_PHOTOS
     options.mapper.init_min_tri_angle = least_angle
     # It places pictures that share hardly a point with the rest, and places some of them wrongly.
     options.structure_less_registration_fallback = False
@@ -364,12 +378,12 @@ def _map_once(
     def one_more() -> None:
         nonlocal placed
         placed += 1
-        tell(stage, min(0.99, placed / len(intake.pictures)))
+        progress(stage, min(0.99, placed / len(imported.pictures)))
 
     found = pycolmap.incremental_mapping(
-        database, intake.folder, folder, options, next_image_callback=one_more
+        database, imported.folder, folder, options, next_image_callback=one_more
     )
-    tell(stage, 1.0)
+    progress(stage, 1.0)
     return found
 
 

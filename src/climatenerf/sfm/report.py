@@ -10,29 +10,34 @@ from PIL import Image, ImageDraw, ImageFont
 from climatenerf.core.storage import atomic_path, write_bytes
 from climatenerf.scene.alignment.scale import scale_summary
 from climatenerf.scene.scene import Scene
-from climatenerf.sfm.diagnose import Lost
-from climatenerf.sfm.photo_import import Intake
+from climatenerf.sfm.diagnose import Unposed
+from climatenerf.sfm.photo_import import PhotoImport
 from climatenerf.sfm.reconstruct import Model
 
 PANEL = 640  # pixels
 GROUND_REACH = 5.0  # camera heights around the path in which ground is asked for
-SEEN_OFTEN = 3  # pictures that should show a piece of ground
+MIN_VIEWS = 3  # pictures that should show a piece of ground
 
 
 def write_report(
-    folder: Path, scene: Scene, intake: Intake, model: Model, lost: list[Lost]
+    folder: Path, scene: Scene, imported: PhotoImport, model: Model, unposed: list[Unposed]
 ) -> tuple[Path, Path]:
     """Writes `report.md` and `report.png` into the scene folder; returns their paths."""
     text, picture = folder / "report.md", folder / "report.png"
     ground, sky = ground_coverage(scene), sky_coverage(scene)
-    write_bytes(text, report_text(scene, intake, model, lost, ground, sky).encode())
+    write_bytes(text, report_text(scene, imported, model, unposed, ground, sky).encode())
     with atomic_path(picture) as temporary:
         draw_report(scene).save(temporary, format="PNG")
     return text, picture
 
 
 def report_text(
-    scene: Scene, intake: Intake, model: Model, lost: list[Lost], ground: float, sky: float
+    scene: Scene,
+    imported: PhotoImport,
+    model: Model,
+    unposed: list[Unposed],
+    ground: float,
+    sky: float,
 ) -> str:
     """What a user wants to know before fitting, in Markdown."""
     error = model.reprojection_error
@@ -41,10 +46,10 @@ def report_text(
         "",
         "![Cameras (red) and points, from above and from the side](report.png)",
         "",
-        f"- Pictures with poses: {len(model.registered)} of {len(model.registered) + len(lost)}",
+        f"- Pictures with poses: {len(model.registered)} of {len(model.registered) + len(unposed)}",
         f"- Reprojection error: {'not known' if error is None else f'{error:.2f} px'};"
         f" {model.points} points",
-        f"- Ground within {GROUND_REACH:g} camera heights of the path that {SEEN_OFTEN} pictures"
+        f"- Ground within {GROUND_REACH:g} camera heights of the path that {MIN_VIEWS} pictures"
         f" or more look at: {ground:.0%}",
         f"- Sky (directions more than 10 degrees up) that any picture looks at: {sky:.0%}",
         f"- Up from {scene.up_report.get('used', '?')}; {scale_summary(scene)}; lowest ground"
@@ -67,14 +72,14 @@ def report_text(
             lines.append(f"- Pictures with {kind} files: {count}")
     if len(model.groups) > 1:
         lines.append(f"- Groups that do not fit together: {', '.join(map(str, model.groups))}")
-    if lost or intake.unusable:
-        source = {picture.name: picture.source for picture in intake.pictures}
+    if unposed or imported.unusable:
+        source = {picture.name: picture.source for picture in imported.pictures}
         head = ("picture", "probable reason", "what to do", "fits best (matches)")
         lines += ["", "## Without pose", "", _row(*head), _row(*["---"] * 4)]
-        for one in lost:
+        for one in unposed:
             near = ", ".join(f"{source.get(n, n)} ({count})" for n, count in one.neighbours)
             lines.append(_row(one.source, one.reason, one.remedy, near or "none"))
-        lines += [_row(name, why, "replace it", "") for name, why in intake.unusable.items()]
+        lines += [_row(name, why, "replace it", "") for name, why in imported.unusable.items()]
     if scene.warnings:
         lines += ["", "## Warnings", ""] + [f"- {warning}" for warning in scene.warnings]
     return "\n".join(lines) + "\n"
@@ -85,7 +90,7 @@ def _row(*cells: str) -> str:
 
 
 def ground_coverage(scene: Scene) -> float:
-    """Share of the ground around the camera path that `SEEN_OFTEN` pictures look at.
+    """Share of the ground around the camera path that `MIN_VIEWS` pictures look at.
 
     By the pictures' frames alone: what stands in the way is not asked for.
     """
@@ -101,7 +106,7 @@ def ground_coverage(scene: Scene) -> float:
     seen = np.zeros(len(places), int)
     for view, pose in zip(scene.views, poses, strict=True):
         seen += _in_frame(scene, view.camera, (places - pose[:3, 3]) @ pose[:3, :3])
-    return float((seen >= SEEN_OFTEN).mean())
+    return float((seen >= MIN_VIEWS).mean())
 
 
 def sky_coverage(scene: Scene) -> float:

@@ -18,13 +18,13 @@ from climatenerf.scene.scene import FILE_NAME
 
 WORK = "work"  # folder in the scene: may be deleted when all is well
 RECORD = ".made-by-capture.json"  # beside `scene.json`, so that it outlives the work folder
-FORMER = "made-by-capture.json"  # in the work folder; it lists no files
-KINDS = ("labels", "masks", "depth")  # folders that the user may fill too
-PLACES = (
-    "images", "sparse", *KINDS, FILE_NAME, "points.ply", "points_seen.npz", "report.md",
+OLD_RECORD = "made-by-capture.json"  # in the work folder; it lists no files
+SIDECAR_KINDS = ("labels", "masks", "depth")  # folders that the user may fill too
+ENTRIES = (
+    "images", "sparse", *SIDECAR_KINDS, FILE_NAME, "points.ply", "points_seen.npz", "report.md",
     "report.png", "mark.html",
 )  # fmt: skip
-LITTER = {".DS_Store", "Thumbs.db", "desktop.ini"}  # left where folders are looked at
+IGNORED_NAMES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # left where folders are looked at
 
 # Path in the scene folder -> digests that a file of capture's may have there: one, or two while a
 # new scene takes the place of an old one.
@@ -33,7 +33,7 @@ Record = dict[str, tuple[str, ...]]
 
 def is_scene(folder: Path) -> bool:
     """Whether a folder is a scene, or one that capture has begun."""
-    return any((folder / name).is_file() for name in (FILE_NAME, RECORD, f"{WORK}/{FORMER}"))
+    return any((folder / name).is_file() for name in (FILE_NAME, RECORD, f"{WORK}/{OLD_RECORD}"))
 
 
 def walk_once(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
@@ -52,7 +52,7 @@ def walk_once(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
         yield here, folders, names
 
 
-def check_place(out: Path, given: Collection[str]) -> list[str]:
+def check_output(out: Path, given: Collection[str]) -> list[str]:
     """The user's own files that a new scene leaves where they are, as paths in the folder.
 
     Args:
@@ -64,7 +64,7 @@ def check_place(out: Path, given: Collection[str]) -> list[str]:
     """
     record = read_record(out)
     if record is None or (out / WORK).is_symlink():
-        for name in (*PLACES, WORK):
+        for name in (*ENTRIES, WORK):
             if os.path.lexists(out / name):
                 raise UserError(
                     f"{out} already holds {name}, which no earlier capture made; choose another"
@@ -74,7 +74,7 @@ def check_place(out: Path, given: Collection[str]) -> list[str]:
     kept = []
     for path in _files(out):
         key = _key(path, out)
-        if path.name in LITTER or _digest(path) in record.get(key, ()):
+        if path.name in IGNORED_NAMES or _digest(path) in record.get(key, ()):
             continue
         kind = key.split("/")[0]
         if kind in given:
@@ -82,7 +82,7 @@ def check_place(out: Path, given: Collection[str]) -> list[str]:
                 f"{path} is yours, and --{kind} would write {out / kind} anew; move it into the"
                 f" folder that --{kind} names, or leave --{kind} out"
             )
-        if key == kind or kind not in KINDS:  # a file where a folder should be, too
+        if key == kind or kind not in SIDECAR_KINDS:  # a file where a folder should be, too
             how = "was changed since capture wrote it" if key in record else "is not capture's"
             raise UserError(
                 f"{path} {how} and would be lost; move it away, or choose another folder with -o"
@@ -91,7 +91,7 @@ def check_place(out: Path, given: Collection[str]) -> list[str]:
     return kept
 
 
-def begin(out: Path) -> Path:
+def start_scene(out: Path) -> Path:
     """The folder in which a scene is made before it takes its place, empty."""
     record = read_record(out) or {}
     write_record(out, record)  # first: what is there without it would bar the next run
@@ -100,7 +100,7 @@ def begin(out: Path) -> Path:
     return make_folder(new)
 
 
-def leave(out: Path, fresh: bool) -> None:
+def discard_scene(out: Path, fresh: bool) -> None:
     """Clears away a scene that did not come to be; all of the folder if it holds nothing of use.
 
     Args:
@@ -112,7 +112,7 @@ def leave(out: Path, fresh: bool) -> None:
         shutil.rmtree(out, ignore_errors=True)
 
 
-def take_place(out: Path, new: Path, given: Collection[str]) -> list[str]:
+def install_scene(out: Path, new: Path, given: Collection[str]) -> list[str]:
     """Moves a finished scene to its place; what an earlier capture made goes, the user's stays.
 
     Args:
@@ -126,7 +126,7 @@ def take_place(out: Path, new: Path, given: Collection[str]) -> list[str]:
     Raises:
         UserError: the user has put something in the way meanwhile, or a file cannot be moved.
     """
-    kept = check_place(out, given)
+    kept = check_output(out, given)
     told = read_json(new / FILE_NAME)
     write_json(new / FILE_NAME, {**told, "root_absolute": str(out.absolute())})
     before = read_record(out) or {}
@@ -134,9 +134,9 @@ def take_place(out: Path, new: Path, given: Collection[str]) -> list[str]:
     both = {key: before.get(key, ()) + record.get(key, ()) for key in {**before, **record}}
     write_record(out, both)  # stopped from here on, either file is known for capture's
     try:
-        for name in PLACES:
+        for name in ENTRIES:
             if any(key.startswith(f"{name}/") for key in kept):
-                _remove_besides(out / name, out, kept)
+                _remove_except(out / name, out, kept)
                 continue
             _remove(out / name)
             if (new / name).exists():
@@ -156,7 +156,7 @@ def _remove(place: Path) -> None:
         place.unlink(missing_ok=True)
 
 
-def _remove_besides(place: Path, out: Path, kept: Collection[str]) -> None:
+def _remove_except(place: Path, out: Path, kept: Collection[str]) -> None:
     """Removes what is not kept from a folder; what lies behind a link is not of this folder."""
     for here, folders, names in os.walk(place):
         if Path(here).is_symlink():
@@ -178,8 +178,8 @@ def read_record(out: Path) -> Record | None:
             files = read_json(out / RECORD)["files"]
             return {str(path): tuple(map(str, digests)) for path, digests in files.items()}
         return {}  # damaged: nothing is sure to be capture's
-    if (out / WORK / FORMER).is_file():
-        return {_key(path, out): (_digest(path),) for path in _of_former(out)}
+    if (out / WORK / OLD_RECORD).is_file():
+        return {_key(path, out): (_digest(path),) for path in _old_record_files(out)}
     return None
 
 
@@ -192,7 +192,7 @@ def write_record(out: Path, record: Record) -> None:
     write_json(out / RECORD, {"files": record})
 
 
-def _of_former(out: Path) -> list[Path]:
+def _old_record_files(out: Path) -> list[Path]:
     try:
         scene, when = load_scene(out), (out / FILE_NAME).stat().st_mtime_ns
     except (UserError, OSError):
@@ -215,7 +215,7 @@ def _of_former(out: Path) -> list[Path]:
 
 def _files(folder: Path) -> Iterator[Path]:
     """All files in the places of a scene, those behind links too."""
-    for name in PLACES:
+    for name in ENTRIES:
         place = folder / name
         if place.is_dir():
             for here, _, names in walk_once(place):

@@ -42,7 +42,7 @@ class Photo:
     shown: bool
 
 
-def bring_along(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Photo]) -> Scene:
+def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Photo]) -> Scene:
     """The scene with the user's files of one kind for its views, written into its folder.
 
     Args:
@@ -54,20 +54,20 @@ def bring_along(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Phot
     Raises:
         UserError: no file for any view, or a file that cannot be used.
     """
-    found = {v.name: _find(folder, kind, photos[v.name].source, v.name) for v in scene.views}
+    found = {v.name: _find_file(folder, kind, photos[v.name].source, v.name) for v in scene.views}
     if not any(found.values()):
         wanted = Path(photos[scene.views[0].name].source).with_suffix(SUFFIXES[kind][0])
         raise UserError(
             f"--{kind} {folder} holds nothing for any photo; name the files like {wanted}"
         )
     values = {name: READERS[kind](path) for name, path in found.items() if path is not None}
-    as_stored, sure = _made_as_stored(values, photos)
+    as_stored, sure = _infer_stored(values, photos)
     views = []
     for view in scene.views:
         if view.name in values:
             photo = photos[view.name]
-            one = _framed(values.pop(view.name), photo, as_stored, found[view.name])
-            one = _through_lens(one, photo.lens, scene.cameras[view.camera], OUTSIDE[kind])
+            one = _to_lens_frame(values.pop(view.name), photo, as_stored, found[view.name])
+            one = _resample(one, photo.lens, scene.cameras[view.camera], OUTSIDE[kind])
             view = replace(view, **{FIELDS[kind]: _write(scene.root / kind, kind, view, one)})
         views.append(view)
     warnings = list(scene.warnings)
@@ -82,7 +82,7 @@ def bring_along(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Phot
     return replace(scene, views=tuple(views), warnings=tuple(warnings))
 
 
-def _made_as_stored(
+def _infer_stored(
     values: Mapping[str, np.ndarray], photos: Mapping[str, Photo]
 ) -> tuple[bool, bool]:
     """Whether files are of photos as stored, told by the shapes of those on edge; and if surely."""
@@ -102,15 +102,17 @@ def _same_shape(values: np.ndarray, lens: Camera) -> bool:
     return abs(stretch - 1) < SAME_SHAPE
 
 
-def _framed(values: np.ndarray, photo: Photo, as_stored: bool, path: Path | None) -> np.ndarray:
+def _to_lens_frame(
+    values: np.ndarray, photo: Photo, as_stored: bool, path: Path | None
+) -> np.ndarray:
     """The file in the frame of the photo's lens."""
     on_edge = photo.orientation >= 5
     if on_edge and photo.lens.width != photo.lens.height:
         as_stored = _same_shape(values, photo.lens) != photo.shown
     if as_stored and photo.shown:
-        values = turned(values, photo.orientation)
+        values = orient(values, photo.orientation)
     elif not as_stored and not photo.shown:
-        values = turned(values, {6: 8, 8: 6}.get(photo.orientation, photo.orientation))
+        values = orient(values, {6: 8, 8: 6}.get(photo.orientation, photo.orientation))
     if not _same_shape(values, photo.lens):
         raise UserError(
             f"{path} has {values.shape[1]}x{values.shape[0]} pixels, another shape than its photo"
@@ -119,7 +121,7 @@ def _framed(values: np.ndarray, photo: Photo, as_stored: bool, path: Path | None
     return values
 
 
-def turned(values: np.ndarray, orientation: int) -> np.ndarray:
+def orient(values: np.ndarray, orientation: int) -> np.ndarray:
     """An array of stored pixels as EXIF's tag wants it shown."""
     turns = {
         2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud, 5: np.transpose,
@@ -128,7 +130,7 @@ def turned(values: np.ndarray, orientation: int) -> np.ndarray:
     return turns[orientation](values) if orientation in turns else values
 
 
-def _find(folder: Path, kind: str, source: str, name: str) -> Path | None:
+def _find_file(folder: Path, kind: str, source: str, name: str) -> Path | None:
     for base in (Path(source), Path(source).name, Path(name)):
         for suffix in SUFFIXES[kind]:
             for candidate in (folder / base).with_suffix(suffix), folder / f"{base}{suffix}":
@@ -137,7 +139,7 @@ def _find(folder: Path, kind: str, source: str, name: str) -> Path | None:
     return None
 
 
-def _through_lens(values: np.ndarray, lens: Camera, target: Camera, outside: float) -> np.ndarray:
+def _resample(values: np.ndarray, lens: Camera, target: Camera, outside: float) -> np.ndarray:
     """Values at the target camera's pixels, looked up in a file for the other lens' picture."""
     scale = np.array([values.shape[1] / lens.width, values.shape[0] / lens.height])
     at = target.pixel_centres() if lens == target else lens.project(target.directions())

@@ -18,26 +18,32 @@ from pathlib import Path
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import explain, plain
-from climatenerf.sfm.photo_import import Intake, picture_from_json
-from climatenerf.sfm.reconstruct import Model, Told, known_result, reconstruct
+from climatenerf.sfm.photo_import import PhotoImport, picture_from_json
+from climatenerf.sfm.reconstruct import Model, Progress, read_result, reconstruct
 
 NEARLY_FULL = 20_000_000  # bytes free, below which a crash is put down to the disk
 LOG = "colmap.log"
 
 # COLMAP matches on threads of its own. Where each of them lets OpenBLAS gather a team as well, the
 # approximate neighbours of two pictures differed between equal runs (one in a hundred, under load).
-ONE_TEAM = {"OMP_NUM_THREADS": "1"}
+WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
 
 
-def reconstruct_apart(
-    intake: Intake, work: Path, out: Path, features: int, seed: int, tell: Told
+def reconstruct_in_subprocess(
+    imported: PhotoImport, work: Path, out: Path, features: int, seed: int, progress: Progress
 ) -> Model:
     """`reconstruct` in another process; arguments and errors are its own.
 
     Raises:
         UserError: as `reconstruct`, or the process ended before its time.
     """
-    order = {"intake": asdict(intake), "work": work, "out": out, "features": features, "seed": seed}
+    order = {
+        "imported": asdict(imported),
+        "work": work,
+        "out": out,
+        "features": features,
+        "seed": seed,
+    }
     try:
         log = (work / LOG).open("wb")
     except OSError as error:
@@ -48,7 +54,7 @@ def reconstruct_apart(
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
-            env={**os.environ, **ONE_TEAM},
+            env={**os.environ, **WORKER_ENVIRONMENT},
             start_new_session=True,  # Ctrl-C is for this side, which ends the other one
         )
     assert process.stdin is not None and process.stdout is not None
@@ -62,7 +68,7 @@ def reconstruct_apart(
             if "error" in words:
                 raise UserError(words["error"])
             if "stage" in words:
-                tell(words["stage"], words["share"])
+                progress(words["stage"], words["share"])
             finished = "done" in words
         process.wait(10)
     except (BrokenPipeError, subprocess.TimeoutExpired):
@@ -73,13 +79,13 @@ def reconstruct_apart(
         with contextlib.suppress(OSError):
             process.stdin.close()
         process.stdout.close()
-    model = known_result(intake, work, features, seed)
+    model = read_result(imported, work, features, seed)
     if not finished or model is None:
-        raise UserError(_why(work, process.returncode))
+        raise UserError(_failure(work, process.returncode))
     return model
 
 
-def _why(work: Path, status: int) -> str:
+def _failure(work: Path, status: int) -> str:
     """The probable cause of a worker's end, and the remedy."""
     if shutil.disk_usage(work).free < NEARLY_FULL:
         return (
@@ -97,7 +103,7 @@ def _why(work: Path, status: int) -> str:
 def main() -> None:
     """The worker's side: an order on standard input, progress and errors on standard output."""
     order = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_the_other_side, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     # COLMAP, too, may write to standard output: it goes where errors go.
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -105,8 +111,8 @@ def main() -> None:
     def say(words: dict) -> None:
         answers.write(json.dumps(words) + "\n")
 
-    told = order["intake"]
-    intake = Intake(
+    told = order["imported"]
+    imported = PhotoImport(
         folder=Path(told["folder"]),
         pictures=tuple(picture_from_json(picture) for picture in told["pictures"]),
         unusable=told["unusable"],
@@ -114,7 +120,7 @@ def main() -> None:
     )
     try:
         reconstruct(
-            intake,
+            imported,
             Path(order["work"]),
             Path(order["out"]),
             order["features"],
@@ -127,7 +133,7 @@ def main() -> None:
         say({"done": True})
 
 
-def _end_with_the_other_side() -> None:
+def _exit_with_parent() -> None:
     sys.stdin.read()
     os._exit(1)
 
