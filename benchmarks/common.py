@@ -7,6 +7,7 @@ import platform
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -66,11 +67,18 @@ def output(words: list[str], environment: dict[str, str] | None = None) -> str:
 
 
 def peak_bytes(words: list[str], environment: dict[str, str] | None = None) -> float:
-    """Run Python with arguments in a process of its own; return its peak resident memory."""
-    child = subprocess.Popen([PYTHON, *words], stdout=subprocess.DEVNULL, env=environment)
-    _, status, usage = os.wait4(child.pid, 0)
-    if status:
-        sys.exit(f"`python {' '.join(words)}` failed; its messages are above")
+    """Run Python with arguments in a process of its own; return its peak resident memory.
+
+    Its output is shown only if it fails; then this process exits as well.
+    """
+    with tempfile.TemporaryFile("w+") as output:
+        child = subprocess.Popen(
+            [PYTHON, *words], stdout=output, stderr=subprocess.STDOUT, env=environment
+        )
+        _, status, usage = os.wait4(child.pid, 0)
+        if status:
+            output.seek(0)
+            sys.exit(f"{output.read()}`python {' '.join(words)}` failed")
     # Linux counts in KiB, macOS in bytes.
     return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 

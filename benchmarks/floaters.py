@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from climatenerf.evaluation import geometry
+from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views, transmittance_to
 from climatenerf.evaluation.reference import read_reference
-from climatenerf.evaluation.scores import Place, check_views, passing
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import Scene
@@ -83,21 +83,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     options = parser.parse_args()
-    place = Place(
+    run = EvaluatedRun(
         load_field(options.run),
         load_scene(options.run),
         read_reference(ROOT / "reference" / "street"),
     )
-    check_views(place.scene, place.reference)
-    photos = depths_of_photos(place.scene)
+    check_views(run.scene, run.reference)
+    photos = depths_of_photos(run.scene)
     lost, shown, edge, way = [], [], [], []
-    for truth in place.reference.truths:
+    for truth in run.reference.truths:
         free = torch.from_numpy(geometry.free_space(truth).astype(np.float32).ravel())
-        passed = passing(place.fitted, *place.pose(truth), free).view(truth.depth.shape).numpy()
+        passed = (
+            transmittance_to(run.field, *run.camera(truth), free).view(truth.depth.shape).numpy()
+        )
         solid = ~truth.sky
         lost.append(1 - passed[solid])
-        shown.append(times_shown(truth.points[solid], place.scene, photos))
-        edge.append(geometry.beside_nearer(truth)[solid])
+        shown.append(times_shown(truth.points[solid], run.scene, photos))
+        edge.append(geometry.occluded_edges(truth)[solid])
         way.append(truth.depth[solid])
     lost, shown, edge, way = (np.concatenate(each) for each in (lost, shown, edge, way))
     everything = np.ones(len(lost), bool)

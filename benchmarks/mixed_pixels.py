@@ -22,9 +22,9 @@ import torch
 from jaxtyping import Float
 
 from climatenerf.core.classes import MERGED, SKY
+from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views, transmittance_to
 from climatenerf.evaluation.geometry import EMPTY, emptiness_scores, free_space
 from climatenerf.evaluation.reference import read_reference
-from climatenerf.evaluation.scores import Place, check_views, passing
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_labels
@@ -48,23 +48,24 @@ def depths(scene, pose: Float[np.ndarray, "4 4"], size: tuple[int, int], rays: i
 def transmittance(fitted, camera, c2w) -> Float[np.ndarray, "h w"]:
     """Of the whole ray of each pixel of a view."""
     endless = torch.full((camera.width * camera.height,), 1e9)
-    return passing(fitted, camera, c2w, endless).view(camera.height, camera.width).numpy()
+    return transmittance_to(fitted, camera, c2w, endless).view(camera.height, camera.width).numpy()
 
 
-def run_scores(run: Path, truths, pure: list[np.ndarray]) -> dict[str, float]:
+def run_scores(folder: Path, truths, pure: list[np.ndarray]) -> dict[str, float]:
     """Shares of a fit's sky pixels that are empty; `pure` are those that are all sky."""
-    place = Place(load_field(run), load_scene(run), read_reference(ROOT / "reference" / "street"))
-    check_views(place.scene, place.reference)
-    passed = [transmittance(place.fitted, *place.pose(truth)) for truth in truths]
+    reference = read_reference(ROOT / "reference" / "street")
+    run = EvaluatedRun(load_field(folder), load_scene(folder), reference)
+    check_views(run.scene, run.reference)
+    passed = [transmittance(run.field, *run.camera(truth)) for truth in truths]
     empty = np.concatenate([(p >= EMPTY)[t.sky] for p, t in zip(passed, truths, strict=True)])
     all_sky = np.concatenate([p[t.sky] for p, t in zip(pure, truths, strict=True)])
     known = []
-    for view in place.scene.of_split("train")[::8]:
-        label = load_labels(view, place.scene)
+    for view in run.scene.of_split("train")[::8]:
+        label = load_labels(view, run.scene)
         assert label is not None
         sky = MERGED[label] == SKY
-        camera, c2w = place.scene.cameras[view.camera], place.scene.c2w_world(view)
-        known.append((transmittance(place.fitted, camera, c2w) >= EMPTY)[sky])
+        camera, c2w = run.scene.cameras[view.camera], run.scene.c2w_world(view)
+        known.append((transmittance(run.field, camera, c2w) >= EMPTY)[sky])
     return {
         "pure_empty": float(empty[all_sky].mean()),
         "mixed_empty": float(empty[~all_sky].mean()),

@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 
+from climatenerf.evaluation.evaluated_run import EvaluatedRun
 from climatenerf.evaluation.reference import read_reference
-from climatenerf.evaluation.scores import Place
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene, read_scene
-from climatenerf.studies.ablation import measure_row
+from climatenerf.studies.ablation import score_row
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 
@@ -104,10 +104,10 @@ def main() -> None:
         found = {}
         for name in options.rows:
             settings = FitSettings(minutes=options.minutes, losses=ROWS[name], seed=options.seed)
-            run = work / name.replace(" ", "-")
-            fit_scene(scene, run, settings, 2, False, lambda _: None, lambda *_: None)
-            place = Place(load_field(run), load_scene(run), read_reference(REFERENCE))
-            found[name], _ = measure_row(place, settings, False)
+            folder = work / name.replace(" ", "-")
+            fit_scene(scene, folder, settings, 2, False, lambda _: None, lambda *_: None)
+            run = EvaluatedRun(load_field(folder), load_scene(folder), read_reference(REFERENCE))
+            found[name], _ = score_row(run, settings, False)
             print(name, found[name], file=sys.stderr)
     common.report("fits with and without relative depth", found, options.seed)
 

@@ -16,11 +16,11 @@ import common
 import numpy as np
 
 from climatenerf.evaluation import geometry
+from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views, render_clean
 from climatenerf.evaluation.reference import Truth, read_reference
-from climatenerf.evaluation.scores import Place, check_views, dry_from
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import Camera, load_scene
-from climatenerf.studies.ablation import slope_normals
+from climatenerf.studies.ablation import density_normals
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 
@@ -47,23 +47,24 @@ def main() -> None:
     options = parser.parse_args()
     if any(part % 2 == 0 for part in options.parts):
         parser.error("--parts are odd: else a small pixel's middle is the middle of no true one")
-    place = Place(load_field(options.run), load_scene(options.run), read_reference(REFERENCE))
-    check_views(place.scene, place.reference)
-    if not place.fitted.knows_normals:
+    reference = read_reference(REFERENCE)
+    run = EvaluatedRun(load_field(options.run), load_scene(options.run), reference)
+    check_views(run.scene, run.reference)
+    if not run.field.knows_normals:
         parser.error(f"{options.run} has learned no normals")
     found = {}
     for part in options.parts:
         angles = {}
         for kind in ("predicted", "planes", "slope"):
-            place.fitted.learned[0] = kind != "planes"
+            run.field.learned[0] = kind != "planes"
             truths, normals = [], []
-            for truth in place.reference.truths:
-                camera, c2w = place.pose(truth)
+            for truth in run.reference.truths:
+                camera, c2w = run.camera(truth)
                 own, small = thinned(truth, camera, part)
-                dry = dry_from(place, small, c2w)
+                dry = render_clean(run.field, small, c2w)
                 sloped = kind == "slope"
                 normals.append(
-                    slope_normals(place.fitted, dry) if sloped else dry.normal @ c2w[:3, :3]
+                    density_normals(run.field, dry) if sloped else dry.normal @ c2w[:3, :3]
                 )
                 truths.append(own)
             angles[kind] = geometry.normal_scores(normals, tuple(truths))

@@ -17,12 +17,12 @@ from pathlib import Path
 import common
 import numpy as np
 
+from climatenerf.evaluation.evaluated_run import EvaluatedRun
 from climatenerf.evaluation.reference import read_reference
-from climatenerf.evaluation.scores import Place
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.scene import Scene
-from climatenerf.studies.ablation import measure_row
+from climatenerf.studies.ablation import score_row
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 
@@ -82,12 +82,12 @@ def main() -> None:
                 losses=losses,
                 multiview_stereo=False,
             )
-            run = Path(work) / fit
+            folder = Path(work) / fit
             fit_scene(
-                scene, run, settings, options.downscale, False, lambda _: None, lambda *_: None
+                scene, folder, settings, options.downscale, False, lambda _: None, lambda *_: None
             )
-            place = Place(load_field(run), load_scene(run), read_reference(REFERENCE))
-            found[fit], _ = measure_row(place, settings, False)
+            run = EvaluatedRun(load_field(folder), load_scene(folder), read_reference(REFERENCE))
+            found[fit], _ = score_row(run, settings, False)
             print(fit, found[fit], file=sys.stderr, flush=True)
     common.report("floaters with sparse and with true points", found, options.seed)
 

@@ -34,7 +34,7 @@ def test_an_ablation_wants_a_capture_with_its_truth(capsys, tmp_path, monkeypatc
     words = ["evaluate", REFERENCE, "--ablation", "-o", tmp_path / "out"]
     assert "above 0" in complaint(capsys, *words, "--minutes", "0")
     assert "--reference" in complaint(capsys, *words, "--reference")
-    assert "no row 'sun'; there are: plain NGP" in complaint(capsys, *words, "--rows", "sun")
+    assert "no row 'sun'; choose from: plain NGP" in complaint(capsys, *words, "--rows", "sun")
     assert "--rows" in complaint(capsys, "evaluate", REFERENCE, "--rows", "full", "-o", tmp_path)
     street = REFERENCE.parents[1] / "src/climatenerf/assets/street"
     err = complaint(capsys, "evaluate", street, "--ablation", "-o", tmp_path / "out")

@@ -12,10 +12,10 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
 from climatenerf.core.srgb import to_display
 from climatenerf.evaluation import baselines, geometry, weather_scores
-from climatenerf.evaluation.baselines import Dry
+from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
+from climatenerf.evaluation.evaluated_run import depth_spread
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
-from climatenerf.evaluation.scores import depth_spread
 from climatenerf.scene import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -80,7 +80,7 @@ def test_depth_errors_are_those_put_in():
     truth = truth_of()
     found = geometry.depth_scores([1.1 * truth.depth], (truth,))
     assert found["depth_abs_rel"] == pytest.approx(0.1, rel=1e-4)
-    near = truth.depth[truth.depth < geometry.FARTHEST].astype(float)
+    near = truth.depth[truth.depth < geometry.MAX_DISTANCE].astype(float)
     assert found["depth_rmse_m"] == pytest.approx(0.1 * np.sqrt((near**2).mean()), rel=1e-4)
     nothing = np.full_like(truth.depth, np.inf)
     assert geometry.depth_scores([nothing], (truth,))["depth_abs_rel"] == pytest.approx(1.0)
@@ -88,7 +88,7 @@ def test_depth_errors_are_those_put_in():
 
 def test_holes_in_the_ground_are_those_put_in():
     truth, leaves = truth_of(), truth_of(label=LEAVES)
-    ground = np.argwhere(truth.depth < geometry.FARTHEST)
+    ground = np.argwhere(truth.depth < geometry.MAX_DISTANCE)
     depth = 1.2 * truth.depth
     for row, column in ground[:30]:
         depth[row, column] = 1.6 * truth.depth[row, column]
@@ -163,7 +163,7 @@ def test_floaters_are_told_off_edges_too():
     beside = np.zeros(truth.depth.shape, bool)
     beside[7:12, 7:12] = True
     beside[8:11, 8:11] = False
-    assert np.array_equal(geometry.beside_nearer(truth), beside)
+    assert np.array_equal(geometry.occluded_edges(truth), beside)
     lost = np.where(beside, 1.0, 0.125)
     found = geometry.emptiness_scores([lost], [1 - lost], (truth,))
     assert found["clear_floater_mass"] == pytest.approx(0.125)
@@ -171,7 +171,7 @@ def test_floaters_are_told_off_edges_too():
     # A surface that recedes is its own neighbour, not an edge; nor is what the sky is behind.
     truth.depth[:] = np.linspace(5, 9, truth.depth.shape[0])[:, None]
     truth.depth[:4] = np.inf
-    assert not geometry.beside_nearer(truth)[4:].any()
+    assert not geometry.occluded_edges(truth)[4:].any()
 
 
 def waterline(depth, level, truth, mask):
@@ -185,13 +185,13 @@ def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_dist
     from_eye = truth.points - truth.c2w[:3, 3]
     line, _ = weather_scores.crossings(from_eye, truth.points[..., 2] - 0.3)
     np.testing.assert_allclose(line[:, 1], 3.0, atol=0.02)
-    wet = weather_scores.plane_first(truth, 0.3)
+    wet = weather_scores.water_visible(truth, 0.3)
     assert wet.any() and (truth.points[wet][:, 2] < 0.3).all()
     right = waterline(truth.depth, 0.3, truth, wet)
     assert right["waterline_error_cm"] < 0.01 and right["waterline_error_px"] < 0.01
     assert right["waterline_height_error_cm"] < 2 and right["water_iou"] == 1.0
     # 2 cm too high on a slope of one in ten: the line lies 20 cm further.
-    high = waterline(truth.depth, 0.32, truth, weather_scores.plane_first(truth, 0.32))
+    high = waterline(truth.depth, 0.32, truth, weather_scores.water_visible(truth, 0.32))
     assert high["waterline_error_cm"] == pytest.approx(20.0, rel=0.05)
     assert high["waterline_height_error_cm"] == pytest.approx(2.0, abs=0.5)
     assert 0.9 < high["water_iou"] < 1
@@ -205,7 +205,7 @@ def test_a_shore_that_is_not_there_counts():
     truth = truth_of(rise=0.1)
     hump = truth.depth.copy()
     hump[36:46, 10:54] *= 0.85
-    found = waterline(hump, 0.3, truth, weather_scores.plane_first(truth, 0.3))
+    found = waterline(hump, 0.3, truth, weather_scores.water_visible(truth, 0.3))
     assert found["waterline_error_cm"] > 1
 
 
@@ -242,7 +242,7 @@ def dry_view(rise=0.0):
     linear = np.stack([red, 0.3 * np.ones_like(red), 0.2 * np.ones_like(red)], -1)
     linear[truth.sky] = (0.5, 0.6, 0.9)
     normal = truth.normal @ truth.c2w[:3, :3].T
-    return Dry(linear, truth.depth, normal, truth.rays_d, truth.c2w, CAMERA)
+    return CleanView(linear, truth.depth, normal, truth.rays_d, truth.c2w, CAMERA)
 
 
 def test_tuning_finds_the_constants_that_made_the_truth():
@@ -250,9 +250,9 @@ def test_tuning_finds_the_constants_that_made_the_truth():
     foggy = to_display(baselines.depth_fog(dry, 0.1, colour))
     found = baselines.tuned_sigma([dry], [np.round(255 * foggy).astype(np.uint8)], 0.05, colour)
     assert found == pytest.approx(0.1, rel=0.1)
-    share = baselines.white_paint(dry)
+    share = baselines.snow_coverage(dry)
     assert share[~np.isinf(dry.depth)].min() > 0.99 and share[np.isinf(dry.depth)].max() < 1e-6
-    painted = to_display(baselines.painted(dry.linear, share, colour))
+    painted = to_display(baselines.overlay(dry.linear, share, colour))
     true = [np.round(255 * painted).astype(np.uint8)]
     white = baselines.tuned_colour([dry.linear * (1 - share[..., None])], [share], true)
     np.testing.assert_allclose(white, colour, atol=0.01)
@@ -269,7 +269,7 @@ def test_a_screen_reflects_what_it_shows_and_its_sky():
     depth = np.where(high, np.inf, np.minimum(ground, wall))
     linear = np.where((wall < ground)[..., None], [0.7, 0.1, 0.1], [0.2, 0.2, 0.2])
     linear[high] = (0.1, 0.2, 0.9)
-    dry = Dry(linear, depth, np.zeros_like(linear), rays, pose, CAMERA)
+    dry = CleanView(linear, depth, np.zeros_like(linear), rays, pose, CAMERA)
     wet, t = baselines.wet_pixels(dry, 0.1)
     assert wet.any() and (t[wet] < depth[wet]).all()
     shown, part = baselines.screen_reflection(dry, 0.1, 1.333, np.zeros((48, 64, 2)))
@@ -279,12 +279,6 @@ def test_a_screen_reflects_what_it_shows_and_its_sky():
     assert part[rows[0], column] > part[rows[-1], column], "more of it at grazing"
     sky = [r for r in rows if np.allclose(shown[r, column], [0.1, 0.2, 0.9])]
     assert sky and min(sky) > rows[0], "the sky above the wall mirrors nearer to the eye"
-
-
-def test_fresnel_of_the_baselines_is_the_textbooks():
-    angles = np.deg2rad([0.0, 30.0, 60.0, 75.0, 80.0, 85.0])
-    found = baselines.fresnel(np.cos(angles), 1.333)
-    np.testing.assert_allclose(found, [0.0204, 0.0214, 0.0597, 0.212, 0.348, 0.584], rtol=0.01)
 
 
 def test_a_colour_is_tuned_for_what_is_displayed():

@@ -9,8 +9,9 @@ from support.toy_scene import TINY, make_scene
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU
+from climatenerf.evaluation.baselines import CleanView
+from climatenerf.evaluation.evaluated_run import EvaluatedRun
 from climatenerf.evaluation.reference import read_reference
-from climatenerf.evaluation.scores import Dry, Place
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.scene import Camera, load_scene, read_scene
@@ -57,8 +58,8 @@ def test_slopes_are_the_density_s_at_the_surfaces_in_the_camera_s_axes():
     rays = np.array([[[1.0, 0, 0], [1.0, 0, 0]]])
     for depth, along in ((4.0, 1.0), (2.0, -1.0)):
         depths = np.array([[depth, np.inf]])
-        dry = Dry(np.zeros((1, 2, 3)), depths, np.zeros((1, 2, 3)), rays, c2w, camera)
-        found = ablation.slope_normals(Slanted(), dry)
+        dry = CleanView(np.zeros((1, 2, 3)), depths, np.zeros((1, 2, 3)), rays, c2w, camera)
+        found = ablation.density_normals(Slanted(), dry)
         assert np.allclose(found, [[[0.0, -along, 0.0], [0.0, 0.0, 0.0]]]), found
 
 
@@ -89,18 +90,18 @@ def test_each_row_leaves_out_just_what_it_says():
 
 
 def test_rows_are_chosen_by_name_in_the_table_s_order():
-    assert list(ablation.chosen_rows(4.0, ())) == list(ablation.rows(4.0))
-    some = ablation.chosen_rows(2.0, ("full", "plain NGP"))
+    assert list(ablation.select_rows(4.0, ())) == list(ablation.rows(4.0))
+    some = ablation.select_rows(2.0, ("full", "plain NGP"))
     assert list(some) == ["plain NGP", "full"] and some["full"] == FitSettings(minutes=2.0)
-    with pytest.raises(UserError, match="'no sun'; there are: plain NGP, no appearance"):
-        ablation.chosen_rows(4.0, ("full", "no sun"))
+    with pytest.raises(UserError, match="'no sun'; choose from: plain NGP, no appearance"):
+        ablation.select_rows(4.0, ("full", "no sun"))
 
 
 def test_the_papers_weights_are_the_papers():
     """Its print 3^{-4} and so on is 3e-4: the first public code has these."""
     weights = PAPER.losses
     assert (weights.classes, weights.normals, weights.distortion) == (4e-2, 7e-4, 3e-4)
-    assert (weights.sky, weights.opacity, PAPER.decay) == (1e-1, 2e-4, 0.0)
+    assert (weights.sky, weights.opacity_entropy, PAPER.decay) == (1e-1, 2e-4, 0.0)
     assert settings_of("paper") is PAPER and settings_of("cpu").losses == Losses()
     assert settings_of("gpu").preset == "gpu"
 
@@ -193,20 +194,20 @@ def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
     scene = read_scene(REFERENCE)
     settings = FitSettings(minutes=None, steps=700)
     run_module.fit_scene(scene, tmp_path, settings, 2, False, lambda _: None, lambda *_: None)
-    place = Place(load_field(tmp_path), load_scene(tmp_path), read_reference(REFERENCE))
-    found, _ = ablation.measure_row(place, settings, False)
+    run = EvaluatedRun(load_field(tmp_path), load_scene(tmp_path), read_reference(REFERENCE))
+    found, _ = ablation.score_row(run, settings, False)
     assert found["psnr"] > 24 and found["depth_abs_rel"] < 0.06 and found["miou"] > 0.85
     assert found["normal_ground_roof_median_deg"] < 8 and found["floater_mass"] < 0.12
     # What is shown is far smoother than what the density alone would give.
     assert found["normal_median_deg"] < 0.6 * found["slope_median_deg"]
     assert found["open_sky"] > 0.95 and found["sky_empty_fraction"] > 0.9
     # Upwards all round, where reflections go: nothing is black.
-    photos = np.concatenate([truth.clean.reshape(-1, 3) for truth in place.reference.truths])
+    photos = np.concatenate([truth.clean.reshape(-1, 3) for truth in run.reference.truths])
     least = 0.25 * np.median(photos.mean(-1))
     angle, up = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0.05, 1.0, 20))
     level = np.sqrt(1 - up**2)
     d = np.stack([level * np.cos(angle), level * np.sin(angle), up], -1).reshape(-1, 3)
-    sky = place.fitted.sky(torch.from_numpy(d.astype(np.float32)))
+    sky = run.field.sky(torch.from_numpy(d.astype(np.float32)))
     assert sky.mean(-1).min() > least
 
 
@@ -229,7 +230,7 @@ def test_what_cannot_be_measured_is_refused_before_the_first_fit(tmp_path, monke
     trained = [dataclasses.replace(view, split="train") for view in scene.views]
     refused("was fitted to the test view", tmp_path, dataclasses.replace(scene, views=trained))
     fewer = [view for view in scene.views if view.name != "t03.jpg"]
-    refused("does not know the test view", tmp_path, dataclasses.replace(scene, views=fewer))
+    refused("lacks the test view", tmp_path, dataclasses.replace(scene, views=fewer))
     (tmp_path / ablation.TEXT_NAME).write_text("mine")
     refused("would be overwritten", tmp_path)
     assert (tmp_path / ablation.TEXT_NAME).read_text() == "mine" and len(

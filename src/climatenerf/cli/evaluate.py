@@ -1,7 +1,7 @@
-"""``climatenerf evaluate RUN --reference -o REPORT``: a run's scores against the known truth.
+"""``climatenerf evaluate RUN --reference -o REPORT``: scores of a run against the ground truth.
 
-``climatenerf evaluate SCENE --ablation -o REPORT`` fits and measures it with one part left out at
-a time.
+``climatenerf evaluate SCENE --ablation -o REPORT`` fits and scores a reference set with one part of
+the method left out at a time.
 """
 
 from dataclasses import dataclass
@@ -16,33 +16,33 @@ from climatenerf.core.errors import UserError
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Measure a run against the truth: a table, report.json, and pictures."""
+    """Score a run against the ground truth: a table, report.json and pictures."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder made by `climatenerf fit reference/street`; with --ablation the reference set."""
+    """Run folder from `climatenerf fit reference/street`; with --ablation the reference set."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
     reference: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Against the reference set that the run was fitted to: geometry, weather, baselines."""
+    """Compare with the reference set that the run was fitted to: geometry, weather, baselines."""
     views: tuple[str, ...] = ()
-    """Test views, such as t01 t04. Default: all."""
+    """Test views to score, such as t01 t04. Default: all."""
     weathers: tuple[str, ...] = ()
-    """Weathers, such as flood-low smog-near. Default: all."""
+    """Weathers to score, such as flood-low smog-near. Default: all."""
     ablation: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Fit a reference set with one part of the method left out at a time, and measure each: eight
-    rows, an hour and a half with the defaults. Stopped, the same command goes on."""
+    """Fit a reference set with one part of the method left out at a time, and score each fit: eight
+    rows, an hour and a half with the defaults. Re-run the same command to resume."""
     minutes: float = 4.0
-    """Time for each fit of the ablation."""
+    """Duration of each fit of the ablation, minutes."""
     downscale: int = 2
-    """Photos are reduced this many times for the ablation."""
+    """Factor by which photos are reduced for the ablation."""
     seeds: int = 2
-    """Fits of each row of the ablation."""
+    """Number of fits of each row of the ablation."""
     rows: tuple[str, ...] = ()
     """Rows of the ablation, such as "plain NGP" full. Default: all."""
 
 
 def run(options: Evaluate) -> int:
-    """Measures, prints the table, and says where the report is."""
+    """Score a run or make an ablation; print the table and the path of the report."""
     if options.ablation:
         return run_ablation(options)
     if (options.minutes, options.downscale, options.seeds, options.rows) != (4.0, 2, 2, ()):
@@ -50,11 +50,14 @@ def run(options: Evaluate) -> int:
             "--minutes, --downscale, --seeds and --rows belong to --ablation; leave them out"
         )
     if not options.reference:
-        raise UserError("say what to measure against: climatenerf evaluate RUN --reference -o OUT")
+        raise UserError(
+            "no reference to compare with; use: climatenerf evaluate RUN --reference -o OUT"
+        )
 
     from climatenerf.core.storage import read_json
+    from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views
     from climatenerf.evaluation.reference import read_reference
-    from climatenerf.evaluation.scores import Place, check_views, evaluate
+    from climatenerf.evaluation.scores import evaluate
     from climatenerf.field.checkpoint import load_field
     from climatenerf.output.score_report import check_folder, table_text, write_report
     from climatenerf.scene import load_scene
@@ -67,15 +70,15 @@ def run(options: Evaluate) -> int:
     if options.out.resolve().is_relative_to(reference.folder.resolve()):
         raise UserError(f"{options.out} lies in the reference set; choose another folder with -o")
     check_views(scene, reference)
-    measured = options.run / "metrics.json"  # absent where a fit was stopped before its end
+    measured = options.run / "metrics.json"  # absent after an interrupted fit
     metrics = read_json(measured, "the run's measurements") if measured.exists() else {}
-    names = ["clean", *(kind.name for kind in reference.weathers)]
+    names = ["clean", *(case.name for case in reference.weathers)]
     old = check_folder(options.out, names)
     with progress.Bar("evaluate", len(names) + 7) as bar:
         scores = evaluate(
-            Place(field, scene, reference), lambda what: bar.advance(1, {"now": what})
+            EvaluatedRun(field, scene, reference), lambda step: bar.advance(1, {"now": step})
         )
-    about = {
+    description = {
         "run": options.run.resolve().name,
         "capture": scene.root.name,
         "seconds": metrics.get("seconds"),
@@ -83,40 +86,40 @@ def run(options: Evaluate) -> int:
         "downscale": config.get("downscale"),
         "views": [Path(truth.name).stem for truth in reference.truths],
     }
-    write_report(scores, about, options.out, old)
+    write_report(scores, description, options.out, old)
     progress.result(table_text(scores.table))
     progress.result(f"report: {options.out / 'report.md'}")
     return 0
 
 
 def run_ablation(options: Evaluate) -> int:
-    """Fits and measures every row, prints the table, and says where it is."""
+    """Fit and score every row; print the table and the path of the report."""
     if not options.minutes > 0 or options.downscale < 1 or options.seeds < 1:
         raise UserError("--minutes must be above 0, --downscale and --seeds at least 1")
     if options.reference or options.views or options.weathers:
-        raise UserError("--ablation stands alone; leave --reference, --views and --weathers out")
+        raise UserError("--ablation excludes --reference, --views and --weathers; leave them out")
     from climatenerf.scene import read_scene
 
     scene = read_scene(options.run)
 
-    from climatenerf.studies.ablation import TEXT_NAME, ablate, chosen_rows, markdown
+    from climatenerf.studies.ablation import TEXT_NAME, ablate, markdown, select_rows
     from climatenerf.training.trainer import Report
 
-    chosen = chosen_rows(options.minutes, options.rows)
-    total = len(chosen) * options.seeds
+    selected = select_rows(options.minutes, options.rows)
+    total = len(selected) * options.seeds
     with progress.Bar("ablation", float(total)) as bar:
         done = 0
 
-        def report(name: str, state: Report) -> None:
+        def after_step(name: str, state: Report) -> None:
             bar.update(done + state.progress, {"row": name, "PSNR": f"{state.psnr:.1f}"})
 
-        def tell(name: str) -> None:
+        def scoring(name: str) -> None:
             nonlocal done
             done += 1
-            bar.update(float(done), {"measured": name})
+            bar.update(float(done), {"scoring": name})
 
-        asked = (options.minutes, options.downscale, options.seeds)
-        data = ablate(scene, options.out, *asked, report, tell, chosen)
+        extent = (options.minutes, options.downscale, options.seeds)
+        data = ablate(scene, options.out, *extent, after_step, scoring, selected)
     progress.result(markdown(data))
     progress.result(f"report: {options.out / TEXT_NAME}")
     return 0

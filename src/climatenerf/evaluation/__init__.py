@@ -1,1 +1,1 @@
-
+"""Measure rendered pictures and fitted runs against photographs and ground truth."""

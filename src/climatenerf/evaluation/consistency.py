@@ -1,4 +1,4 @@
-"""Whether frames show one place: a frame moved to another's camera by depth must look like it."""
+"""Multi-view consistency of rendered frames: a frame warped by depth must match its neighbour."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from climatenerf.evaluation.geometry import nearest_pixels
 from climatenerf.scene import Camera
 
-SAME = 0.02  # of the distance: the other frame sees the place itself if its depth is this near
-LEAST = 200  # pixels; fewer say nothing
+DEPTH_TOLERANCE = 0.02  # relative; a point is visible in the other frame if its depth agrees
+MIN_PIXELS = 200  # fewer common pixels give no score
 
 
 @dataclass(frozen=True)
@@ -17,9 +17,9 @@ class Frame:
     """One frame of a movie.
 
     Attributes:
-        picture: display values, 0 to 1.
+        picture: display values, [0, 1].
         depth: ray length, m; +inf in the sky.
-        excluded: pixels that may change with the view (water).
+        excluded: pixels whose colour may depend on the view (water).
         c2w: pose, world m.
         camera: intrinsics.
     """
@@ -32,39 +32,40 @@ class Frame:
 
 
 def warp_error(frame: Frame, other: Frame) -> float:
-    """Root mean square difference of a frame from another one warped to it, over its contrast.
+    """Return the RMS difference between a frame and another one warped to it, over its contrast.
 
-    Each pixel's place is looked up in the other frame (bilinearly) where that one sees it too;
-    water, sky and what is hidden there are left out. Contrast is the deviation of the frame's
-    colours over the same pixels.
+    The surface point of each pixel is projected into the other frame, whose colour is interpolated
+    bilinearly. Water, sky and points hidden from the other camera are left out. The contrast is the
+    standard deviation of the frame's colours over the same pixels.
 
     Args:
-        frame: at t.
+        frame: at time t.
         other: at t + 1 or later.
 
     Returns:
-        0 for frames of one rigid, dull place; NaN where the two share nothing.
+        0 for a rigid scene of diffuse surfaces; NaN if fewer than `MIN_PIXELS` are common.
     """
-    seen = np.isfinite(frame.depth) & ~frame.excluded
+    compared = np.isfinite(frame.depth) & ~frame.excluded
     rays = frame.camera.directions() @ frame.c2w[:3, :3].T
-    points = frame.c2w[:3, 3] + np.where(seen, frame.depth, 1.0)[..., None] * rays
+    points = frame.c2w[:3, 3] + np.where(compared, frame.depth, 1.0)[..., None] * rays
     local = (points - other.c2w[:3, 3]) @ other.c2w[:3, :3]
     row, column, inside = nearest_pixels(other.camera, local)
     distance = np.linalg.norm(local, axis=-1)
-    same = np.abs(other.depth[row, column] - distance) < SAME * distance
-    seen &= inside & same & ~other.excluded[row, column]
-    if seen.sum() < LEAST:
+    visible = np.abs(other.depth[row, column] - distance) < DEPTH_TOLERANCE * distance
+    compared &= inside & visible & ~other.excluded[row, column]
+    if compared.sum() < MIN_PIXELS:
         return float("nan")
-    moved = bilinear(other.picture, other.camera.project(local[seen]))
-    own = frame.picture[seen]
-    contrast = np.sqrt(((own - own.mean(0)) ** 2).mean())
-    return float(np.sqrt(((own - moved) ** 2).mean()) / max(contrast, 1e-6))  # one colour: 0/0
+    warped = bilinear(other.picture, other.camera.project(local[compared]))
+    colour = frame.picture[compared]
+    contrast = np.sqrt(((colour - colour.mean(0)) ** 2).mean())
+    # 1e-6: a frame of one colour has no contrast, 0/0.
+    return float(np.sqrt(((colour - warped) ** 2).mean()) / max(contrast, 1e-6))
 
 
 def bilinear(
     picture: Float[np.ndarray, "h w 3"], pixel: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Values between pixel centres, held at the border."""
+    """Interpolate a picture at pixel coordinates (x, y); beyond the border the edge is repeated."""
     height, width = picture.shape[:2]
     x = np.clip(pixel[:, 0] - 0.5, 0, width - 1)
     y = np.clip(pixel[:, 1] - 0.5, 0, height - 1)

@@ -1,4 +1,4 @@
-"""How right a fitted place is: depth, normals, floaters, sky, classes, against the truth."""
+"""Scores of a fitted scene's geometry against the truth: depth, normals, free space, classes."""
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -15,160 +15,181 @@ from climatenerf.core.classes import (
 from climatenerf.evaluation.reference import Truth
 from climatenerf.scene import Camera
 
-HOLE = 1.5  # times the true distance: ground seen beyond that is missing
-FARTHEST = 50.0  # m: beyond it photos of a walk say little about distance
-MARGIN, MARGIN_SHARE = 0.1, 0.05  # m, and of the depth: matter this close before a surface is its
-EDGE, EDGE_SHARE = 0.1, 0.1  # m, and of the depth: a neighbour so much nearer makes an edge
-EMPTY = 0.99  # transmittance of what counts as empty sky
-CLEAR = 1.0  # m: how far around a place nothing stands over open ground,
-STANDING = 0.5  # m: and from which height it counts
-EVERY = 41  # of the pixels that show ground are asked for what is above them
-TALLEST_ROOF = 0.5  # upward part of a normal from which a building's surface is a roof
+HOLE_RATIO = 1.5  # rendered over true distance from which ground counts as missing
+MAX_DISTANCE = 50.0  # m; photos of a walk do not constrain geometry beyond it
+MARGIN, RELATIVE_MARGIN = 0.1, 0.05  # m, and of the depth; closer density belongs to the surface
+EDGE, RELATIVE_EDGE = 0.1, 0.1  # m, and of the depth; a depth step between pixels that is an edge
+EMPTY = 0.99  # transmittance from which a sky pixel counts as empty
+CLEARANCE = 1.0  # m, radius around open ground that must be free of obstacles
+MIN_OBSTACLE_HEIGHT = 0.5  # m
+GROUND_STRIDE = 41  # every so many ground pixels is tested for open sky
+MIN_ROOF_SLOPE = 0.5  # z of the unit normal from which a building's surface counts as a roof
 
 
-def depth_scores(depth: list[np.ndarray], truths: tuple[Truth, ...]) -> dict[str, float]:
-    """Relative and absolute error of ray lengths, where the truth is nearer than `FARTHEST`.
+def depth_scores(
+    depth: list[Float[np.ndarray, "h w"]], truths: tuple[Truth, ...]
+) -> dict[str, float]:
+    """Return the errors of ray lengths where the truth is nearer than `MAX_DISTANCE`.
 
-    A ray that meets nothing, or something beyond twice the truth, counts as twice the truth, so
-    that a single hole does not outweigh all else.
+    A ray without a hit, or with one beyond twice the true length, counts as twice the true length:
+    a single hole must not outweigh all other pixels.
+
+    Args:
+        depth: rendered ray lengths, m; +inf in the sky.
+        truths: the same views.
+
+    Returns:
+        `depth_abs_rel`, the mean relative error, and `depth_rmse_m`.
     """
-    relative, metres = [], []
-    for ours, truth in zip(depth, truths, strict=True):
-        near = truth.depth < FARTHEST
-        real = truth.depth[near].astype(np.float64)
-        error = np.minimum(ours[near], 2 * real) - real
-        relative.append(np.abs(error) / real)
-        metres.append(error**2)
+    relative, squared = [], []
+    for rendered, truth in zip(depth, truths, strict=True):
+        near = truth.depth < MAX_DISTANCE
+        true = truth.depth[near].astype(np.float64)
+        error = np.minimum(rendered[near], 2 * true) - true
+        relative.append(np.abs(error) / true)
+        squared.append(error**2)
     return {
         "depth_abs_rel": float(np.concatenate(relative).mean()),
-        "depth_rmse_m": float(np.sqrt(np.concatenate(metres).mean())),
+        "depth_rmse_m": float(np.sqrt(np.concatenate(squared).mean())),
     }
 
 
-def normal_scores(normal: list[np.ndarray], truths: tuple[Truth, ...]) -> dict[str, float]:
-    """Angles between true normals and ours, both in camera axes, in degrees.
+def normal_scores(
+    normal: list[Float[np.ndarray, "h w 3"]], truths: tuple[Truth, ...]
+) -> dict[str, float]:
+    """Return median angles between rendered and true normals, degrees.
 
-    Medians over places nearer than `FARTHEST`: without vegetation, on ground and roofs alone, and
-    over all. A pixel without a surface counts as 90 degrees.
+    Args:
+        normal: rendered unit normals in camera axes; 0 where there is no surface, which counts as
+            an error of 90 degrees.
+        truths: the same views.
+
+    Returns:
+        Medians over pixels nearer than `MAX_DISTANCE`: `normal_median_deg` without vegetation,
+        `normal_ground_roof_median_deg` on ground and roofs, `normal_all_median_deg` over all.
     """
-    angles, smooth, level = [], [], []
-    for ours, truth in zip(normal, truths, strict=True):
-        near = truth.depth < FARTHEST
-        cosine = (ours * truth.normal).sum(-1)
+    angles, not_vegetation, ground_roof = [], [], []
+    for rendered, truth in zip(normal, truths, strict=True):
+        near = truth.depth < MAX_DISTANCE
+        cosine = (rendered * truth.normal).sum(-1)
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1)))[near])
-        smooth.append((MERGED[truth.label] != VEGETATION)[near])
-        level.append(ground_or_roof(truth)[near])
-    angle, plain, flat = (np.concatenate(each) for each in (angles, smooth, level))
+        not_vegetation.append((MERGED[truth.label] != VEGETATION)[near])
+        ground_roof.append(ground_or_roof(truth)[near])
+    angle = np.concatenate(angles)
     return {
-        "normal_median_deg": _median(angle[plain]),
-        "normal_ground_roof_median_deg": _median(angle[flat]),
+        "normal_median_deg": _median(angle[np.concatenate(not_vegetation)]),
+        "normal_ground_roof_median_deg": _median(angle[np.concatenate(ground_roof)]),
         "normal_all_median_deg": _median(angle),
     }
 
 
 def ground_or_roof(truth: Truth) -> Bool[np.ndarray, "h w"]:
-    """Road, terrain, and what of the buildings looks up."""
-    kind = MERGED[truth.label]
-    up = truth.c2w[2, :3]  # in the camera's axes
-    roof = (kind == BUILDING) & (truth.normal @ up > TALLEST_ROOF)
-    return (kind == ROAD) | (kind == TERRAIN) | roof
+    """Return the pixels of roads, terrain and upward-facing surfaces of buildings."""
+    label = MERGED[truth.label]
+    up = truth.c2w[2, :3]  # world z in camera axes
+    roof = (label == BUILDING) & (truth.normal @ up > MIN_ROOF_SLOPE)
+    return (label == ROAD) | (label == TERRAIN) | roof
 
 
-def ground_holes(depth: list[np.ndarray], truths: tuple[Truth, ...]) -> float:
-    """Share of road and terrain nearer than `FARTHEST` that is seen through.
+def ground_holes(depth: list[Float[np.ndarray, "h w"]], truths: tuple[Truth, ...]) -> float:
+    """Return the fraction of road and terrain nearer than `MAX_DISTANCE` that rays pass through.
 
     Args:
-        depth: ray lengths of the field, in true metres; +inf where nothing is.
+        depth: ray lengths of the field, true metres; +inf without a hit.
         truths: the same views.
     """
-    seen_through = []
-    for own, truth in zip(depth, truths, strict=True):
-        ground = np.isin(MERGED[truth.label], (ROAD, TERRAIN)) & (truth.depth < FARTHEST)
-        seen_through.append(own[ground] > HOLE * truth.depth[ground])
-    found = np.concatenate(seen_through)
-    return float(found.sum() / max(len(found), 1))  # 1: no ground, 0/0
+    missing = []
+    for rendered, truth in zip(depth, truths, strict=True):
+        ground = np.isin(MERGED[truth.label], (ROAD, TERRAIN)) & (truth.depth < MAX_DISTANCE)
+        missing.append(rendered[ground] > HOLE_RATIO * truth.depth[ground])
+    holes = np.concatenate(missing)
+    return float(holes.sum() / max(len(holes), 1))  # 1: views without ground, 0/0
 
 
 def free_space(truth: Truth) -> Float[np.ndarray, "h w"]:
-    """Ray length, m, up to which the truth is empty with a margin; +inf in the sky."""
-    return np.maximum((1 - MARGIN_SHARE) * truth.depth - MARGIN, 0.0)
+    """Return the ray length, m, up to which space is empty, with a margin; +inf in the sky."""
+    return np.maximum((1 - RELATIVE_MARGIN) * truth.depth - MARGIN, 0.0)
 
 
 def open_ground(truths: tuple[Truth, ...]) -> Float[np.ndarray, "n 3"]:
-    """Places on road and terrain under the open sky, in the true world, m.
+    """Return points on road and terrain under the open sky, true world, m.
 
-    What the test views show is all that is known to stand over the ground: a place is open if none
-    of it is higher than `STANDING` over the place within about `CLEAR` around.
+    Obstacles are known only from the test views. A point is open if no surface that they show lies
+    more than `MIN_OBSTACLE_HEIGHT` above it within about `CLEARANCE`.
     """
-    places, heights = [], []
+    ground, surfaces = [], []
     for truth in truths:
-        near = truth.depth < FARTHEST
-        kind = MERGED[truth.label]
-        heights.append(truth.points[near])
-        places.append(truth.points[near & ((kind == ROAD) | (kind == TERRAIN))][::EVERY])
-    place, above = np.concatenate(places), np.concatenate(heights)
-    tallest: dict[tuple[int, int], float] = {}
-    cells = np.floor(above[:, :2] / CLEAR).astype(int)
-    order = np.lexsort((above[:, 2], cells[:, 1], cells[:, 0]))
-    for (x, y), z in zip(cells[order].tolist(), above[order, 2].tolist(), strict=True):
-        tallest[x, y] = z  # the last of a cell is its highest
-    free = []
-    for x, y, z in place.tolist():
-        i, j = int(np.floor(x / CLEAR)), int(np.floor(y / CLEAR))
-        around = [tallest.get((i + a, j + b), -np.inf) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-        free.append(max(around) < z + STANDING)
-    return place[np.array(free, bool)]
+        near = truth.depth < MAX_DISTANCE
+        label = MERGED[truth.label]
+        surfaces.append(truth.points[near])
+        is_ground = near & ((label == ROAD) | (label == TERRAIN))
+        ground.append(truth.points[is_ground][::GROUND_STRIDE])
+    candidates, points = np.concatenate(ground), np.concatenate(surfaces)
+    highest: dict[tuple[int, int], float] = {}
+    cells = np.floor(points[:, :2] / CLEARANCE).astype(int)
+    order = np.lexsort((points[:, 2], cells[:, 1], cells[:, 0]))
+    for (x, y), z in zip(cells[order].tolist(), points[order, 2].tolist(), strict=True):
+        highest[x, y] = z  # ascending z: the last of a cell is its highest
+    is_open = []
+    for x, y, z in candidates.tolist():
+        i, j = int(np.floor(x / CLEARANCE)), int(np.floor(y / CLEARANCE))
+        around = [highest.get((i + a, j + b), -np.inf) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        is_open.append(max(around) < z + MIN_OBSTACLE_HEIGHT)
+    return candidates[np.array(is_open, bool)]
 
 
 def emptiness_scores(
     absorbed: list[Float[np.ndarray, "h w"]],
-    skyward: list[Float[np.ndarray, "h w"]],
+    transmittance: list[Float[np.ndarray, "h w"]],
     truths: tuple[Truth, ...],
 ) -> dict[str, float]:
-    """Matter where there is none.
+    """Return how much density lies in space that is truly empty.
 
     Args:
-        absorbed: share of light lost within `free_space`.
-        skyward: transmittance of whole rays.
-        truths: of the same views.
+        absorbed: fraction of light absorbed within `free_space`.
+        transmittance: of whole rays.
+        truths: the same views.
 
     Returns:
-        `floater_mass`, the mean share lost before the surface, and `floaters_CLASS`, the same
-        before surfaces of each class; `sky_empty_fraction`, the share of true sky pixels that at
-        least `EMPTY` of the light passes; `clear_floater_mass` and `clear_sky_empty_fraction`, the
-        same of pixels with nothing nearer beside them, and of those with sky all around (a pixel
-        beside a leaf is leaf in part, whatever its middle shows).
+        `floater_mass`, the mean fraction absorbed before the surface, and `floaters_CLASS`, the
+        same before surfaces of each class. `sky_empty_fraction`, the fraction of true sky pixels
+        with a transmittance of at least `EMPTY`. `clear_floater_mass` and
+        `clear_sky_empty_fraction`, the same without pixels at a depth edge, and without sky pixels
+        beside other classes: the area of such a pixel contains both surfaces.
     """
-    lost = np.concatenate([a[~t.sky] for a, t in zip(absorbed, truths, strict=True)])
-    passed = np.concatenate([s[t.sky] for s, t in zip(skyward, truths, strict=True)])
-    clear = np.concatenate([within(t.sky)[t.sky] for t in truths])
-    inner = np.concatenate([~beside_nearer(t)[~t.sky] for t in truths])
-    kind = np.concatenate([MERGED[t.label][~t.sky] for t in truths])
-    each = {
-        f"floaters_{name}": float(lost[kind == own].mean())
-        for own, name in enumerate(CLASS_NAMES)
-        if (kind == own).any()
+    mass = np.concatenate([a[~t.sky] for a, t in zip(absorbed, truths, strict=True)])
+    sky = np.concatenate([s[t.sky] for s, t in zip(transmittance, truths, strict=True)])
+    clear_sky = np.concatenate([interior(t.sky)[t.sky] for t in truths])
+    inner = np.concatenate([~occluded_edges(t)[~t.sky] for t in truths])
+    label = np.concatenate([MERGED[t.label][~t.sky] for t in truths])
+    by_class = {
+        f"floaters_{name}": float(mass[label == index].mean())
+        for index, name in enumerate(CLASS_NAMES)
+        if (label == index).any()
     }
     return {
-        "floater_mass": float(lost.mean()),
-        "clear_floater_mass": float(lost[inner].mean()),
-        **each,
-        "sky_empty_fraction": _share(passed >= EMPTY),
-        "clear_sky_empty_fraction": _share(passed[clear] >= EMPTY),
+        "floater_mass": float(mass.mean()),
+        "clear_floater_mass": float(mass[inner].mean()),
+        **by_class,
+        "sky_empty_fraction": _fraction(sky >= EMPTY),
+        "clear_sky_empty_fraction": _fraction(sky[clear_sky] >= EMPTY),
     }
 
 
-def beside_nearer(truth: Truth) -> Bool[np.ndarray, "h w"]:
-    """Pixels one of whose eight neighbours shows what is much nearer."""
-    # What may be this near and still belong to the pixel's own surface; the sky has no end.
-    least = np.where(truth.sky, np.inf, (1 - EDGE_SHARE) * truth.depth - EDGE)
+def occluded_edges(truth: Truth) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels with a much nearer surface among their eight neighbours."""
+    # Nearer neighbours belong to another surface. The sky has no depth, hence no such bound.
+    bound = np.where(truth.sky, np.inf, (1 - RELATIVE_EDGE) * truth.depth - EDGE)
     padded = np.pad(truth.depth, 1, mode="edge")
     rows = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.minimum(np.minimum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]) < least
+    return np.minimum(np.minimum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]) < bound
 
 
-def within(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose neighbours are in the mask too; beyond the border there are none."""
+def interior(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels of a mask whose neighbours inside the picture are all in it.
+
+    `core.morphology.eroded` differs: there pixels beyond the border count as outside the mask.
+    """
     padded = np.pad(mask, 1, mode="edge")
     rows = padded[:-2] & padded[1:-1] & padded[2:]
     return rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]
@@ -177,9 +198,12 @@ def within(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def nearest_pixels(
     camera: Camera, local: Float[np.ndarray, "*n 3"]
 ) -> tuple[np.ndarray, np.ndarray, Bool[np.ndarray, "*n"]]:
-    """Row, column (0 where outside) of points in camera axes, and whether they are in the picture.
+    """Return the pixels that points in camera axes (m) project to.
 
-    Points behind the camera project to NaN, which is outside.
+    Points behind the camera project to NaN, which counts as outside.
+
+    Returns:
+        Row and column, 0 outside the picture, and whether the point is inside.
     """
     pixel = camera.project(local)
     with np.errstate(invalid="ignore"):
@@ -191,21 +215,26 @@ def nearest_pixels(
 def label_scores(
     labels: list[UInt8[np.ndarray, "h w"]], truths: tuple[Truth, ...]
 ) -> dict[str, float]:
-    """Intersection over union of each class that occurs, and their mean; unknown is wrong."""
-    ours = np.concatenate([each.ravel() for each in labels])
-    real = np.concatenate([MERGED[truth.label].ravel() for truth in truths])
-    known = real != UNKNOWN
-    ours, real = ours[known], real[known]
-    each = {}
-    for kind, name in enumerate(CLASS_NAMES):
-        if (real == kind).any():
-            union = ((ours == kind) | (real == kind)).sum()
-            each[f"iou_{name}"] = float(((ours == kind) & (real == kind)).sum() / union)
-    return {"miou": float(np.mean(list(each.values()))), **each}
+    """Return the intersection over union of each true class, and the mean `miou`.
+
+    Args:
+        labels: rendered merged classes; unknown counts as wrong.
+        truths: the same views; their unknown pixels are left out.
+    """
+    rendered = np.concatenate([each.ravel() for each in labels])
+    true = np.concatenate([MERGED[truth.label].ravel() for truth in truths])
+    labelled = true != UNKNOWN
+    rendered, true = rendered[labelled], true[labelled]
+    scores = {}
+    for index, name in enumerate(CLASS_NAMES):
+        if (true == index).any():
+            union = ((rendered == index) | (true == index)).sum()
+            scores[f"iou_{name}"] = float(((rendered == index) & (true == index)).sum() / union)
+    return {"miou": float(np.mean(list(scores.values()))), **scores}
 
 
-def _share(which: Bool[np.ndarray, "n"]) -> float:
-    return float(which.mean()) if which.size else float("nan")
+def _fraction(mask: Bool[np.ndarray, "n"]) -> float:
+    return float(mask.mean()) if mask.size else float("nan")
 
 
 def _median(values: np.ndarray) -> float:

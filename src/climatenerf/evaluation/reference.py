@@ -1,6 +1,6 @@
-"""The reference set: a place whose geometry and whose pictures in weather are known exactly.
+"""Read a reference set: a scene with exact geometry and path-traced pictures in known weather.
 
-What lies where in its folder is told in docs/reference-scene.md.
+docs/reference-scene.md describes the files of its folder.
 """
 
 import zipfile
@@ -26,16 +26,16 @@ SKY = 10  # Cityscapes train id
 
 @dataclass(frozen=True)
 class Truth:
-    """What is known of one test view.
+    """The ground truth of one test view.
 
     Attributes:
-        name: of the view.
+        name: file name of the view.
         depth: ray length, m; +inf in the sky.
-        normal: unit, towards the camera, in the camera's axes (OpenCV); 0 in the sky.
+        normal: unit, towards the camera, camera axes (OpenCV); 0 in the sky.
         label: Cityscapes train ids.
-        sun: share of the sun's disc that lights the place, 0 to 1.
-        clean: linear radiance.
-        rays_d: unit directions in the true world (z up).
+        sun: visible fraction of the sun's disc at the surface point, [0, 1].
+        clean: linear radiance without weather.
+        rays_d: unit ray directions, true world (z up).
         c2w: true pose of the camera, world m.
     """
 
@@ -50,12 +50,12 @@ class Truth:
 
     @property
     def sky(self) -> Bool[np.ndarray, "h w"]:
-        """Where nothing is."""
+        """Pixels without a surface."""
         return np.isinf(self.depth)
 
     @property
     def points(self) -> Float[np.ndarray, "h w 3"]:
-        """Places seen, in the true world, m; the eye in the sky."""
+        """Surface points, true world, m; the camera centre in the sky."""
         return self.c2w[:3, 3] + np.where(self.sky, 0.0, self.depth)[..., None] * self.rays_d
 
 
@@ -65,9 +65,9 @@ class WeatherTruth:
 
     Attributes:
         name: such as "flood-low".
-        weather: what the program is asked for.
-        time: moment of the picture, s.
-        folder: of its true pictures and layers.
+        weather: the weather to render.
+        time: time of the picture, s.
+        folder: folder of its true pictures and layers.
     """
 
     name: str
@@ -76,13 +76,17 @@ class WeatherTruth:
     folder: Path
 
     def picture(self, view: str) -> UInt8[np.ndarray, "h w 3"]:
-        """The path-traced display picture."""
+        """Read the path-traced display picture of a view."""
         return read_rgb((self.folder / view).with_suffix(".png"))
 
     def layers(self, view: str) -> dict[str, np.ndarray]:
-        """True layers, where this weather has some.
+        """Read the true layers of a view.
 
-        Smog: `transmittance`. Snow: `depth` along the ray and vertical `thickness`, m.
+        Returns:
+            For smog `transmittance`; for snow `depth` along the ray and vertical `thickness`, m.
+
+        Raises:
+            UserError: the file is missing (floods have no layers) or damaged.
         """
         return _arrays((self.folder / view).with_suffix(".npz"))
 
@@ -92,10 +96,10 @@ class Reference:
     """The reference set of a capture.
 
     Attributes:
-        folder: where the truth lies.
-        scene: the true scene; its world is the true one.
-        truths: one for each view that is measured.
-        weathers: by name.
+        folder: folder of the ground truth.
+        scene: the true scene, in the true world.
+        truths: one per test view.
+        weathers: all weathers to measure.
         mirror_level: height of the mirror in the pictures of `mirror/`, m above the ground datum.
     """
 
@@ -106,19 +110,19 @@ class Reference:
     mirror_level: float
 
     def mirrored(self, view: str) -> UInt8[np.ndarray, "h w 3"]:
-        """The true picture with a perfect mirror at `mirror_level`."""
+        """Read the true picture of a view with a perfect mirror at `mirror_level`."""
         return read_rgb((self.folder / "mirror" / view).with_suffix(".png"))
 
 
 def read_reference(
     capture: Path, views: tuple[str, ...] = (), weathers: tuple[str, ...] = ()
 ) -> Reference:
-    """The reference set that a capture belongs to.
+    """Read the reference set of a capture.
 
     Args:
         capture: folder with a `reference.json`.
-        views: names, without suffix, of those to read; default all.
-        weathers: names of those to read; default all.
+        views: names, without suffix, of the test views to read; default all.
+        weathers: names of the weathers to read; default all.
 
     Raises:
         UserError: the capture is no reference set, its files are damaged, or a name is unknown.
@@ -129,61 +133,63 @@ def read_reference(
             f"{capture} is no reference set: it has no {FILE_NAME}; fit one (climatenerf fit"
             " reference/street -o RUN) and evaluate that run"
         )
-    data = read_json(path, "the reference set's list")
+    data = read_json(path, "the reference set's index")
     check_schema(data.get("schema_version"), SCHEMA_VERSION, f"the reference set {capture}")
     try:
         folder = (capture / data["truth"]).resolve()
-        listed, kinds = [str(v) for v in data["views"]], dict(data["weather"])
-        times = {kind: float(entry["time_s"]) for kind, entry in kinds.items()}
+        listed, entries = [str(v) for v in data["views"]], dict(data["weather"])
+        times = {name: float(entry["time_s"]) for name, entry in entries.items()}
         level = float(data["mirror_level_m"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
-            f"{path} is damaged ({type(error).__name__}: {error}); make the set anew"
+            f"{path} is damaged ({type(error).__name__}: {error}); generate the set again"
         ) from error
     scene = load_scene(folder)
-    wanted = [v for v in listed if not views or Path(v).stem in views]
-    _all_known(views, [Path(v).stem for v in listed], "view")
-    _all_known(weathers, list(times), "weather")
+    selected = [v for v in listed if not views or Path(v).stem in views]
+    _check_names(views, [Path(v).stem for v in listed], "view")
+    _check_names(weathers, list(times), "weather")
     return Reference(
         folder,
         scene,
-        tuple(_truth(folder, scene, name) for name in wanted),
+        tuple(_read_truth(folder, scene, name) for name in selected),
         tuple(
             WeatherTruth(
-                kind,
-                read_weather(folder / "weather" / f"{kind}.toml"),
-                times[kind],
-                folder / "weather" / kind,
+                name,
+                read_weather(folder / "weather" / f"{name}.toml"),
+                time,
+                folder / "weather" / name,
             )
-            for kind in times
-            if not weathers or kind in weathers
+            for name, time in times.items()
+            if not weathers or name in weathers
         ),
         level,
     )
 
 
-def _all_known(names: tuple[str, ...], known: list[str], what: str) -> None:
+def _check_names(names: tuple[str, ...], existing: list[str], what: str) -> None:
     for name in names:
-        if name not in known:
-            raise UserError(f'the reference set has no {what} "{name}"; it has {", ".join(known)}')
+        if name not in existing:
+            raise UserError(
+                f'the reference set has no {what} "{name}"; choose from {", ".join(existing)}'
+            )
 
 
-def _truth(folder: Path, scene: Scene, name: str) -> Truth:
+def _read_truth(folder: Path, scene: Scene, name: str) -> Truth:
     view = next((v for v in scene.views if v.name == name), None)
     if view is None:
-        raise UserError(f"{folder} lists the view {name} but has no pose of it; make the set anew")
+        raise UserError(f"{folder} has no pose of its view {name}; generate the set again")
     arrays = _arrays((folder / "truth" / name).with_suffix(".npz"))
     label = load_labels(view, scene)
     camera, c2w = scene.cameras[view.camera], scene.c2w_world(view)
     shape = (camera.height, camera.width)
-    wanted: Mapping[str, tuple[int, ...]] = {
+    shapes: Mapping[str, tuple[int, ...]] = {
         "depth": shape, "normal": (*shape, 3), "sun": shape, "clean": (*shape, 3)
     }  # fmt: skip
-    for key, size in wanted.items():
-        if key not in arrays or arrays[key].shape != size:
-            raise UserError(f"the truth of {name} in {folder} lacks {key}; make the set anew")
+    for key, expected in shapes.items():
+        if key not in arrays or arrays[key].shape != expected:
+            raise UserError(f"the truth of {name} in {folder} lacks {key}; generate the set again")
     if label is None:
-        raise UserError(f"{folder} has no labels of {name}; make the set anew")
+        raise UserError(f"{folder} has no labels of {name}; generate the set again")
     return Truth(
         name,
         arrays["depth"].astype(np.float32),
@@ -197,7 +203,7 @@ def _truth(folder: Path, scene: Scene, name: str) -> Truth:
 
 
 def world_rays(camera: Camera, c2w: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w 3"]:
-    """Unit directions of a camera's pixels in the world."""
+    """Return the unit directions of a camera's pixels in the world."""
     return camera.directions() @ c2w[:3, :3].T
 
 
@@ -206,6 +212,6 @@ def _arrays(path: Path) -> dict[str, Any]:
         with np.load(path) as data:
             return {key: data[key] for key in data.files}
     except FileNotFoundError:
-        raise UserError(f"{path} is missing; the reference set is not whole") from None
+        raise UserError(f"{path} is missing; generate the reference set again") from None
     except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"{path} is damaged; make the set anew") from error
+        raise UserError(f"{path} is damaged; generate the set again") from error

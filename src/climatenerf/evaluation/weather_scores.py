@@ -1,156 +1,157 @@
-"""How right a weather is beside its picture: waterline, snow surface, transmittance of the air."""
+"""Geometric scores of a rendered weather: waterline, snow surface, transmittance of the smog."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from climatenerf.evaluation.geometry import ground_or_roof
 from climatenerf.evaluation.reference import Truth
 from climatenerf.render.depth_normals import plane_normals
 
-JOINED, JOINED_SHARE = 0.5, 0.05  # m, and of the distance: neighbours this close are one surface
-NEAR = 30.0  # m: snow is compared up to here
-NO_LINE = 10.0  # m: said of a line that is not there, and the most of one that is
-MIN_SNOW = 0.005  # m: less is bare ground
+MAX_GAP, RELATIVE_GAP = 0.5, 0.05  # m, and of the distance; closer neighbours are one surface
+MAX_SNOW_DISTANCE = 30.0  # m, snow is compared up to here
+MAX_LINE_ERROR = 10.0  # m, error of a waterline that is missing, and upper bound of all errors
+MIN_SNOW = 0.005  # m, thinner snow counts as bare ground
 
 Layers = dict[str, np.ndarray]
 
 
 def waterline_scores(
     depth: list[Float[np.ndarray, "h w"]], masks: list[Float[np.ndarray, "h w"]],
-    eyes: list[Float[np.ndarray, "4 4"]], level: float,
+    poses: list[Float[np.ndarray, "4 4"]], level: float,
     truths: tuple[Truth, ...], true_level: float, pixel_angle: float,
 ) -> dict[str, float]:  # fmt: skip
-    """Where the water ends, against where it truly does.
+    """Compare the edge of the rendered water with that of the true water.
 
-    Both lines are found between neighbouring pixels of one dry surface, one above and one below the
-    water, at the share of the way where it crosses.
+    Both waterlines are found between neighbouring pixels of one dry surface, one above and one
+    below the water level, by linear interpolation of the heights.
 
     Args:
-        depth: our ray lengths without water, m.
-        masks: shares of water in our flooded pictures.
-        eyes: poses of the cameras in our world.
-        level: height of our water, m.
-        truths: of the same views.
+        depth: rendered ray lengths without water, m.
+        masks: water coverage of the flooded renders, [0, 1].
+        poses: of the cameras in the run's world.
+        level: height of the water in the run's world, m.
+        truths: the same views.
         true_level: height of the true water, m.
-        pixel_angle: of a pixel, rad.
+        pixel_angle: angle of a pixel, rad.
 
     Returns:
-        `waterline_error_cm`, the mean of the median distance of the true line from ours and of ours
-        from the true one, in the place; `waterline_error_px`, the same in the picture, where far
-        shores seen at grazing do not count for more than they are looked at;
-        `waterline_height_error_cm`, the median height by which our ground misses the water at the
-        true line; `water_iou` of the flooded pixels.
+        `waterline_error_cm`, the mean over both directions of the median distance from a point of
+        one line to the other line, in space. `waterline_error_px`, the same in the picture, where
+        distant shores at grazing angles have less weight. `waterline_height_error_cm`, the median
+        height of the fitted ground above or below the water at the true line. `water_iou` of the
+        flooded pixels.
     """
-    apart, seen, rise, both, either = ([], []), ([], []), [], 0, 0
-    for ours, mask, c2w, truth in zip(depth, masks, eyes, truths, strict=True):
+    # Each pair: from the true line to the rendered one, and back.
+    distance, angle = ([], []), ([], [])
+    height_error, intersection, union = [], 0, 0
+    for rendered, mask, c2w, truth in zip(depth, masks, poses, truths, strict=True):
         rays_c = truth.rays_d @ truth.c2w[:3, :3]  # camera axes
-        height = truth.points[..., 2] - true_level
-        height[truth.sky] = np.inf
-        line, (i, j) = crossings(truth.depth[..., None] * rays_c, height)
+        true_height = truth.points[..., 2] - true_level
+        true_height[truth.sky] = np.inf
+        true_line, (i, j) = crossings(truth.depth[..., None] * rays_c, true_height)
         with np.errstate(invalid="ignore"):
-            own_height = c2w[2, 3] + ours * (rays_c @ c2w[2, :3]) - level
-        own_height[~np.isfinite(ours)] = np.inf
-        own, _ = crossings(ours[..., None] * rays_c, own_height)
-        if len(line):
-            for k, (a, b) in enumerate(((line, own), (own, line))):
-                apart[k].append(_nearest(a, b))
-                seen[k].append(_nearest(_unit(a), _unit(b)) / pixel_angle)
-            here = 0.5 * (own_height.ravel()[i] + own_height.ravel()[j])
-            rise.append(np.minimum(np.abs(here), NO_LINE))
-        wet, real = mask > 0.5, plane_first(truth, true_level)
-        both, either = both + (wet & real).sum(), either + (wet | real).sum()
+            height = c2w[2, 3] + rendered * (rays_c @ c2w[2, :3]) - level
+        height[~np.isfinite(rendered)] = np.inf
+        line, _ = crossings(rendered[..., None] * rays_c, height)
+        if len(true_line):
+            for k, (a, b) in enumerate(((true_line, line), (line, true_line))):
+                distance[k].append(_nearest(a, b))
+                angle[k].append(_nearest(_unit(a), _unit(b)) / pixel_angle)
+            at_line = 0.5 * (height.ravel()[i] + height.ravel()[j])
+            height_error.append(np.minimum(np.abs(at_line), MAX_LINE_ERROR))
+        wet, true_wet = mask > 0.5, water_visible(truth, true_level)
+        intersection, union = intersection + (wet & true_wet).sum(), union + (wet | true_wet).sum()
     return {
-        "waterline_error_cm": float(np.mean([_median_cm(each) for each in apart])),
-        "waterline_error_px": float(np.mean([_median_cm(each) for each in seen])) / 100,
-        "waterline_height_error_cm": _median_cm(rise),
-        "water_iou": float(both / either) if either else float("nan"),
+        "waterline_error_cm": float(np.mean([_median_cm(each) for each in distance])),
+        "waterline_error_px": float(np.mean([_median_cm(each) for each in angle])) / 100,
+        "waterline_height_error_cm": _median_cm(height_error),
+        "water_iou": float(intersection / union) if union else float("nan"),
     }
 
 
 def crossings(
     points: Float[np.ndarray, "h w 3"], height: Float[np.ndarray, "h w"]
-) -> tuple[Float[np.ndarray, "n 3"], tuple[np.ndarray, np.ndarray]]:
-    """Places where a surface crosses height 0 between neighbouring pixels.
+) -> tuple[Float[np.ndarray, "n 3"], tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]]:
+    """Find where a surface crosses height 0 between neighbouring pixels.
 
     Args:
-        points: seen by the pixels, from the eye.
-        height: theirs, m; inf where there is nothing.
+        points: surface points of the pixels relative to the camera centre, m.
+        height: their heights, m; inf without a surface.
 
     Returns:
-        The places, and the flat indices of the pixels on both sides of each.
+        The crossing points, m, and the flat indices of the two pixels of each.
     """
-    number = np.arange(height.size).reshape(height.shape)
-    i = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
-    j = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+    index = np.arange(height.size).reshape(height.shape)
+    i = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
+    j = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
     p, z = points.reshape(-1, 3), height.ravel()
-    known = np.isfinite(z[i]) & np.isfinite(z[j])
-    i, j = i[known], j[known]
+    finite = np.isfinite(z[i]) & np.isfinite(z[j])
+    i, j = i[finite], j[finite]
     crosses = (z[i] < 0) != (z[j] < 0)
     i, j = i[crosses], j[crosses]
-    away = np.minimum(*(np.linalg.norm(p[k], axis=-1) for k in (i, j)))
-    one = np.linalg.norm(p[i] - p[j], axis=-1) < JOINED + JOINED_SHARE * away
-    i, j = i[one], j[one]
-    share = z[i] / (z[i] - z[j])  # signs differ: never 0/0
-    return p[i] + share[:, None] * (p[j] - p[i]), (i, j)
+    distance = np.minimum(*(np.linalg.norm(p[k], axis=-1) for k in (i, j)))
+    same_surface = np.linalg.norm(p[i] - p[j], axis=-1) < MAX_GAP + RELATIVE_GAP * distance
+    i, j = i[same_surface], j[same_surface]
+    fraction = z[i] / (z[i] - z[j])  # the signs differ: never 0/0
+    return p[i] + fraction[:, None] * (p[j] - p[i]), (i, j)
 
 
 def snow_scores(
     layers: list[Layers], truths: tuple[Truth, ...], snow: list[Layers], pixel_angle: float
 ) -> dict[str, float]:
-    """Where snow lies and how deep, against the truth.
+    """Compare where snow lies, and how deep, with the truth.
 
     Args:
-        layers: our `depth`, `snow_thickness` and `mask_snow` of each view.
-        truths: of the same views, without snow.
+        layers: rendered `depth`, `snow_thickness` and `mask_snow` of each view.
+        truths: the same views without snow.
         snow: true `depth` and `thickness` under snow.
-        pixel_angle: of a pixel, rad.
+        pixel_angle: angle of a pixel, rad.
 
     Returns:
-        `snow_surface_error_cm`, the median distance between our surface and the true one, square to
-        it; `thickness_error_cm`, the median error of the snow's thickness; both on ground and roofs
-        nearer than `NEAR` where snow truly lies; `thickness_cm` and `true_thickness_cm`, medians;
-        `snow_iou` of snowy pixels there.
+        Over ground and roofs nearer than `MAX_SNOW_DISTANCE` with true snow:
+        `snow_surface_error_cm`, the median distance between the surfaces along the true normal;
+        `thickness_error_cm`, the median error of the thickness; `thickness_cm` and
+        `true_thickness_cm`, medians. `snow_iou` of the snowy pixels on ground and roofs.
     """
-    apart, error, ours_thick, true_thick, both, either = [], [], [], [], 0, 0
-    for ours, truth, real in zip(layers, truths, snow, strict=True):
-        thickness = real["thickness"].astype(np.float64)
+    distance, error, thickness, true_thickness, intersection, union = [], [], [], [], 0, 0
+    for rendered, truth, true in zip(layers, truths, snow, strict=True):
+        thick = true["thickness"].astype(np.float64)
         rays_c = truth.rays_d @ truth.c2w[:3, :3]
-        place = ground_or_roof(truth) & (truth.depth < NEAR)
-        white = place & (thickness > MIN_SNOW) & np.isfinite(real["depth"])
-        normal = plane_normals(np.zeros(3), rays_c, real["depth"], pixel_angle)
-        depth = np.minimum(ours["depth"], 2 * np.where(white, real["depth"], 1.0))
-        gap = np.abs(depth - np.where(white, real["depth"], depth)) * np.abs(
-            (normal * rays_c).sum(-1)
-        )
-        apart.append(gap[white])
-        error.append(np.abs(ours["snow_thickness"] - thickness)[white])
-        ours_thick.append(ours["snow_thickness"][white])
-        true_thick.append(thickness[white])
-        own = place & (ours["mask_snow"] > 0.5)
-        both, either = both + (own & white).sum(), either + (own | white).sum()
+        level = ground_or_roof(truth) & (truth.depth < MAX_SNOW_DISTANCE)
+        true_snow = level & (thick > MIN_SNOW) & np.isfinite(true["depth"])
+        normal = plane_normals(np.zeros(3), rays_c, true["depth"], pixel_angle)
+        depth = np.minimum(rendered["depth"], 2 * np.where(true_snow, true["depth"], 1.0))
+        along_ray = np.abs(depth - np.where(true_snow, true["depth"], depth))
+        distance.append((along_ray * np.abs((normal * rays_c).sum(-1)))[true_snow])
+        error.append(np.abs(rendered["snow_thickness"] - thick)[true_snow])
+        thickness.append(rendered["snow_thickness"][true_snow])
+        true_thickness.append(thick[true_snow])
+        snowy = level & (rendered["mask_snow"] > 0.5)
+        intersection += (snowy & true_snow).sum()
+        union += (snowy | true_snow).sum()
     return {
-        "snow_surface_error_cm": _median_cm(apart),
+        "snow_surface_error_cm": _median_cm(distance),
         "thickness_error_cm": _median_cm(error),
-        "thickness_cm": _median_cm(ours_thick),
-        "true_thickness_cm": _median_cm(true_thick),
-        "snow_iou": float(both / either) if either else float("nan"),
+        "thickness_cm": _median_cm(thickness),
+        "true_thickness_cm": _median_cm(true_thickness),
+        "snow_iou": float(intersection / union) if union else float("nan"),
     }
 
 
 def transmittance_scores(
-    passed: list[Float[np.ndarray, "h w"]], real: list[Float[np.ndarray, "h w"]]
+    rendered: list[Float[np.ndarray, "h w"]], true: list[Float[np.ndarray, "h w"]]
 ) -> dict[str, float]:
-    """Mean absolute error of the air's transmittance over all pixels."""
-    pairs = zip(passed, real, strict=True)
+    """Return the mean absolute error of the smog's transmittance over all pixels."""
+    pairs = zip(rendered, true, strict=True)
     errors = [np.abs(a - b.astype(np.float64)).ravel() for a, b in pairs]
     return {"transmittance_error": float(np.concatenate(errors).mean())}
 
 
-def plane_first(truth: Truth, level: float) -> np.ndarray:
-    """Where the truth shows the water's plane before anything else."""
-    fall = -truth.rays_d[..., 2]
+def water_visible(truth: Truth, level: float) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels whose true ray meets the water plane before any surface."""
+    descent = -truth.rays_d[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = np.where(fall > 0, (truth.c2w[2, 3] - level) / fall, np.inf)
+        t = np.where(descent > 0, (truth.c2w[2, 3] - level) / descent, np.inf)
     return (t > 0) & (t < truth.depth)
 
 
@@ -158,13 +159,20 @@ def _unit(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return line / np.linalg.norm(line, axis=-1, keepdims=True)
 
 
-def _nearest(line: Float[np.ndarray, "n 3"], own: Float[np.ndarray, "m 3"]) -> np.ndarray:
-    """Distance of each place of a line from the nearest of another; `NO_LINE` if there is none."""
-    if not len(own):
-        return np.full(max(len(line), 1), NO_LINE)
+def _nearest(
+    line: Float[np.ndarray, "n 3"], other: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "k"]:
+    """Return the distance of each point of a line from the nearest of another.
+
+    Distances are bounded by `MAX_LINE_ERROR`, which is also the result for an empty line.
+    """
+    if not len(other):
+        return np.full(max(len(line), 1), MAX_LINE_ERROR)
     parts = [line[k : k + 512] for k in range(0, len(line), 512)]
-    near = [np.sqrt(((p[:, None] - own[None]) ** 2).sum(-1).min(1)) for p in parts]
-    return np.minimum(np.concatenate(near), NO_LINE) if near else np.full(1, NO_LINE)
+    near = [np.sqrt(((p[:, None] - other[None]) ** 2).sum(-1).min(1)) for p in parts]
+    if not near:
+        return np.full(1, MAX_LINE_ERROR)
+    return np.minimum(np.concatenate(near), MAX_LINE_ERROR)
 
 
 def _median_cm(parts: list[np.ndarray]) -> float:

@@ -1,1 +1,1 @@
-"""Experiments on many fits."""
+"""Experiments that compare many fits."""

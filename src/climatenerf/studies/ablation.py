@@ -1,7 +1,7 @@
-"""What each part of the fit is good for: the paper's ablation of geometry, against the truth.
+"""Ablation of the fit on a reference set, after the paper's ablation of geometry.
 
-Every row leaves one part out, is fitted for the same time with the same sampling, and is measured
-like any run (`evaluation.scores`).
+Each row leaves one part of the method out. All rows are fitted for the same time with the same
+sampling, and scored like any run (`evaluation.scores`).
 """
 
 import dataclasses
@@ -17,19 +17,21 @@ from jaxtyping import Float, UInt8
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
 from climatenerf.evaluation import geometry
+from climatenerf.evaluation.baselines import CleanView
+from climatenerf.evaluation.evaluated_run import (
+    EvaluatedRun,
+    check_views,
+    clean_view,
+    display_8bit,
+    render_weather,
+)
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import (
-    Dry,
-    Place,
-    Tell,
-    check_views,
-    display_8bit,
-    dry_view,
+    Progress,
     frame_scores,
     geometry_scores,
     label_scores,
     picture_scores,
-    weather_views,
 )
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
@@ -43,18 +45,18 @@ from climatenerf.training.trainer import Report
 SCHEMA_VERSION = 1
 FILE_NAME, TEXT_NAME, SHEET = "ablation.json", "ablation.md", "ablation.jpg"
 WEATHERS = ("smog-mid", "flood-low", "snow-deep")
-CELL = 256  # pixels of a picture's width
-MEASURED = {
+CELL = 256  # width of each picture in the sheet, pixels
+COLUMNS = {
     "psnr": "clean, dB",
     "depth_abs_rel": "depth",
     "depth_spread": "spread",
     "ground_holes": "holes",
-    "open_sky": "upwards",
+    "open_sky": "open sky",
     "normal_median_deg": "normals, deg",
     "normal_ground_roof_median_deg": "ground, roofs",
     "slope_median_deg": "slope, deg",
     "floater_mass": "floaters",
-    "clear_floater_mass": "off edges",
+    "clear_floater_mass": "without edges",
     "sky_empty_fraction": "sky",
     "miou": "mIoU",
     **{name: f"{name}, dB" for name in WEATHERS},
@@ -62,16 +64,16 @@ MEASURED = {
 
 
 def rows(minutes: float) -> dict[str, FitSettings]:
-    """Settings of each row; the first fits colours alone, as a plain NGP does."""
+    """Return the settings of each row; the first has photometric losses alone, like plain NGP."""
     full = FitSettings(minutes=minutes)
 
     def without(**weights: float) -> FitSettings:
         return dataclasses.replace(full, losses=dataclasses.replace(full.losses, **weights))
 
-    nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
+    zero = {each.name: 0.0 for each in dataclasses.fields(Losses)}
     plain = dataclasses.replace(
         full,
-        losses=Losses(**nothing),
+        losses=Losses(**zero),
         appearance=False,
         sky_labels=False,
         free_space=False,
@@ -93,17 +95,17 @@ def rows(minutes: float) -> dict[str, FitSettings]:
     }
 
 
-def chosen_rows(minutes: float, names: tuple[str, ...]) -> dict[str, FitSettings]:
-    """The rows of these names; all if none is given.
+def select_rows(minutes: float, names: tuple[str, ...]) -> dict[str, FitSettings]:
+    """Return the rows of some names, in the order of the table; all rows if no name is given.
 
     Raises:
         UserError: there is no row of a name.
     """
-    known = rows(minutes)
+    existing = rows(minutes)
     for name in names:
-        if name not in known:
-            raise UserError(f"there is no row {name!r}; there are: {', '.join(known)}")
-    return {name: row for name, row in known.items() if not names or name in names}
+        if name not in existing:
+            raise UserError(f"there is no row {name!r}; choose from: {', '.join(existing)}")
+    return {name: row for name, row in existing.items() if not names or name in names}
 
 
 def ablate(
@@ -112,42 +114,44 @@ def ablate(
     minutes: float,
     downscale: int,
     seeds: int,
-    report: Callable[[str, Report], None],
-    tell: Tell,
-    chosen: dict[str, FitSettings],
+    after_step: Callable[[str, Report], None],
+    progress: Progress,
+    selected: dict[str, FitSettings],
 ) -> dict[str, Any]:
-    """Fits and measures some rows; returns and writes the table.
+    """Fit and score some rows; write and return the table.
 
-    What an earlier call has finished in the folder is taken from there.
+    Fits that an earlier call finished in the same folder are reused.
 
     Args:
         scene: a capture with a reference set.
         out: folder of the report; the runs go to `out/runs`.
-        minutes: of each fit.
-        downscale: photos are reduced this many times for the fits.
-        seeds: fits of each row.
-        report: told the row and where its fit is.
-        tell: told what is being measured.
-        chosen: settings of the rows, see `chosen_rows`.
+        minutes: duration of each fit.
+        downscale: factor by which the photos are reduced for the fits.
+        seeds: number of fits of each row.
+        after_step: called with the row and the state of its fit after each step.
+        progress: called with each row and seed as its scoring begins.
+        selected: settings of the rows, see `select_rows`.
 
     Raises:
         UserError: the capture has no reference set, or the folder holds fits of other settings.
     """
-    # All that can be wrong is to be known before hours of fitting.
+    # All checks come before the fits, which take hours.
     reference = read_reference(scene.root)
     check_views(scene, reference)
-    check_folder(out, reference.folder, tuple(chosen))
+    check_folder(out, reference.folder, tuple(selected))
     make_folder(out / "runs")
     table: dict[str, list[dict[str, float]]] = {}
     sheet = []
-    for name, settings in chosen.items():
+    for name, settings in selected.items():
         for seed in range(seeds):
-            run = out / "runs" / f"{name.replace(' ', '-')}-{seed}"
+            folder = out / "runs" / f"{name.replace(' ', '-')}-{seed}"
             seeded = dataclasses.replace(settings, seed=seed)
-            fit_row(scene, run, seeded, downscale, lambda state, name=name: report(name, state))
-            tell(f"{name}, seed {seed}")
-            place = Place(load_field(run), load_scene(run), read_reference(scene.root))
-            scores, pictures = measure_row(place, settings, seed == 0)
+            fit_row(
+                scene, folder, seeded, downscale, lambda state, name=name: after_step(name, state)
+            )
+            progress(f"{name}, seed {seed}")
+            run = EvaluatedRun(load_field(folder), load_scene(folder), read_reference(scene.root))
+            scores, pictures = score_row(run, settings, seed == 0)
             table.setdefault(name, []).append(scores)
             if pictures:
                 sheet.append((name, pictures))
@@ -165,21 +169,28 @@ def ablate(
 
 
 def check_folder(out: Path, reference: Path, names: tuple[str, ...]) -> None:
-    """Refuses a folder within the reference set, or with a report that these rows do not replace.
+    """Refuse a folder whose files the report would overwrite.
 
-    That is one that no ablation wrote, or one of other rows, too.
+    Args:
+        out: folder for the report.
+        reference: folder of the reference set.
+        names: the rows of the report.
+
+    Raises:
+        UserError: the folder lies in the reference set, holds files of the report's names that no
+            ablation wrote, or a report with rows that are not among `names`.
     """
     if out.resolve().is_relative_to(reference.resolve()):
         raise UserError(f"{out} lies in the reference set; choose another folder with -o")
-    ours = (out / FILE_NAME).is_file() and "rows" in read_json(out / FILE_NAME, "an ablation")
-    more = set(read_json(out / FILE_NAME, "an ablation")["rows"]) - set(names) if ours else set()
+    earlier = read_json(out / FILE_NAME, "an ablation") if (out / FILE_NAME).is_file() else {}
+    more = set(earlier.get("rows", ())) - set(names)
     if more:
         raise UserError(
             f"{out} holds a report of more rows ({', '.join(sorted(more))}); choose another folder"
-            " with -o, or ask for these, too"
+            " with -o, or add these rows"
         )
     for name in (FILE_NAME, TEXT_NAME, SHEET):
-        if (out / name).exists() and not ours:
+        if (out / name).exists() and "rows" not in earlier:
             raise UserError(f"{out / name} would be overwritten; choose another folder with -o")
 
 
@@ -188,14 +199,26 @@ def fit_row(
     run: Path,
     settings: FitSettings,
     downscale: int,
-    report: Callable[[Report], None],
+    after_step: Callable[[Report], None],
 ) -> None:
-    """One fit, unless the folder holds it finished already."""
-    wanted = json.loads(json.dumps(dataclasses.asdict(settings)))
+    """Make one fit, resume it, or keep it if the folder holds it finished.
+
+    Args:
+        scene: the capture.
+        run: run folder.
+        settings: of the fit.
+        downscale: factor by which the photos are reduced.
+        after_step: called with the state of the fit after each step.
+
+    Raises:
+        UserError: the folder holds a fit of other settings.
+        KeyboardInterrupt: the fit was interrupted; the folder holds what is needed to resume.
+    """
+    expected = json.loads(json.dumps(dataclasses.asdict(settings)))
     begun = (run / "config.json").is_file() and (run / OPTIMISER).is_file()
     if begun:
         config = check_config(run)
-        if config.get("settings") != wanted or config.get("downscale") != downscale:
+        if config.get("settings") != expected or config.get("downscale") != downscale:
             raise UserError(
                 f"{run} was fitted with other settings; choose another folder with -o, or remove it"
             )
@@ -203,79 +226,93 @@ def fit_row(
         metrics = read_json(run / "metrics.json", "the run's measurements")
         if metrics.get("interrupted") is False and "views" in metrics:
             return
-    metrics = fit_scene(scene, run, settings, downscale, begun, report, lambda done, total: None)
+    metrics = fit_scene(scene, run, settings, downscale, begun, after_step, lambda done, n: None)
     if metrics["interrupted"]:
         raise KeyboardInterrupt
 
 
-def measure_row(
-    place: Place, settings: FitSettings, pictured: bool
+def score_row(
+    run: EvaluatedRun, settings: FitSettings, with_pictures: bool
 ) -> tuple[dict[str, float], list[UInt8[np.ndarray, "h w 3"]]]:
-    """Scores of one fit and, if wanted, pictures of its first view."""
-    truths = place.reference.truths
-    dry = [dry_view(place, truth) for truth in truths]
-    clean = [display_8bit(each.linear) for each in dry]
-    scale = frame_scores(place)["scale"]
+    """Score one fit.
+
+    Args:
+        run: the fit and its truth.
+        settings: of the fit.
+        with_pictures: return pictures as well.
+
+    Returns:
+        The scores, and pictures of the first view: colours, depth, normals, and each weather.
+    """
+    truths = run.reference.truths
+    views = [clean_view(run, truth) for truth in truths]
+    clean = [display_8bit(view.linear) for view in views]
+    scale = frame_scores(run)["scale"]
     scores = picture_scores(clean, [display_8bit(truth.clean) for truth in truths])
-    scores |= geometry_scores(place, dry, scale)
-    slopes = geometry.normal_scores([slope_normals(place.fitted, each) for each in dry], truths)
+    scores |= geometry_scores(run, views, scale)
+    assert isinstance(run.field, Field), "fits are hash fields"
+    normals = [density_normals(run.field, view) for view in views]
+    slopes = geometry.normal_scores(normals, truths)
     scores |= {"slope_median_deg": slopes["normal_median_deg"]}
     if settings.losses.classes:
-        scores |= {"miou": label_scores(place)["miou"]}
-    scores["ground_holes"] = geometry.ground_holes([each.depth / scale for each in dry], truths)
-    pictures = [clean[0], depth_picture(dry[0].depth), normal_picture(dry[0].normal)]
-    for kind in place.reference.weathers:
-        if kind.name in WEATHERS:
-            seen = [display_8bit(linear) for linear, _ in weather_views(place, kind)]
-            real = [kind.picture(truth.name) for truth in truths]
-            scores[kind.name] = picture_scores(seen, real)["psnr"]
-            pictures.append(seen[0])
-    return scores, pictures if pictured else []
+        scores |= {"miou": label_scores(run)["miou"]}
+    scores["ground_holes"] = geometry.ground_holes([view.depth / scale for view in views], truths)
+    pictures = [clean[0], depth_picture(views[0].depth), normal_picture(views[0].normal)]
+    for case in run.reference.weathers:
+        if case.name in WEATHERS:
+            rendered = [display_8bit(linear) for linear, _ in render_weather(run, case)]
+            true = [case.picture(truth.name) for truth in truths]
+            scores[case.name] = picture_scores(rendered, true)["psnr"]
+            pictures.append(rendered[0])
+    return scores, pictures if with_pictures else []
 
 
-def slope_normals(field: Field, dry: Dry) -> Float[np.ndarray, "h w 3"]:
-    """Normals, in camera axes, as the density's own slope has them at the surfaces of a view.
+def density_normals(field: Field, view: CleanView) -> Float[np.ndarray, "h w 3"]:
+    """Return normals from the gradient of the density at the surfaces of a view.
 
-    What weather would have to do with if nothing smoothed them; 0 where there is no surface.
+    They show what weather would use without predicted normals.
+
+    Returns:
+        Unit normals in camera axes; 0 where there is no surface.
     """
-    hit = np.isfinite(dry.depth)
-    x = dry.c2w[:3, 3] + dry.depth[hit][:, None] * dry.rays_d[hit]
-    normal = np.zeros(dry.normal.shape)
+    hit = np.isfinite(view.depth)
+    x = view.c2w[:3, 3] + view.depth[hit][:, None] * view.rays_d[hit]
+    normal = np.zeros(view.normal.shape)
     q = field.to_grid(torch.from_numpy(x.astype(np.float32)))
     normal[hit] = field.density_normal(q).numpy()
-    return normal @ dry.c2w[:3, :3]
+    return normal @ view.c2w[:3, :3]
 
 
 def depth_picture(depth: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Grey by inverse distance: near is bright, a metre or nearer is white, the sky black."""
+    """Show ray lengths (m) as grey values: white up to 1 m, darker with distance, black sky."""
     grey = (255 * np.clip(1.0 / np.maximum(depth, 1.0), 0, 1) ** 0.5 + 0.5).astype(np.uint8)
     return np.repeat(grey[..., None], 3, axis=-1)
 
 
 def normal_picture(normal: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """(n + 1) / 2 as colours; black where there is none."""
-    there = (normal != 0).any(-1, keepdims=True)
-    return (255 * np.where(there, (normal + 1) / 2, 0) + 0.5).astype(np.uint8)
+    """Show unit normals as colours (n + 1) / 2; black where the normal is 0."""
+    valid = (normal != 0).any(-1, keepdims=True)
+    return (255 * np.where(valid, (normal + 1) / 2, 0) + 0.5).astype(np.uint8)
 
 
 def markdown(data: dict[str, Any]) -> str:
-    """The table, means over the seeds with half the range between them."""
+    """Return the table in Markdown: means over the seeds, and half the range."""
     head = (
         f"{data['minutes']:g} minutes each at 1/{data['downscale']} of the size, {data['capture']}"
     )
     lines = [
-        "| row | " + " | ".join(MEASURED.values()) + " |",
-        "|---" * (len(MEASURED) + 1) + "|",
+        "| row | " + " | ".join(COLUMNS.values()) + " |",
+        "|---" * (len(COLUMNS) + 1) + "|",
     ]
     for name, each in data["rows"].items():
-        cells = [cell([one[key] for one in each if key in one]) for key in MEASURED]
+        cells = [cell([one[key] for one in each if key in one]) for key in COLUMNS]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return f"# Ablation\n\n{head}\n\n" + "\n".join(lines) + f"\n\n![pictures]({SHEET})\n"
 
 
 def cell(values: list[float]) -> str:
-    """Mean and half the range, or a dash."""
+    """Return mean ± half the range as text; a dash without values."""
     if not values:
         return "-"
-    half = (max(values) - min(values)) / 2
-    return f"{np.mean(values):.3g}" + (f" ± {half:.2g}" if len(values) > 1 else "")
+    half_range = (max(values) - min(values)) / 2
+    return f"{np.mean(values):.3g}" + (f" ± {half_range:.2g}" if len(values) > 1 else "")
