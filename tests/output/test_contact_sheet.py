@@ -10,7 +10,7 @@ def frame(grey, width=160, height=90):
     return np.full((height, width, 3), grey, np.uint8)
 
 
-def test_rows_and_columns_are_where_they_belong():
+def test_frames_are_placed_in_rows_and_columns():
     rows = [("clean", [frame(i * 20) for i in range(9)]), ("snow", [frame(200), frame(250)])]
     sheet = contact_sheet(rows, columns=3, cell_width=80)
     assert sheet.shape == (2 * (45 + GAP) + GAP, 3 * (80 + GAP) + GAP, 3)
@@ -31,7 +31,7 @@ def test_small_frames_are_not_enlarged():
         contact_sheet([("a", [])])
 
 
-def test_jpeg_keeps_its_bound(tmp_path):
+def test_jpeg_stays_below_its_size_limit(tmp_path):
     noise = np.random.default_rng(0).integers(0, 255, (200, 300, 3), np.uint8)
     free = write_jpeg(tmp_path / "a.jpg", noise)
     bound = write_jpeg(tmp_path / "b.jpg", noise, 20_000)

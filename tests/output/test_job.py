@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -17,6 +18,7 @@ from support.render_jobs import SCENE, files_of, join_parts, make_job, noise_of,
 
 import climatenerf
 from climatenerf.core.errors import UserError
+from climatenerf.core.storage import atomic_path
 from climatenerf.output import job as jobs
 from climatenerf.output import render_folder
 from climatenerf.output.job import frames_of_part, join, render_frames, render_movie
@@ -354,8 +356,15 @@ def test_scratch_files_of_killed_processes_are_removed_later(tmp_path):
     for name, age in (("unfinished-old", 7200), ("unfinished-new", 0)):
         (tmp_path / ".frames" / name).mkdir(parents=True)
         os.utime(tmp_path / ".frames" / name, (time.time() - age,) * 2)
+    with contextlib.suppress(Crash), atomic_path(tmp_path / "movie.mp4") as temporary:
+        temporary.write_bytes(b"killed")
+        shutil.copy(temporary, tmp_path / "copy")
+        raise Crash
+    (tmp_path / "copy").rename(temporary)
+    os.utime(temporary, (time.time() - 7200,) * 2)
     render(job, tmp_path)
     assert [p.name for p in (tmp_path / ".frames").glob("unfinished-*")] == ["unfinished-new"]
+    assert not temporary.exists()
 
 
 def test_a_file_system_without_locks_is_used_without_them(tmp_path, monkeypatch):

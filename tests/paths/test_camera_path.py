@@ -7,7 +7,7 @@ import pytest
 from climatenerf.core.errors import UserError
 from climatenerf.paths.camera_path import camera_path, fitted_camera, orbit, still
 from climatenerf.paths.camera_path import smoothed_training_path as training_path
-from climatenerf.paths.tour import longest_run, looking_at
+from climatenerf.paths.tour import longest_segment, looking_at
 from climatenerf.scene import Camera, Scene, View
 
 CAMERA = Camera(640, 360, 500.0, 500.0, 320.0, 180.0)
@@ -53,7 +53,7 @@ def distance_to(path, c2w):
     return np.linalg.norm(gap, axis=-1).min(axis=1)
 
 
-def test_training_path_is_level_even_and_near_the_photographs():
+def test_training_path_has_no_roll_even_spacing_and_stays_near_the_photographs():
     rng = np.random.default_rng(1)
     poses = np.stack([roll(m, a) for m, a in zip(drive(40), rng.normal(0, 4, 40), strict=True)])
     path = training_path(scene_of(poses), 25, (480, 270))
@@ -83,7 +83,7 @@ def test_smoothing_removes_jitter():
     assert np.degrees(np.arccos(np.clip(turn, -1, 1))).max() < 8
 
 
-def test_shuffled_names_are_toured_by_distance():
+def test_names_without_spatial_order_give_a_tour_by_distance():
     poses = ring(40, arc=1.6 * np.pi)
     order = np.random.default_rng(4).permutation(40)
     path = training_path(scene_of(poses[order]), 60)
@@ -93,7 +93,7 @@ def test_shuffled_names_are_toured_by_distance():
     assert distance_to(path, poses).max() < 0.6
 
 
-def test_a_jump_is_not_flown_through():
+def test_a_path_follows_the_longest_segment_between_jumps():
     first, second = drive(30), drive(12)
     second[:, 1, 3] += 40.0
     path = training_path(scene_of(np.concatenate([first, second])), 30)
@@ -101,7 +101,7 @@ def test_a_jump_is_not_flown_through():
     assert np.abs(path.c2w[:, 1, 3]).max() < 0.5
 
 
-def test_turning_on_the_spot_and_few_views():
+def test_rotation_at_one_position_and_few_views():
     turn = looking_at(np.zeros((8, 3)) + [0, 0, 1.6], np.array([5.0, 0, 1.6]))
     for i, angle in enumerate(np.linspace(0, 1.5, 8)):
         c, s = np.cos(angle), np.sin(angle)
@@ -114,7 +114,7 @@ def test_turning_on_the_spot_and_few_views():
         for make in (training_path, orbit):
             check_valid(make(scene_of(drive(count)), 5), 5)
     check_valid(training_path(scene_of(drive(9)), 1), 1)
-    with pytest.raises(UserError, match="at least 1"):
+    with pytest.raises(UserError, match="--frames 1 or more"):
         training_path(scene_of(drive(9)), 0)
 
 
@@ -128,7 +128,7 @@ def test_a_camera_looking_down_stays_finite():
     assert np.allclose(path.c2w[:, :3, 0], [1, 0, 0], atol=1e-6), "the photographs' own x axis"
 
 
-def test_orbit_of_a_ring_is_that_ring():
+def test_orbit_of_a_ring_is_the_same_ring():
     poses = ring(24)
     path = orbit(scene_of(poses), 36, (320, 180))
     check_valid(path, 36)
@@ -151,18 +151,18 @@ def test_orbit_of_an_arc_stays_on_the_arc():
 
 
 @pytest.mark.parametrize("side", [False, True])
-def test_orbit_without_a_centre_sways_among_the_photographs(side):
+def test_orbit_without_a_centre_is_a_small_ellipse(side):
     poses = drive(54, side)
     path = orbit(scene_of(poses), 30)
     check_valid(path, 30)
-    assert path.name == "sway" and "not around one point" in path.notes[0]
+    assert path.name == "sway" and "do not surround a point" in path.notes[0]
     assert distance_to(path, poses).max() < 0.6
     assert np.ptp(path.c2w[:, 0, 3]) > 1.0, "it moves"
     ahead = path.c2w[:, :3, 2] @ poses[27, :3, 2]
     assert ahead.min() > 0.9, "and looks where the photographs look"
 
 
-def test_still_is_the_photograph_itself():
+def test_still_has_the_pose_of_the_photograph():
     poses = np.stack([roll(m, 7) for m in drive(5)])
     scene = scene_of(poses, Camera(640, 360, 500, 500, 310, 190, k1=-0.1))
     for name in ("0003.jpg", "0003", 3, "3"):
@@ -205,7 +205,7 @@ def nerfstudio_file(folder, poses, **changes):
     return path
 
 
-def test_nerfstudio_path_comes_back_through_every_frame(tmp_path):
+def test_nerfstudio_poses_are_transformed_back_through_every_frame(tmp_path):
     rng = np.random.default_rng(5)
     truth = ring(6)  # in world metres
     q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -259,13 +259,13 @@ def test_nerfstudio_path_without_dataparser_is_in_the_input_frame(tmp_path):
         ({"render_width": "wide"}, "0x270"),
     ],
 )
-def test_damaged_nerfstudio_paths(tmp_path, changes, words):
+def test_damaged_nerfstudio_paths_are_refused(tmp_path, changes, words):
     path = nerfstudio_file(tmp_path, [np.eye(4)], **changes)
     with pytest.raises(UserError, match=words):
         camera_path(str(path), scene_of(ring(3)), 1)
 
 
-def test_unknown_path():
+def test_unknown_paths_are_refused():
     with pytest.raises(UserError, match="training, orbit, still"):
         camera_path("spiral", scene_of(ring(3)), 1)
     with pytest.raises(UserError, match="does not exist"):
@@ -278,7 +278,7 @@ def test_real_captures(captures, name):
 
     scene = read_scene(captures / name)
     poses = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
-    step = np.linalg.norm(np.diff(longest_run(poses)[:, :3, 3], axis=0), axis=1)
+    step = np.linalg.norm(np.diff(longest_segment(poses)[:, :3, 3], axis=0), axis=1)
     path = camera_path("training", scene, 48, (480, 270))
     check_valid(path, 48)
     # Half the widest gap between two photographs, and a hand's shaking smoothed away.

@@ -154,18 +154,18 @@ def test_what_would_be_lost_is_named_before_any_work(posed, capsys, name, words,
 
 
 def test_what_comes_while_capture_works_is_not_lost_either(posed, capsys, monkeypatch):
-    from climatenerf.sfm import report
+    from climatenerf.sfm import pipeline
 
     out = posed / "scene"
     assert capture(posed, out) == 0
     before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
-    real = report.write_report
+    real = pipeline.write_report
 
     def meanwhile(*arguments):
         (out / "images" / "late.jpg").write_bytes(b"mine")
         return real(*arguments)
 
-    monkeypatch.setattr(report, "write_report", meanwhile)
+    monkeypatch.setattr(pipeline, "write_report", meanwhile)
     assert capture(posed, out) == 2
     assert "late.jpg is not capture's" in capsys.readouterr().err
     after = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
@@ -234,7 +234,7 @@ def test_marks_that_cannot_be_used_leave_a_finished_scene(posed, capsys, picture
     before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
     assert capture(posed, out, "--known-length", "D=2 m", "--marks", marks) == 2
     err = capsys.readouterr().err
-    assert "stays as it was" in err and "poses are kept" not in err
+    assert "is unchanged" in err and "poses are kept" not in err
     assert {k: v for k, v in everything(out).items() if not k.startswith("work/")} == before
 
 

@@ -18,11 +18,10 @@ from dataclasses import dataclass
 import climatenerf
 from climatenerf.core.errors import UserError
 
-# Before torch and Numba are imported, unless the user has chosen otherwise. Both bring an OpenMP
-# run time of their own. Idle threads of the one that spin for long after each parallel region take
-# the cores from the other, and those that sleep at once wake late: some tens of microseconds are
-# best (docs/adr/0001). Numba's OpenMP layer is asked for because it may be entered from several
-# threads at once, which its last fallback may not.
+# Set before torch and Numba are imported, unless the user has set them. Both load an OpenMP run
+# time. Threads of one that spin long after a parallel region take cores from the other; threads
+# that sleep at once wake late. Spinning for some tens of microseconds is fastest (docs/adr/0001).
+# Numba's OpenMP layer is thread-safe; its last fallback is not.
 THREADING = {
     "OMP_WAIT_POLICY": "PASSIVE",
     "GOMP_SPINCOUNT": "10000",
@@ -33,7 +32,7 @@ THREADING = {
 
 @dataclass(frozen=True)
 class Verb:
-    """One verb.
+    """A verb of the command line.
 
     Attributes:
         module: Module that has the options dataclass and ``run``.
@@ -50,36 +49,36 @@ VERBS = {
     "capture": Verb("climatenerf.cli.capture", "Capture", "find the poses of photos or a video"),
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
-    "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against the truth"),
+    "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),
-    "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the street that comes along"),
+    "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the embedded street"),
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line.
+    """Run the command line.
 
     Args:
         arguments: words after the program's name; None takes those of this process.
 
     Returns:
-        Exit status: 0, 2 after a mistake that the user can mend, 130 after Ctrl-C, 143 and 129
-        after the signals of `kill` and of a terminal that is closed.
+        Exit status: 0; 2 after an error that the user can correct; 130 after Ctrl-C; 143 after
+        `kill`; 129 after the terminal is closed.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         with _stopped_like_ctrl_c():
             status = _run(words)
-        sys.stdout.flush()  # here, where a reader that has gone is dealt with
+        sys.stdout.flush()  # here, so that a closed pipe is handled below
         return status
     except UserError as error:
         return _complain(str(error))
     except KeyboardInterrupt as stop:
-        with contextlib.suppress(OSError):  # the terminal may be what has gone
+        with contextlib.suppress(OSError):  # the terminal may be closed
             sys.stderr.write("\nclimatenerf: interrupted\n")
         return 128 + (stop.args[0] if stop.args else signal.SIGINT)
     except BrokenPipeError:
-        # The reader (`| head`) has gone; a second complaint at exit is avoided by closing.
+        # The reader (`| head`) has exited. Redirecting prevents a second error at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
@@ -93,19 +92,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _stopped_like_ctrl_c() -> Iterator[None]:
-    """Lets `kill` and a closed terminal end a verb as Ctrl-C does: tidily and with a word."""
-    taken = []
+    """Let `kill` and a closed terminal end a verb as Ctrl-C does: with clean-up and a message."""
+    replaced = []
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGTERM", "SIGHUP"):  # Windows lacks the second
             number = getattr(signal, name, None)
-            # What is ignored (nohup) or somebody else's stays so.
+            # Ignored signals (nohup) and foreign handlers stay as they are.
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
                 signal.signal(number, _stop)
-                taken.append(number)
+                replaced.append(number)
     try:
         yield
     finally:
-        for number in taken:
+        for number in replaced:
             signal.signal(number, signal.SIG_DFL)
 
 
@@ -131,15 +130,15 @@ def _run(words: list[str]) -> int:
 
     verb = VERBS[name]
     module = importlib.import_module(verb.module)
-    # tyro prints its own help and complaints, and leaves by SystemExit with status 0 or 2.
+    # tyro prints help and errors itself, and raises SystemExit with status 0 or 2.
     options = tyro.cli(getattr(module, verb.options), prog=f"climatenerf {name}", args=words[1:])
-    if name == "render":  # which flags were given decides over a weather file
+    if name == "render":  # given flags override a weather file
         return module.run(options, words[1:]) or 0
     return module.run(options) or 0
 
 
 def usage() -> str:
-    """The help text that lists the verbs."""
+    """Return the help text that lists the verbs."""
     lines = [f"  {name:<8} {verb.summary}" for name, verb in VERBS.items()]
     return "\n".join(
         [

@@ -13,18 +13,18 @@ from climatenerf.scene.export import export_colmap, export_transforms
 
 @dataclass(frozen=True)
 class Export:
-    """Write a scene's poses, in the input's own frame, for other programs."""
+    """Write the poses of a scene, in the input's own frame, for other programs."""
 
     scene: tyro.conf.Positional[Path]
     """Run folder, scene folder, or any capture that `fit` reads."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder to write into."""
     format: tuple[Literal["transforms", "colmap"], ...] = ("transforms", "colmap")
-    """transforms.json (nerfstudio, instant-ngp) and COLMAP text."""
+    """transforms.json (nerfstudio, instant-ngp), COLMAP text."""
 
 
 def run(options: Export) -> int:
-    """Writes the files and says where they are."""
+    """Write the files, and print where they are."""
     scene = read_scene(options.scene)
     writers = {"transforms": export_transforms, "colmap": export_colmap}
     for name in dict.fromkeys(options.format):

@@ -32,41 +32,41 @@ class Fit:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Run folder to make."""
     minutes: float | None = None
-    """Time for fitting steps; reading, previews, saving and measuring come on top. Default: 5, or
-    no limit where --steps is given."""
+    """Time for fitting steps, minutes; reading, previews, saving and measuring are not counted.
+    Default: 5, or no limit if --steps is given."""
     steps: int | None = None
-    """Stop after this many steps; with --minutes too, after what is sooner."""
+    """Stop after this many steps. With --minutes, the limit that is reached first counts."""
     downscale: int = 1
-    """Reduce the photos this many times in width and height."""
+    """Factor by which the photos are reduced in width and height."""
     holdout: str | None = None
-    """Photos kept for measuring: names with commas between, or 0 for none. Default: the capture's
-    own split, else every 8th by name."""
+    """Photos held out for measuring: names separated by commas, or 0 for none. Default: the
+    capture's own split, else every 8th photo by name."""
     resume: bool = False
-    """Continue the run in the folder; --minutes then counts from its beginning."""
+    """Resume the run in the folder. --minutes counts from the beginning of the run."""
     preset: Literal["cpu", "gpu", "paper"] | None = None
-    """Size of the field. gpu: larger tables. paper: the paper's sizes and weights of losses
-    (docs/physics.md tells what in them is ours); its sky is opaque, by each photo's own labels, and
-    shelters from snow. Default: gpu with --device cuda, else cpu."""
+    """Size of the field. gpu: larger tables. paper: the sizes and loss weights of the paper
+    (docs/physics.md lists the differences); its sky is opaque according to the labels of each
+    photo, and keeps snow away. Default: gpu with --device cuda, else cpu."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """Weight of a loss, such as sky=0, which switches it off; may be given again for others. They
-    are: distortion, opacity_entropy, below_horizon_opacity, sky, sky_prior, planarity,
+    """Weight of a loss, such as sky=0, which switches it off. Repeat the flag for other losses:
+    distortion, opacity_entropy, below_horizon_opacity, sky, sky_prior, planarity,
     sparse_depth, ground_height, monocular_depth, classes, normals, normal_consistency, transient
     (docs/physics.md)."""
     refine_poses: bool = False
-    """Correct the cameras while fitting."""
+    """Refine the camera poses while fitting."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
     known_length: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
     marks: Path | None = None
-    """Where their ends are in the pictures; default: marks.toml in the scene folder."""
+    """File of the marks at which known lengths end. Default: marks.toml in the scene folder."""
     metric_input: bool = False
-    """The capture is in metres with z up already."""
+    """The poses are already in metres with z up."""
     frames: str | None = None
-    """Frames of a KITTI-360 drive: first and last, such as 1538:1601."""
+    """First and last frame of a KITTI-360 drive, such as 1538:1601."""
     label_space: str | None = None
-    """What the numbers in label files mean: cityscapes-train-ids, cityscapes-ids or seven. Default:
-    what the capture says."""
+    """Meaning of the numbers in label files: cityscapes-train-ids, cityscapes-ids or seven.
+    Default: what the capture states."""
     labels: str | None = None
     """Class labels: none, heuristic (sky and ground without a network), or a network's
     name or folder. Default: the capture's label files, else heuristic if it surely shows sky."""
@@ -74,15 +74,15 @@ class Fit:
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
     capture's depth_relative files, else its depth files; none leaves both alone."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler beside it, in larger
-    steps; its present kernels were tested without one."""
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed, in larger
+    steps; the present GPU kernels were tested without a GPU."""
     seed: int = 0
-    """Of all randomness."""
+    """Random seed."""
 
 
 def run(options: Fit) -> int:
-    """Reads the capture, fits, and says where the run is and how good."""
-    settings = fit_settings(options)  # what is wrong with it is to be known before photos are read
+    """Read the capture, fit, and print where the run is and how good it is."""
+    settings = fit_settings(options)  # reports wrong flags before photos are read
     limits = [each for each in (settings.minutes, settings.steps) if each is not None]
     if not all(0 < limit < float("inf") for limit in limits):
         raise UserError("--minutes and --steps must be numbers above 0; try --minutes 5")
@@ -107,21 +107,21 @@ def run(options: Fit) -> int:
     for warning in dict.fromkeys((*scene.warnings, *scale_warnings(scene))):
         progress.warn(warning)
     progress.say(frame_line(scene))
-    # Labels may take minutes to make.
+    # Checked before labels, which may take minutes.
     check_folder(scene, options.out, options.resume)
     if options.resume:
         check_resumable(options.out, settings)
     scene = with_perception(scene, options)
     metrics = fit_with_bars(scene, options)
     if metrics["interrupted"]:
-        progress.say(f"Stopped early; continue with: {resuming(options)}")
+        progress.say(f"Stopped early; resume with: {resuming(options)}")
     progress.result(summary(metrics))
     progress.result(f"run: {options.out}")
     return 0
 
 
 def check_device(device: str) -> None:
-    """Refuses a device that is not there; imports torch for others than the CPU only."""
+    """Refuse a device that is absent; torch is imported only for devices other than the CPU."""
     if device != "cpu":
         from climatenerf.core.device import on
 
@@ -130,11 +130,11 @@ def check_device(device: str) -> None:
 
 
 def with_perception(scene: Scene, options: Fit) -> Scene:
-    """The scene with the labels, and the capture with the relative depths, that are asked for."""
+    """Return the scene with the requested labels, after writing relative depths if requested."""
     from climatenerf.perception import check_depth_model, prepare_depth, prepare_labels
 
     if options.mono_depth not in (None, "none"):
-        check_depth_model(options.mono_depth)  # labels may take minutes to make
+        check_depth_model(options.mono_depth)  # before minutes of labelling
     scene = prepare_labels(scene, options.labels, options.out, progress.track, progress.say)
     if options.mono_depth not in (None, "none"):
         prepare_depth(scene, options.mono_depth, progress.track, progress.say)
@@ -142,16 +142,16 @@ def with_perception(scene: Scene, options: Fit) -> Scene:
 
 
 def with_known_lengths(scene: Scene, lengths: tuple[str, ...], marks: Path | None) -> Scene:
-    """The scene in the metres of lengths given as "NAME=2.0 m"."""
+    """Return the scene in the metres of lengths given as "NAME=2.0 m"."""
     if not lengths:
         return scene
     known = parse_known_lengths(lengths)
-    placed = read_marks(marks or scene.root / FILE_NAME)
-    return apply_known_lengths(scene, [measure(scene, placed, *one) for one in known])
+    marked = read_marks(marks or scene.root / FILE_NAME)
+    return apply_known_lengths(scene, [measure(scene, marked, *each) for each in known])
 
 
 def parse_known_lengths(lengths: tuple[str, ...]) -> list[tuple[str, float]]:
-    """Names and metres of lengths given as "NAME=2.0 m".
+    """Return names and lengths, m, given as "NAME=2.0 m".
 
     Raises:
         UserError: one is not of this form, not above 0, or given twice.
@@ -171,25 +171,25 @@ def parse_known_lengths(lengths: tuple[str, ...]) -> list[tuple[str, float]]:
 
 
 def check_known_lengths(lengths: tuple[str, ...], marks: Path | None, default: Path) -> None:
-    """What is wrong with known lengths, as far as it shows without a scene.
+    """Refuse known lengths or marks that cannot be used, as far as that shows without a scene.
 
     Raises:
         UserError: lengths or marks that cannot be used.
     """
     if marks is not None and not lengths:
         raise UserError(
-            '--marks needs --known-length "NAME=2.0 m" to say how long what is marked is'
+            '--marks needs --known-length "NAME=2.0 m", the length between the marks; add it'
         )
     if not lengths:
         return
-    placed = read_marks(marks or default)
+    marked = read_marks(marks or default)
     for name, _ in parse_known_lengths(lengths):
-        if name not in placed:
-            raise UserError(f"the marks hold no {name!r}; they hold: {', '.join(placed) or 'none'}")
+        if name not in marked:
+            raise UserError(f"the marks hold no {name!r}; they hold: {', '.join(marked) or 'none'}")
 
 
 def frame_line(scene: Scene) -> str:
-    """How the scene stands in the world, in one line."""
+    """Return one line about up direction, scale and heights of a scene."""
     views = scene.of_split("train")
     heights = sorted(float(scene.c2w_world(view)[2, 3]) - scene.ground_z for view in views)
     up = scene.up_report.get("used", "the scene file")
@@ -204,13 +204,13 @@ def frame_line(scene: Scene) -> str:
 
 
 def resuming(options: Fit) -> str:
-    """The command that continues a run: with the flags that it was begun with."""
+    """Return the command that resumes a run, with the flags of its first command."""
     words = ["climatenerf", "fit", str(options.scene), "-o", str(options.out), "--resume"]
     for option in fields(Fit)[2:]:
         value = getattr(options, option.name)
-        # The run keeps its scale itself.
-        kept = ("resume", "camera_height", "metric_input", "known_length", "marks")
-        if option.name in kept or value == option.default:
+        # The run folder holds the scale.
+        stored = ("resume", "camera_height", "metric_input", "known_length", "marks")
+        if option.name in stored or value == option.default:
             continue
         flag = f"--{option.name.replace('_', '-')}"
         if isinstance(value, bool):
@@ -225,11 +225,11 @@ def _each(value: object) -> tuple:
 
 
 def fit_with_bars(scene, options: Fit) -> dict:
-    """Fits with progress bars; returns the metrics."""
-    # torch comes in here, so that help and errors in the input do not wait for it.
+    """Fit with progress bars, and return the metrics."""
+    # torch is imported here, so that help and input errors do not wait for it.
     progress.say(
-        "Preparing: photos are matched, up to half a minute; so long again where kernels are to be"
-        " compiled, once on a machine"
+        "Preparing: matching photos takes up to half a minute; compiling kernels takes as long,"
+        " once per machine"
     )
     from climatenerf.core.device import on
     from climatenerf.training.run import fit_scene
@@ -241,7 +241,7 @@ def fit_with_bars(scene, options: Fit) -> dict:
 
         def report(state: Report) -> None:
             nonlocal begun
-            if not begun:  # the kernels are there
+            if not begun:  # the kernels are compiled
                 bar.prepared(state.progress)
                 begun = True
             bar.update(
@@ -263,7 +263,7 @@ def fit_with_bars(scene, options: Fit) -> dict:
 
 
 def fit_settings(options: Fit) -> FitSettings:
-    """What the flags say of the fit, on top of what its preset says."""
+    """Return the settings of the preset, replaced by those that flags give."""
     settings = settings_of(
         options.preset or ("gpu" if options.device == "cuda" else "cpu"), options.device
     )
@@ -285,10 +285,10 @@ def fit_settings(options: Fit) -> FitSettings:
 
 
 def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
-    """Weights of losses given as "sky=0".
+    """Return weights of losses given as "sky=0".
 
     Raises:
-        UserError: one has another form, no such loss, or a weight below 0.
+        UserError: a word has another form, an unknown loss, or a weight below 0.
     """
     names = [each.name for each in fields(Losses)]
     weights = {}
@@ -309,7 +309,7 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
 
 
 def summary(metrics: dict) -> str:
-    """One line: quality, cost, and what of the photos was left out."""
+    """Return one line with quality, cost, and the masked fraction of the photos."""
     cost = f"{metrics['steps']} steps, {metrics['seconds']:.0f} s of fitting"
     if metrics.get("masked_fraction"):  # runs of earlier versions have none
         cost += f"; {metrics['masked_fraction']:.1%} of the photos masked as passers-by"

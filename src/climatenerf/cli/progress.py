@@ -1,7 +1,7 @@
-"""What the user sees while the program works: bars with ETA in a terminal, plain lines elsewhere.
+"""Output for the user: progress bars with ETA in a terminal, plain lines elsewhere.
 
-The only module that prints. Everything that belongs to progress goes to standard error; results
-(where the files are, the PSNR) go to standard output, so that they can be piped.
+This is the only module that prints. Progress goes to standard error; results (paths of files, the
+PSNR) go to standard output, so that they can be piped.
 """
 
 import functools
@@ -16,29 +16,29 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 LINE_EVERY = 10.0
-"""Seconds between two lines where there is no terminal."""
+"""Seconds between two lines if standard error is no terminal."""
 
 Item = TypeVar("Item")
 
 
 class Bar:
-    """One piece of work with a known end, in steps or in seconds.
+    """Progress of one task with a known amount of work.
 
     ``with Bar("fit", total=300.0) as bar: bar.update(elapsed, {"step": "120", "PSNR": "21.3"})``.
-    In a terminal this is a bar with percentage, ETA and the given columns; elsewhere
-    a line about every ten seconds, and one at the end.
+    In a terminal this is a bar with percentage, ETA and the given columns. Elsewhere it is a line
+    about every ten seconds, and one at the end.
     """
 
     def __init__(self, title: str, total: float, quiet: bool = False) -> None:
-        """Prepares the bar.
+        """Prepare the bar.
 
         Args:
-            title: what is being done, a word or two.
+            title: name of the task, a word or two.
             total: amount of work, any unit (steps, frames, seconds), > 0.
-            quiet: show nothing.
+            quiet: print nothing.
         """
         self.title = title
-        self.total = max(float(total), 1e-9)  # a bar of nothing is complete, not 0/0
+        self.total = max(float(total), 1e-9)  # prevents 0/0 for an empty task, which is complete
         self.done = 0.0
         self.columns: dict[str, str] = {}
         self._quiet = quiet
@@ -48,7 +48,7 @@ class Bar:
         self._progress: Progress | None = None
 
     def __enter__(self) -> Self:
-        """Shows the bar."""
+        """Show the bar."""
         self._start = self._paced = time.monotonic()
         self._next_line = self._start + LINE_EVERY
         if not self._quiet and _console().is_terminal:
@@ -63,18 +63,18 @@ class Bar:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Leaves the bar as it is and frees the line."""
+        """Leave the bar as it is, and end its line."""
         if self._progress is not None:
             self._progress.stop()
         elif not self._quiet:
             self._line(last=True)
 
     def update(self, done: float, columns: Mapping[str, str] | None = None) -> None:
-        """Tells how far the work is.
+        """Report the amount of work done.
 
         Args:
             done: amount done so far, [0, total].
-            columns: label → text beside the bar, e.g. ``{"rays/s": "21 k"}``; kept until changed.
+            columns: text beside the bar by label, e.g. ``{"rays/s": "21 k"}``; shown until changed.
         """
         self.done = min(float(done), self.total)
         self.columns |= columns or {}
@@ -84,25 +84,25 @@ class Bar:
             self._line(last=False)
 
     def advance(self, by: float = 1.0, columns: Mapping[str, str] | None = None) -> None:
-        """Tells that another piece is done."""
+        """Report that a further amount of work is done."""
         self.update(self.done + by, columns)
 
     def prepared(self, done: float = 0.0) -> None:
-        """Tells that the work begins now, with so much done: time before says nothing of its pace.
+        """Report that the work begins now; the time before does not count in the ETA.
 
         Args:
-            done: amount done before, as of a run that is continued.
+            done: amount done before, such as the steps of a resumed run.
         """
         self._paced, self._given = time.monotonic(), float(done)
         if self._progress is not None:
             self._progress.reset(self._task, total=self.total, completed=int(done))
 
     def eta(self) -> float | None:
-        """Seconds until the end at the pace so far, or None before anything is done."""
-        own = self.done - self._given
-        if own <= 0:
+        """Return the seconds until the end at the mean pace, or None before any work is done."""
+        done_here = self.done - self._given
+        if done_here <= 0:
             return None
-        return (time.monotonic() - self._paced) / own * (self.total - self.done)
+        return (time.monotonic() - self._paced) / done_here * (self.total - self.done)
 
     def _text(self) -> str:
         return "  ".join(f"{label} {text}" for label, text in self.columns.items())
@@ -110,8 +110,8 @@ class Bar:
     def _line(self, last: bool) -> None:
         now = time.monotonic()
         self._next_line = now + LINE_EVERY
-        left = self.eta()
-        end = f"{duration(now - self._start)} in all" if last else f"ETA {duration(left)}"
+        eta = self.eta()
+        end = f"{duration(now - self._start)} in all" if last else f"ETA {duration(eta)}"
         parts = [f"{self.title}: {100 * self.done / self.total:.0f} %", end, self._text()]
         say("  ".join(part for part in parts if part))
 
@@ -157,7 +157,7 @@ class StageBars:
 
 
 def track(title: str, items: Iterable[Item], quiet: bool = False) -> Iterator[Item]:
-    """Yields the items of a sized collection under a bar that counts them."""
+    """Yield the items of a sized collection, with a progress bar that counts them."""
     total = len(items) if isinstance(items, Sized) else 0
     with Bar(title, total, quiet) as bar:
         for number, item in enumerate(items):
@@ -167,23 +167,23 @@ def track(title: str, items: Iterable[Item], quiet: bool = False) -> Iterator[It
 
 
 def say(text: str) -> None:
-    """A line about what is going on, on standard error; above the bar if one is shown."""
+    """Print a line on standard error, above the progress bar if one is shown."""
     _console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def warn(text: str) -> None:
-    """A warning, on standard error."""
+    """Print a warning on standard error."""
     say(f"warning: {text}")
 
 
 def result(text: str) -> None:
-    """A line that is the program's result, on standard output."""
+    """Print a result on standard output."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
 def duration(seconds: float | None) -> str:
-    """``m:ss`` or ``h:mm:ss``; ``-:--`` where unknown."""
+    """Format seconds as ``m:ss`` or ``h:mm:ss``; None as ``-:--``."""
     if seconds is None:
         return "-:--"
     minutes, rest = divmod(round(seconds), 60)
@@ -192,7 +192,7 @@ def duration(seconds: float | None) -> str:
 
 
 def rate(per_second: float) -> str:
-    """A number with three digits and k, M or G, e.g. ``21.4 k``."""
+    """Format a number with three digits and k, M or G, e.g. ``21.4 k``."""
     for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if per_second >= size:
             return f"{per_second / size:.3g}{letter}"
@@ -213,7 +213,7 @@ def _rich_progress(console: "Console") -> "Progress":
     narrow = console.width < 110
 
     def fixed(width: int) -> Column:
-        # Without a fixed width a narrow terminal squeezes the ETA out before the long columns.
+        # Without a fixed width, rich drops the ETA before the long columns in a narrow terminal.
         return Column(min_width=width, no_wrap=True)
 
     return progress.Progress(

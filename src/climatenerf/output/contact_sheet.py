@@ -1,4 +1,4 @@
-"""One picture of many frames: a row for each movie, a column for each moment."""
+"""Contact sheets: a row for each movie, a column for each moment."""
 
 import io
 from collections.abc import Sequence
@@ -20,11 +20,11 @@ def contact_sheet(
     columns: int | None = None,
     cell_width: int = 320,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Lays rows of frames out as one labelled picture.
+    """Arrange rows of frames in one labelled picture.
 
     Args:
         rows: label and frames of each row; all frames of one shape.
-        columns: at most so many frames of each row, evenly spread over it; None takes all.
+        columns: maximum number of frames of each row, evenly spaced; None takes all.
         cell_width: width of each frame in the sheet, pixels; frames are never enlarged.
 
     Returns:
@@ -45,30 +45,30 @@ def contact_sheet(
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round())
         for c, index in enumerate(chosen.astype(int)):
             picture = Image.fromarray(np.ascontiguousarray(frames[index]))
-            place = (GAP + c * (cell[0] + GAP), GAP + r * (cell[1] + GAP))
-            sheet.paste(picture.resize(cell, Image.Resampling.LANCZOS), place)
+            corner = (GAP + c * (cell[0] + GAP), GAP + r * (cell[1] + GAP))
+            sheet.paste(picture.resize(cell, Image.Resampling.LANCZOS), corner)
             if c == 0:
-                _label(ImageDraw.Draw(sheet), place, label, font)
+                _label(ImageDraw.Draw(sheet), corner, label, font)
     return np.asarray(sheet)
 
 
 def write_jpeg(
     path: Path | str, picture: UInt8[np.ndarray, "h w 3"], max_bytes: int | None = None
 ) -> int:
-    """Writes a JPEG, marked as simulated, as good as the size bound allows.
+    """Write a JPEG, marked as simulated, with the best quality that the size limit allows.
 
-    Quality is lowered from 90 to 60 first, then the picture is made smaller.
+    Quality is lowered from 90 to 60 first; then the picture is reduced.
 
     Args:
         path: the file.
         picture: 8-bit RGB.
-        max_bytes: upper bound of the file, or None.
+        max_bytes: maximum size of the file, or None.
 
     Returns:
-        Bytes written.
+        Size of the file, bytes.
 
     Raises:
-        UserError: the bound cannot be met, or the place cannot be written.
+        UserError: the limit cannot be met, or the file cannot be written.
     """
     image = Image.fromarray(np.ascontiguousarray(picture))
     while min(image.size) >= 16:
@@ -81,15 +81,15 @@ def write_jpeg(
         image = image.resize(
             (round(image.width * 0.8), round(image.height * 0.8)), Image.Resampling.LANCZOS
         )
-    raise UserError(f"{path} does not fit into {max_bytes} bytes; allow more")
+    raise UserError(f"{path} does not fit into {max_bytes} bytes; allow a larger file")
 
 
 def _label(
     draw: ImageDraw.ImageDraw,
-    place: tuple[int, int],
+    corner: tuple[int, int],
     text: str,
     font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
 ) -> None:
-    left, top, right, bottom = draw.textbbox((place[0] + 6, place[1] + 4), text, font=font)
+    left, top, right, bottom = draw.textbbox((corner[0] + 6, corner[1] + 4), text, font=font)
     draw.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=(0, 0, 0))
-    draw.text((place[0] + 6, place[1] + 4), text, font=font, fill=(255, 255, 255))
+    draw.text((corner[0] + 6, corner[1] + 4), text, font=font, fill=(255, 255, 255))

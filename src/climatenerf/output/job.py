@@ -269,7 +269,7 @@ def check_folder(job: RenderJob, out: Path, preview: bool = False) -> None:
             render with other settings.
     """
     planned = [name for index in range(len(job)) for name in job.files(index)]
-    render_folder.check_place(out, planned, list(LAYERS), preview)
+    render_folder.check_foreign_files(out, planned, list(LAYERS), preview)
     render_folder.working_folder(out, job.key)
 
 

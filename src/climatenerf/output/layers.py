@@ -1,7 +1,7 @@
-"""Measured layers of a frame (depth, normals, water depth, ...) as files.
+"""Files of measured layers (depth, normals, water depth, ...).
 
-Layers are float32 arrays of the frame's size. NPZ and EXR hold them as they are; PNG holds them
-rounded to the step in `LAYERS`. No surface is +inf in the depth of NPZ and EXR, and 0 in PNG.
+Layers are float32 arrays of the frame's size. NPZ and EXR store them exactly; PNG stores them
+rounded to the step in `LAYERS`. Depth without a surface is +inf in NPZ and EXR, and 0 in PNG.
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,19 +57,19 @@ def save_layers(
     layers: Mapping[str, Float[np.ndarray, "h w *c"]],
     formats: Sequence[LayerFormat] = ("npz",),
 ) -> dict[str, list[str]]:
-    """Writes one frame's layers as ``folder/NAME/STEM.FORMAT``.
+    """Write the layers of a frame as ``folder/NAME/STEM.FORMAT``.
 
     Args:
-        folder: where the layers go.
+        folder: folder of the movie.
         stem: the frame's file name without suffix, e.g. ``0007``.
         layers: names of `LAYERS` with (h, w) values, (h, w, 3) for ``normal``.
-        formats: any of npz (one array, named as the layer), png (rounded, see `LAYERS`), exr.
+        formats: any of npz (one array with the layer's name), png (rounded, see `LAYERS`), exr.
 
     Returns:
-        For each layer the paths written, relative to ``folder``.
+        The paths written for each layer, relative to ``folder``.
 
     Raises:
-        UserError: a file cannot be written, or EXR is asked for without the OpenEXR package.
+        UserError: a file cannot be written, or EXR is requested without the OpenEXR package.
         ValueError: a layer has an unknown name or a wrong shape.
     """
     written: dict[str, list[str]] = {}
@@ -92,10 +92,10 @@ def save_layers(
 
 
 def png_values(name: str, array: Float[np.ndarray, "h w *c"]) -> np.ndarray:
-    """A layer as PNG grey levels, 8 or 16 bits.
+    """Return a layer as PNG grey levels, 8 or 16 bits.
 
-    Values beyond the range saturate (65.535 m for depth in 16-bit millimetres), except that what
-    is not finite is 0. A positive depth too small for a grey level is 1, as 0 means no surface.
+    Values out of range saturate (65.535 m for depth in 16-bit millimetres); values that are not
+    finite become 0. A positive depth below one grey level becomes 1, as 0 means no surface.
     """
     layer = LAYERS[name]
     top = 2**layer.png_bits - 1
@@ -107,7 +107,7 @@ def png_values(name: str, array: Float[np.ndarray, "h w *c"]) -> np.ndarray:
 
 
 def require_exr() -> None:
-    """Raises UserError if EXR cannot be written; to be called before hours of rendering."""
+    """Raise UserError if EXR cannot be written; call this before hours of rendering."""
     try:
         import OpenEXR  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -120,7 +120,7 @@ def _write_exr(path: Path, name: str, array: np.ndarray) -> None:
     require_exr()
     import OpenEXR  # pyright: ignore[reportMissingImports]
 
-    # Viewers show X, Y, Z as a picture; one value a pixel is Y (luminance) or Z (depth) by custom.
+    # By convention a single channel is Z for depth and Y (luminance) otherwise; viewers show both.
     single = "Z" if name == "depth" else "Y"
     channels = {single: array} if array.ndim == 2 else dict(zip("XYZ", _planes(array), strict=True))
     header = {

@@ -29,6 +29,7 @@ SCHEMA_VERSION = 1
 STATE = ".frames"
 NEXT = f"{STATE}/next"
 MOVIE, SIDECAR, PREVIEW = "movie.mp4", "movie.json", "preview.png"
+TEMPORARY = f".{'[0-9a-f]' * 12}.tmp.*"  # names of `storage.atomic_path`
 ABANDONED_AFTER = 3600.0
 """Seconds after which unfinished files of a killed process are removed."""
 
@@ -90,7 +91,7 @@ def files_of_render(out: Path) -> set[Path]:
     return {path for path in paths if path.is_relative_to(out.resolve())}
 
 
-def check_place(
+def check_foreign_files(
     out: Path, planned: Sequence[str], layer_names: Sequence[str], preview: bool = False
 ) -> None:
     """Refuse a folder in which a render would overwrite files that no render made.
@@ -276,11 +277,12 @@ def continue_promotion(out: Path, key: str) -> None:
 
 
 def remove_abandoned(out: Path) -> None:
-    """Remove scratch folders of processes that were killed long ago."""
-    for path in (out / STATE).glob("unfinished-*"):
+    """Remove scratch folders and temporary files of processes that were killed long ago."""
+    state = out / STATE
+    for path in [*state.glob("unfinished-*"), *state.glob(TEMPORARY), *out.glob(TEMPORARY)]:
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime > ABANDONED_AFTER:
-                shutil.rmtree(path, ignore_errors=True)
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def move(source: Path, target: Path) -> None:

@@ -1,4 +1,4 @@
-"""The JSON sidecar of a movie: what each frame shows, where it was seen from, in which units."""
+"""The JSON sidecar of a movie: weather, cameras, layers and units of its frames."""
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
@@ -96,14 +96,14 @@ def sidecar(
 
 
 def c2w_in_input_frame(c2w: Float[np.ndarray, "4 4"], scene: Scene) -> Float[np.ndarray, "4 4"]:
-    """A world pose in the capture's own frame: its units for the position, a pure rotation."""
+    """Return a world pose in the capture's own frame: position in its units, pure rotation."""
     back = np.linalg.inv(scene.world_from_input) @ c2w
     back[:3, :3] *= scene.scale
     return back
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of what computes the pictures, without importing it; None where absent."""
+    """Return the versions of the packages that compute the pictures; None for absent ones."""
     found: dict[str, str | None] = {"climatenerf": climatenerf.__version__}
     for package in ("torch", "numpy", "numba"):
         try:

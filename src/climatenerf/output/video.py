@@ -19,7 +19,7 @@ SIMULATED = (
     " no forecast"
 )
 CRF = 18
-"""x264's constant quality: 18 can hardly be told from the frames."""
+"""Constant rate factor of x264: at 18 the movie is visually lossless."""
 
 
 def write_png(
@@ -51,7 +51,7 @@ def write_png(
 
 
 def find_ffmpeg() -> str:
-    """Path of an ffmpeg program: `IMAGEIO_FFMPEG_EXE`, the one imageio-ffmpeg brings, the system's.
+    """Return the path of ffmpeg: `IMAGEIO_FFMPEG_EXE`, imageio-ffmpeg's own, or the system's.
 
     Raises:
         UserError: there is none.
@@ -81,20 +81,19 @@ def padding_note(name: str, size: tuple[int, int]) -> str | None:
 
 
 class MovieWriter:
-    """Streams frames into an MP4 (H.264, yuv420p, BT.709), which appears when it is complete.
+    """Stream frames into an MP4 (H.264, yuv420p, BT.709), which appears when it is complete.
 
-    ``with MovieWriter(path, (480, 270), 24) as movie: movie.add(frame)``. Trouble with ffmpeg does
-    not stop the frames from being rendered and saved: `problem` tells of it at once, and it is
-    raised when the block ends. An exception inside the block leaves no movie and an older one
-    untouched.
+    ``with MovieWriter(path, (480, 270), 24) as movie: movie.add(frame)``. An error of ffmpeg is
+    stored in `problem`, and raised when the block ends, so that the caller can finish its frames.
+    An exception inside the block leaves no new movie, and an older one unchanged.
 
     Attributes:
         problem: why there will be no movie, or None.
-        note: what was done to the frames (padding to even sizes), or None.
+        note: how the movie differs from the frames (padding to even sizes), or None.
     """
 
     def __init__(self, path: Path | str, size: tuple[int, int], fps: float) -> None:
-        """Prepares a movie.
+        """Prepare a movie.
 
         Args:
             path: the MP4 file.
@@ -113,7 +112,7 @@ class MovieWriter:
         self._exit = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        """Starts ffmpeg."""
+        """Start ffmpeg."""
         temporary = self._exit.enter_context(atomic_path(self.path))
         self._log = self._exit.enter_context(tempfile.TemporaryFile())
         try:
@@ -122,7 +121,7 @@ class MovieWriter:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=self._log,
-                # Ctrl-C goes to the whole terminal group; ffmpeg must not die before we close it.
+                # Ctrl-C reaches the whole process group of a terminal; ffmpeg has to outlive it.
                 start_new_session=True,
             )
         except UserError as error:
@@ -132,7 +131,7 @@ class MovieWriter:
         return self
 
     def add(self, frame: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Appends a frame: display-encoded 8-bit RGB of the movie's size."""
+        """Append a frame: display-encoded 8-bit RGB of the movie's size."""
         if frame.shape != (self.size[1], self.size[0], 3) or frame.dtype != np.uint8:
             raise ValueError(f"frame {frame.shape} {frame.dtype} in a movie of {self.size}")
         if self.problem is not None or self._process is None or self._process.stdin is None:
@@ -141,8 +140,8 @@ class MovieWriter:
         padded = np.pad(frame, ((0, rows), (0, columns), (0, 0)), mode="edge")
         try:
             self._process.stdin.write(padded.tobytes())
-        except OSError:  # ffmpeg has gone; its own words are in the log
-            self.problem = self._failure(self._last_words())
+        except OSError:  # ffmpeg has exited; the log holds its error
+            self.problem = self._failure(self._last_error())
 
     def __exit__(
         self,
@@ -150,15 +149,15 @@ class MovieWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Completes the movie, or removes it if the block failed."""
+        """Complete the movie, or remove it if the block failed."""
         process = self._process
         if process is not None:
             if kind is not None:
                 process.kill()
-            with contextlib.suppress(OSError):  # what it did not take, add() has reported
+            with contextlib.suppress(OSError):  # `add` has reported a broken pipe
                 process.communicate()
             if process.returncode != 0 and self.problem is None:
-                self.problem = self._failure(self._last_words())
+                self.problem = self._failure(self._last_error())
         if kind is None and self.problem is not None:
             with contextlib.suppress(UserError):
                 self._exit.__exit__(UserError, self.problem, None)
@@ -168,17 +167,17 @@ class MovieWriter:
     def _command(self, ffmpeg: str, out: Path) -> list[str]:
         width, height = self.size[0] + self._padding[1], self.size[1] + self._padding[0]
         raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
-        # Without these tags players guess the colour matrix by picture size, and guess wrong.
+        # Without these tags, players choose a wrong colour matrix from the picture size.
         colours = ["-vf", "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"]
         colours += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"]
         encoder = ["-c:v", "libx264", "-crf", str(CRF), "-preset", "medium"]
-        # faststart puts the index first, so that a browser plays while it loads.
+        # faststart writes the index first, so that a browser can play while it loads.
         container = ["-movflags", "+faststart", "-metadata", "comment=simulated", "-f", "mp4"]
         start = [ffmpeg, "-y", "-hide_banner", "-loglevel", "error", "-nostdin"]
         source = [*raw, "-r", f"{self.fps:g}", "-i", "pipe:0", "-an"]
         return [*start, *source, *encoder, *colours, *container, str(out)]
 
-    def _last_words(self) -> str:
+    def _last_error(self) -> str:
         if self._process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout=5)
@@ -190,6 +189,6 @@ class MovieWriter:
 
     def _failure(self, reason: str) -> UserError:
         return UserError(
-            f"no movie {self.path}: ffmpeg failed ({reason}); the frames are unharmed, free some"
-            " disk space or set IMAGEIO_FFMPEG_EXE to an ffmpeg with libx264"
+            f"no movie {self.path}: ffmpeg failed ({reason}); the frames are complete: free some"
+            " disk space, or set IMAGEIO_FFMPEG_EXE to an ffmpeg with libx264"
         )

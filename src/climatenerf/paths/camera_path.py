@@ -1,8 +1,7 @@
-"""Where the movie's camera goes: along the photographs, around their subject, standing still, or
-along a path drawn in nerfstudio.
+"""Camera paths of movies: along the photographs, around their subject, still, or from nerfstudio.
 
 All poses are camera-to-world in world metres with OpenCV axes (+x right, +y down, +z forward). The
-fitted field is good where photographs were taken, so every path made here stays near them.
+fitted field is accurate near the photographs, so every path made here stays near them.
 """
 
 import difflib
@@ -24,24 +23,24 @@ from climatenerf.paths.framing import (
 from climatenerf.paths.nerfstudio import read_drawn_path
 from climatenerf.paths.tour import (
     capture_order,
-    level,
-    longest_run,
+    longest_segment,
     looking_at,
     smooth_and_resample,
+    without_roll,
 )
 from climatenerf.scene import Camera, Scene, View
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """A moving camera, one entry a frame.
+    """A moving camera with one entry per frame.
 
     Attributes:
         c2w: Camera-to-world poses, world metres, OpenCV axes.
         cameras: Intrinsics of each frame; all of one size.
-        name: What kind of path it is, for the sidecar.
-        notes: What had to be assumed or left out, as sentences for the user.
-        fps: Frames per second that the path itself asks for, or None.
+        name: Kind of path, for the sidecar.
+        notes: Assumptions and omissions, as sentences for the user.
+        fps: Frames per second that a path file gives, or None.
     """
 
     c2w: Float[np.ndarray, "frames 4 4"]
@@ -62,14 +61,14 @@ class CameraPath:
 def camera_path(
     spec: str, scene: Scene, frames: int, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """The path that ``--path`` names.
+    """Return the path that ``--path`` names.
 
     Args:
         spec: ``training``, ``orbit``, ``still``, ``still:NAME`` (a view's name, or its number from
             0 in name order), or a nerfstudio ``camera_path.json``.
         scene: the capture.
-        frames: how many frames, ≥ 1; a file brings its own number.
-        size: (width, height) in pixels; None keeps that of the photographs, or of the file.
+        frames: number of frames, ≥ 1; a file has its own number.
+        size: (width, height) in pixels; None takes that of the photographs, or of the file.
 
     Raises:
         UserError: no such path, view or file, or the file is damaged.
@@ -91,33 +90,37 @@ def camera_path(
 def smoothed_training_path(
     scene: Scene, frames: int, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Follows the photographs in the order they were taken, smoothly and with a level horizon.
+    """Return a smooth path with a level horizon along the photographs, in order of capture.
 
-    Sorted names give the order; a set whose names jump about is toured from neighbour to
-    neighbour. Where the walk breaks (a second pass elsewhere) its longest part is used. Frames
-    are at even distances along the path, a turn on the spot counting as some distance.
+    Sorted names give the order. If the names have no spatial order, the path is a tour from
+    neighbour to neighbour. Where the walk breaks (a second pass elsewhere), the longest segment is
+    used. Frames are evenly spaced along the path; rotation counts as distance.
     """
     _check_frames(frames)
     poses = _poses(scene)
     if len(poses) == 1:
         return still(scene, None, frames, size)
     order, toured = capture_order(poses)
-    run = longest_run(poses[order])
+    segment = longest_segment(poses[order])
     notes = []
     if toured:
-        notes.append("the names of the photographs are in no spatial order; toured by distance")
-    if len(run) < len(poses):
-        notes.append(f"the photographs make separate walks; {len(run)} of {len(poses)} followed")
-    c2w = smooth_and_resample(run, frames)
+        notes.append(
+            "the names of the photographs have no spatial order; the path is a tour by distance"
+        )
+    if len(segment) < len(poses):
+        notes.append(
+            f"the photographs form separate walks; the path follows {len(segment)} of {len(poses)}"
+        )
+    c2w = smooth_and_resample(segment, frames)
     return CameraPath(c2w, (fitted_camera(scene, size),) * frames, "training", tuple(notes))
 
 
 def orbit(scene: Scene, frames: int, size: tuple[int, int] | None = None) -> CameraPath:
-    """Circles the point that the cameras look at, at their median distance and height.
+    """Return a circle around the point that the cameras face, at their median distance and height.
 
-    A capture that goes most of the way round gives a closed circle, one that covers an arc gives
-    that arc there and back. A capture that is not around a point (a drive, a row of sideways
-    views) gives a small closed sway among the photographs instead, and a note says so.
+    A capture that covers most of a circle gives a closed circle. One that covers an arc gives the
+    arc forth and back. A capture without a common point (a drive, a row of sideways views) gives a
+    small closed ellipse among the photographs instead, with a note.
     """
     _check_frames(frames)
     poses = _poses(scene)
@@ -126,7 +129,9 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int] | None = None) -> Cam
     around = _circled_point(poses)
     if around is None:
         c2w = _sway(scene, poses, phase)
-        note = "the photographs are not around one point; the camera sways among them instead"
+        note = (
+            "the photographs do not surround a point; the camera moves on a small ellipse instead"
+        )
         return CameraPath(c2w, (camera,) * frames, "sway", (note,))
     target, start, covered = around
     offset = poses[:, :3, 3] - target
@@ -144,15 +149,15 @@ def orbit(scene: Scene, frames: int, size: tuple[int, int] | None = None) -> Cam
 def still(
     scene: Scene, view: str | int | None, frames: int, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Stands where one photograph was taken, in exactly its pose, so that only weather moves.
+    """Return a path that stays in the pose of one photograph, so that only the weather changes.
 
     Args:
         scene: the capture.
         view: a view's name (with or without suffix) or its number from 0 in name order; None
             takes the most central training view.
-        frames: how many frames, ≥ 1.
-        size: (width, height) in pixels. None keeps the photograph's own camera, distortion and
-            all, so that frame and photograph can be laid over each other.
+        frames: number of frames, ≥ 1.
+        size: (width, height) in pixels. None takes the photograph's camera with its distortion, so
+            that frame and photograph coincide.
 
     Raises:
         UserError: there is no such view.
@@ -169,11 +174,11 @@ def still(
 def from_camera_path_json(
     path: Path, scene: Scene, size: tuple[int, int] | None = None
 ) -> CameraPath:
-    """Follows a path drawn in nerfstudio's viewer (see `nerfstudio_path.read_drawn_path`).
+    """Return a path drawn in nerfstudio's viewer (see `nerfstudio.read_drawn_path`).
 
     Args:
         path: the file.
-        scene: the capture; gives the way from its frame to metres.
+        scene: the capture; defines the transform from its frame to metres.
         size: (width, height) in pixels; None takes the file's. The vertical field of view is kept.
 
     Raises:
@@ -190,11 +195,11 @@ def from_camera_path_json(
 def _circled_point(
     poses: Float[np.ndarray, "n 4 4"],
 ) -> tuple[Float[np.ndarray, "3"], float, float] | None:
-    """The point nearest to all optical axes, with the arc of azimuths from which it was seen.
+    """Return the point nearest to all optical axes, and the arc of azimuths that cameras cover.
 
     Returns:
-        (point in metres, first azimuth, arc covered, radians), or None where the cameras do not
-        stand around a point.
+        (point in metres, first azimuth, arc covered, radians), or None if the cameras do not
+        surround a point.
     """
     position, axis = poses[:, :3, 3], poses[:, :3, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
@@ -218,26 +223,27 @@ def _circled_point(
 def _sway(
     scene: Scene, poses: Float[np.ndarray, "n 4 4"], phase: Float[np.ndarray, "frames"]
 ) -> Float[np.ndarray, "frames 4 4"]:
-    """A small closed ellipse among the photographs nearest to the central one."""
+    """Return a small closed ellipse among the photographs nearest to the central one."""
     middle = scene.c2w_world(_central_view(scene))
     position = poses[:, :3, 3]
     far = np.linalg.norm(position - middle[:3, 3], axis=1)
     near = position[np.argsort(far)[: max(3, min(len(poses) // 6, 12))]]
     centre = near.mean(axis=0)
     _, spread, axes = np.linalg.svd(near - centre, full_matrices=False)
-    # Cameras spread evenly over a length deviate by 0.29 of it: 1.2 deviations stay inside.
-    reach = 1.2 * spread / math.sqrt(len(near))
-    across = np.sin(phase)[:, None] * axes[0] * reach[0]
+    # The standard deviation of a uniform distribution is 0.29 of its length, so 1.2 deviations stay
+    # inside.
+    radius = 1.2 * spread / math.sqrt(len(near))
+    across = np.sin(phase)[:, None] * axes[0] * radius[0]
     if len(near) > 2:
-        across = across + (1 - np.cos(phase))[:, None] / 2 * axes[1] * reach[1]
+        across = across + (1 - np.cos(phase))[:, None] / 2 * axes[1] * radius[1]
     points = scene.points_world()
-    distance = 10 * float(np.linalg.norm(reach)) or 1.0
+    distance = 10 * float(np.linalg.norm(radius)) or 1.0
     if points is not None and len(points):
         ahead = (points - middle[:3, 3]) @ middle[:3, 2]
         if (ahead > 0).any():
             distance = max(distance, float(np.median(ahead[ahead > 0])))
     c2w = looking_at(centre + across, centre + distance * middle[:3, 2])
-    return level(c2w)
+    return without_roll(c2w)
 
 
 def _poses(scene: Scene) -> Float[np.ndarray, "n 4 4"]:
@@ -245,13 +251,14 @@ def _poses(scene: Scene) -> Float[np.ndarray, "n 4 4"]:
 
 
 def _central_view(scene: Scene) -> View:
-    """The training view nearest to all others in place and direction."""
+    """Return the training view nearest to all others in position and direction."""
     views = train_views(scene)
     poses = np.stack([scene.c2w_world(view) for view in views])
     position = poses[:, :3, 3]
-    # Directions count like places a typical distance apart; 1e-9 where all stand in one place.
-    reach = np.sqrt(position.var(axis=0).sum()) + 1e-9
-    features = np.concatenate([position / reach, poses[:, :3, 2]], axis=1)
+    # A change of direction by 1 rad counts like the cameras' spread. 1e-9 m prevents 0/0 where all
+    # positions are equal.
+    spread = np.sqrt(position.var(axis=0).sum()) + 1e-9
+    features = np.concatenate([position / spread, poses[:, :3, 2]], axis=1)
     total = [np.linalg.norm(features - one, axis=1).sum() for one in features]
     return views[int(np.argmin(total))]
 
@@ -273,4 +280,4 @@ def _named_view(scene: Scene, view: str | int) -> View:
 
 def _check_frames(frames: int) -> None:
     if frames < 1:
-        raise UserError(f"a movie of {frames} frames cannot be rendered; ask for at least 1")
+        raise UserError(f"a movie of {frames} frames cannot be rendered; give --frames 1 or more")

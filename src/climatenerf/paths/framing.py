@@ -1,4 +1,4 @@
-"""What the movie's camera sees: the photographs' field of view, in another size."""
+"""Intrinsics of the movie's camera: the photographs' field of view, in another size."""
 
 import math
 
@@ -8,15 +8,15 @@ from climatenerf.core.errors import UserError
 from climatenerf.scene import Camera, Scene, View
 
 MAX_OVERSHOOT = 1.5
-"""How far beyond the photographs' own edges a picture of another shape may look, as a factor."""
+"""Maximum ratio of a picture's extent to the photographs', for pictures of another shape."""
 
 
 def fitted_camera(scene: Scene, size: tuple[int, int] | None = None) -> Camera:
-    """A camera without distortion that sees what the median photograph sees, in another size.
+    """Return a camera without distortion with the median photograph's field of view.
 
-    Where the shape differs from the photographs' (upright photographs, wide movie), the two share
-    their area on the image plane, but the movie looks at most 1.5 times beyond the photographs'
-    edges, where the field is unknown.
+    If the aspect ratio differs (upright photographs, wide movie), the areas on the image plane are
+    equal, but the movie extends at most 1.5 times as far as the photographs: beyond their edges the
+    field is unknown.
 
     Args:
         scene: the capture.
@@ -26,7 +26,7 @@ def fitted_camera(scene: Scene, size: tuple[int, int] | None = None) -> Camera:
     extents = []
     for view in views:
         across, down = half_extent(scene.cameras[view.camera])
-        # A photograph on its side (a turned phone) is level in the movie: its sides swap.
+        # A photograph from a phone held sideways is rotated by 90 degrees: its sides swap.
         on_side = abs(scene.c2w_world(view)[2, 0]) > math.sqrt(0.5)
         extents.append((down, across) if on_side else (across, down))
     if size is None:
@@ -36,7 +36,7 @@ def fitted_camera(scene: Scene, size: tuple[int, int] | None = None) -> Camera:
 
 
 def fit_to_size(extents: list[tuple[float, float]], size: tuple[int, int]) -> Camera:
-    """The camera of ``size`` for the median of photographs' half extents (see `half_extent`).
+    """Return the camera of ``size`` for the median of half extents (see `half_extent`).
 
     Raises:
         UserError: the size is not positive.
@@ -51,12 +51,11 @@ def fit_to_size(extents: list[tuple[float, float]], size: tuple[int, int]) -> Ca
 
 
 def half_extent(camera: Camera) -> tuple[float, float]:
-    """Half width and half height of the picture at distance 1, distortion taken out."""
+    """Return half width and half height of the undistorted picture at distance 1."""
     w, h = camera.width, camera.height
     middles = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
     left, right, top, bottom = camera.directions(middles).astype(np.float64)
-    # At 55 degrees either way a flat picture is already stretched threefold at its edge; a fisheye
-    # that sees more than that is cut there.
+    # At 55 degrees off axis a perspective picture is stretched threefold: a fisheye is cut there.
     limit = math.radians(55)
     across = (math.atan2(right[0], right[2]) - math.atan2(left[0], left[2])) / 2
     down = (math.atan2(bottom[1], bottom[2]) - math.atan2(top[1], top[2])) / 2
@@ -64,11 +63,11 @@ def half_extent(camera: Camera) -> tuple[float, float]:
 
 
 def train_views(scene: Scene) -> tuple[View, ...]:
-    """The views to make paths from: those of the training split, or all if there are none."""
+    """Return the views that paths are made from: the training split, or all if it is empty."""
     return scene.of_split("train") or scene.views
 
 
 def check_size(width: int, height: int) -> None:
-    """Raises UserError unless both are positive."""
+    """Raise UserError unless width and height, pixels, are positive."""
     if width < 1 or height < 1:
-        raise UserError(f"a picture of {width}x{height} pixels cannot be rendered; use --size WxH")
+        raise UserError(f"a picture of {width}x{height} pixels cannot be rendered; give --size WxH")

@@ -15,14 +15,14 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class DrawnPath:
-    """What the file says, brought into world metres.
+    """The content of the file, in world metres.
 
     Attributes:
         c2w: Camera-to-world poses, world metres, OpenCV axes.
         vertical_fov: Vertical field of view of each frame, degrees, in (0, 180).
         size: Width and height to render, pixels; (0, 0) if the file names none.
         fps: Frames per second, or None.
-        note: From which frame the poses were brought here.
+        note: Which frame the poses were taken to be in.
     """
 
     c2w: Float[np.ndarray, "frames 4 4"]
@@ -33,12 +33,12 @@ class DrawnPath:
 
 
 def read_drawn_path(path: Path, scene: Scene) -> DrawnPath:
-    """Reads the frames of a `camera_path.json`.
+    """Read the frames of a `camera_path.json`.
 
     Its poses are OpenGL camera-to-world in nerfstudio's model frame. A
-    `dataparser_transforms.json` in the same folder says how that frame was made from the input's
-    (model = scale * transform * input) and is undone; without it the poses are taken to be in the
-    capture's own frame. The note says which.
+    `dataparser_transforms.json` in the same folder gives the transform from the input frame to that
+    frame (model = scale * transform * input), which is inverted. Without it the poses are taken to
+    be in the capture's own frame. The note states which.
 
     Raises:
         UserError: the file is absent or damaged, or its camera is not a perspective one.
@@ -47,17 +47,17 @@ def read_drawn_path(path: Path, scene: Scene) -> DrawnPath:
     if str(data.get("camera_type", "perspective")).lower() != "perspective":
         raise UserError(
             f"camera path: {path} is for a {data['camera_type']} camera; only perspective paths"
-            " can be rendered, change it in the viewer and export again"
+            " can be rendered; change the camera in the viewer and export again"
         )
     entries = data.get("camera_path")
     if not isinstance(entries, list) or not entries:
-        raise UserError(f"camera path: {path} holds no frames; add key frames and export it again")
+        raise UserError(f"camera path: {path} holds no frames; add keyframes and export it again")
     input_from_model, note = _input_from_model(path, scene)
     world_from_model = scene.world_from_input @ input_from_model
     poses, fovs = [], []
     for number, entry in enumerate(entries):
         pose, fov = _entry(entry, data.get("default_fov"), f"frame {number} of {path}")
-        poses.append(_moved(world_from_model, pose @ OPENGL_TO_OPENCV))
+        poses.append(_transformed(world_from_model, pose @ OPENGL_TO_OPENCV))
         fovs.append(fov)
     size = (_number(data.get("render_width")), _number(data.get("render_height")))
     return DrawnPath(
@@ -86,21 +86,23 @@ def _entry(entry: object, default_fov: object, where: str) -> tuple[np.ndarray, 
     if not np.isfinite(pose).all() or not np.linalg.det(pose[:3, :3]) > 1e-9:
         raise UserError(f"camera path: {where} has no finite pose with a rotation; export it again")
     if not 0 < fov < 180:
-        raise UserError(f"camera path: {where} has a field of view of {fov} degrees; mend it")
+        raise UserError(f"camera path: {where} has a field of view of {fov} degrees; correct it")
     return pose, fov
 
 
 def _input_from_model(path: Path, scene: Scene) -> tuple[Float[np.ndarray, "4 4"], str]:
-    """The way from nerfstudio's model frame to the scene's input frame, and what it rests on."""
-    beside = path.parent / "dataparser_transforms.json"
-    if not beside.is_file():
+    """Return the transform from nerfstudio's model frame to the input frame, and a note on it."""
+    sidecar = path.parent / "dataparser_transforms.json"
+    if not sidecar.is_file():
         return np.eye(4), (
-            f"no {beside.name} beside {path.name}: its poses are taken to be in the capture's frame"
+            f"there is no {sidecar.name} beside {path.name}, so its poses are taken to be in the"
+            " capture's frame"
         )
-    data = read_json(beside, "camera path")
-    # nerfstudio starts from the frame before `applied_transform`; the scene's is the one after it.
-    own = scene.root / "transforms.json"
-    meta = read_json(own, "capture") if scene.source == "transforms" and own.is_file() else {}
+    data = read_json(sidecar, "camera path")
+    # nerfstudio's input frame is before `applied_transform`, and the scene's is after it.
+    capture = scene.root / "transforms.json"
+    from_json = scene.source == "transforms" and capture.is_file()
+    meta = read_json(capture, "capture") if from_json else {}
     try:
         rigid, applied = np.eye(4), np.eye(4)
         rigid[:3] = np.array(data["transform"], float)[:3]
@@ -109,14 +111,14 @@ def _input_from_model(path: Path, scene: Scene) -> tuple[Float[np.ndarray, "4 4"
         matrix = applied @ np.linalg.inv(rigid) @ np.diag([1 / scale] * 3 + [1.0])
     except (KeyError, TypeError, ValueError, ZeroDivisionError, np.linalg.LinAlgError) as error:
         raise UserError(
-            f"camera path: {beside} is damaged ({error}); restore it, or move it away if the"
+            f"camera path: {sidecar} is damaged ({error}); restore it, or move it away if the"
             " path is in the capture's own frame"
         ) from error
-    return matrix, f"poses of {path.name} brought back from nerfstudio's frame by {beside.name}"
+    return matrix, f"poses of {path.name} transformed from nerfstudio's frame by {sidecar.name}"
 
 
-def _moved(similarity: Float[np.ndarray, "4 4"], c2w: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """A pose in the similarity's target frame: position moved and scaled, rotation orthonormal."""
+def _transformed(similarity: Float[np.ndarray, "4 4"], c2w: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """Apply a similarity to a pose: the position is scaled, the rotation stays orthonormal."""
     moved = similarity @ c2w
     u, _, vt = np.linalg.svd(moved[:3, :3])
     moved[:3, :3] = u @ vt

@@ -204,9 +204,7 @@ def _sigma_angle(variance: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     return torch.sqrt((3 * variance).clamp(min=1e-20)).clamp(max=_MAX_SIGMA_ANGLE)
 
 
-def _clip_to_horizon(
-    d: Float[Tensor, "*n 3"], below: Bool[Tensor, "*#n"]
-) -> Float[Tensor, "*n 3"]:
+def _clip_to_horizon(d: Float[Tensor, "*n 3"], below: Bool[Tensor, "*#n"]) -> Float[Tensor, "*n 3"]:
     """Project rays that point through the water plane onto it."""
     z = torch.where(below, d[..., 2].clamp(max=0), d[..., 2].clamp(min=0))
     flat = torch.cat([d[..., :2], z[..., None]], dim=-1)

@@ -1,0 +1,322 @@
+"""From bare photos or a video to a scene folder: pictures, poses, metres, the user's sidecars."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import explain, make_folder
+from climatenerf.scene import Camera, Scene, read_scene, save_scene
+from climatenerf.scene.alignment.georeference import (
+    Georeference,
+    apply_georeference,
+    find_georeference,
+    gps_warning,
+)
+from climatenerf.scene.alignment.known_length import apply_known_lengths, measure, read_marks
+from climatenerf.scene.alignment.scale import (
+    scale_from_depth_files,
+    scale_warnings,
+    with_capture_flags,
+    with_scale_evidence,
+)
+from climatenerf.scene.images import picture_header
+from climatenerf.scene.readers.colmap import read_colmap
+from climatenerf.scene.scene import FILE_NAME
+from climatenerf.sfm.diagnose import Unposed, diagnose
+from climatenerf.sfm.from_colmap import import_posed
+from climatenerf.sfm.mark_page import write_mark_page
+from climatenerf.sfm.photo_import import PhotoImport, import_photos
+from climatenerf.sfm.photos import find_photos, is_video
+from climatenerf.sfm.reconstruct import DATABASE, Model, require_pycolmap
+from climatenerf.sfm.report import write_report
+from climatenerf.sfm.scene_folder import (
+    WORK,
+    check_output,
+    discard_scene,
+    install_scene,
+    start_scene,
+)
+from climatenerf.sfm.sidecars import Photo, import_sidecars
+from climatenerf.sfm.worker import reconstruct_in_subprocess
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """What a scene is made from.
+
+    Attributes:
+        photos: Folder of photos, or a video.
+        out: Scene folder.
+        marks: File of the marks at which known lengths end.
+        features: Maximum number of features per picture.
+        from_colmap: Folder of a COLMAP model of the photos, to take the poses from.
+        sidecars: Folders of labels, masks and depth files by kind.
+        camera_height: Height of the cameras above the ground, m.
+        known_lengths: Names and lengths, m.
+        seed: Random seed of structure from motion.
+    """
+
+    photos: Path
+    out: Path
+    marks: Path
+    features: int = 4096
+    from_colmap: Path | None = None
+    sidecars: Mapping[str, Path] = field(default_factory=dict)
+    camera_height: float | None = None
+    known_lengths: tuple[tuple[str, float], ...] = ()
+    seed: int = 0
+
+    @property
+    def excluded(self) -> list[Path]:
+        """Folders whose pictures are no photos to pose."""
+        return [self.out, *self.sidecars.values()]
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Callbacks for what a user wants to know meanwhile.
+
+    Attributes:
+        note: Called with a sentence.
+        warn: Called with a sentence about what should be mended.
+        progress: Called with a stage and the fraction of it that is done.
+    """
+
+    note: Callable[[str], None]
+    warn: Callable[[str], None]
+    progress: Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Captured:
+    """A scene that was made.
+
+    Attributes:
+        scene: The scene, in metres.
+        model: What structure from motion found.
+        unposed: Pictures without pose, with reason and remedy.
+        kept: Files of the user that stay in the scene folder, relative to it.
+        length_error: Why known lengths could not be used, or None.
+    """
+
+    scene: Scene
+    model: Model
+    unposed: list[Unposed]
+    kept: list[str]
+    length_error: UserError | None
+
+
+def check_settings(settings: CaptureSettings) -> None:
+    """Refuse settings that cannot lead to a scene, before any work is done.
+
+    Raises:
+        UserError: a value out of its range, a folder that is absent, or files in the way.
+    """
+    out = settings.out
+    if not 64 <= settings.features <= 32768:
+        raise UserError(f"--features must lie between 64 and 32768; got {settings.features}")
+    if not 0 <= settings.seed < 2**31:
+        raise UserError(f"--seed must lie between 0 and 2147483647; got {settings.seed}")
+    if settings.camera_height is not None and not settings.camera_height > 0:
+        raise UserError(f"--camera-height must be above 0; got {settings.camera_height:g} m")
+    if not settings.photos.exists():
+        raise UserError(f"{settings.photos} does not exist; give a folder of photos or a video")
+    for kind, folder in settings.sidecars.items():
+        if not (folder.is_dir() and any(folder.iterdir())):
+            raise UserError(f"--{kind} {folder} is no folder with files; give the folder of them")
+    if out.is_symlink() and not out.exists():
+        raise UserError(
+            f"{out} is a link to {os.readlink(out)}, which does not exist; make that folder, or"
+            " choose another with -o"
+        )
+    for path in (settings.photos, settings.from_colmap, *settings.sidecars.values()):
+        if path is not None and path.resolve().is_relative_to(out.resolve()):
+            raise UserError(f"{path} lies in {out}; choose another folder with -o")
+    check_output(out, list(settings.sidecars))
+    if settings.from_colmap is None:
+        require_pycolmap()
+        if not is_video(settings.photos):
+            find_photos(settings.photos, settings.excluded)
+
+
+def capture(settings: CaptureSettings, listener: Listener) -> Captured:
+    """Make a scene folder from photos or a video.
+
+    Args:
+        settings: what it is made from; `check_settings` has accepted them.
+        listener: callbacks.
+
+    Raises:
+        UserError: no scene can be made. An earlier scene in the folder is unharmed.
+    """
+    out, fresh = settings.out, not os.path.lexists(settings.out)
+    has_scene = (out / FILE_NAME).is_file()
+    new = start_scene(out)
+    try:
+        find = poses_of_colmap if settings.from_colmap else poses_by_motion
+        imported, model, unposed = find(settings, new, listener)
+        with naming_photos(settings, new):
+            scene = in_metres(settings, new, imported)
+            scene = with_sidecars(settings, scene, imported, model, listener)
+        length_error = None
+        try:
+            scene = with_known_lengths(scene, settings.known_lengths, settings.marks)
+        except UserError as error:
+            if has_scene:
+                raise UserError(f"{error} (the scene in {out} is unchanged)") from error
+            # The poses are worth keeping, and marks are made on the page written below.
+            length_error = error
+        warnings = dict.fromkeys((*scene.warnings, *scale_warnings(scene)))
+        scene = replace(scene, warnings=tuple(warnings))
+        save_scene(scene, new)
+        write_mark_page(new / "mark.html", scene)
+        write_report(new, scene, imported, model, unposed)
+    except UserError:
+        discard_scene(out, fresh)
+        raise
+    kept = install_scene(out, new, list(settings.sidecars))
+    return Captured(scene, model, unposed, kept, length_error)
+
+
+def with_known_lengths(scene: Scene, known: Sequence[tuple[str, float]], marks: Path) -> Scene:
+    """Return the scene in the metres of known lengths.
+
+    Args:
+        scene: the capture.
+        known: names of marked lengths, with the length of each, m.
+        marks: file of the marks.
+
+    Raises:
+        UserError: marks that are absent or unusable.
+    """
+    if not known:
+        return scene
+    marked = read_marks(marks)
+    return apply_known_lengths(scene, [measure(scene, marked, *each) for each in known])
+
+
+def poses_by_motion(
+    settings: CaptureSettings, new: Path, listener: Listener
+) -> tuple[PhotoImport, Model, list[Unposed]]:
+    """Import the pictures and find their poses by structure from motion.
+
+    Args:
+        settings: what the scene is made from.
+        new: folder that receives pictures and model.
+        listener: callbacks.
+
+    Returns:
+        The pictures, the model, and the pictures without pose.
+    """
+    work, flat, report = settings.out / WORK, new / "flat", listener.progress
+    imported = import_photos(
+        settings.photos, work, lambda n, count: report("pictures", n / count), settings.excluded
+    )
+    for note in imported.notes:
+        listener.note(note)
+    for name, reason in imported.unusable.items():
+        listener.warn(f"{name} is left out: {reason}")
+    features, seed = settings.features, settings.seed
+    model = reconstruct_in_subprocess(imported, work, flat, features, seed, report)
+    if len(model.groups) > 1:
+        listener.warn(
+            f"the pictures fall into {len(model.groups)} groups that do not fit together"
+            f" ({', '.join(map(str, model.groups))} pictures); the largest is kept"
+        )
+    try:
+        make_folder(new / "sparse")
+        os.replace(flat / "images", new / "images")
+        os.replace(flat / "sparse", new / "sparse" / "0")
+        shutil.rmtree(flat)
+    except OSError as error:
+        raise explain(error, new) from error
+    return imported, model, diagnose(imported, model.registered, work / DATABASE)
+
+
+def poses_of_colmap(
+    settings: CaptureSettings, new: Path, listener: Listener
+) -> tuple[PhotoImport, Model, list[Unposed]]:
+    """Import photos with the poses of a COLMAP model; arguments as for `poses_by_motion`."""
+    assert settings.from_colmap is not None
+    root, excluded = settings.from_colmap, settings.excluded
+    found = import_posed(settings.photos, root, new, excluded, listener.progress)
+    for note in found[0].notes:
+        listener.note(note)
+    return found
+
+
+def in_metres(settings: CaptureSettings, new: Path, imported: PhotoImport) -> Scene:
+    """Read the posed pictures as a scene, level and in metres as far as photos and flags allow."""
+    exif = {picture.name: picture.exif for picture in imported.pictures}
+    # Only views with poses are in the model. Their pixel sizes are known after reading.
+    posed = read_colmap(new / "sparse" / "0")
+    gravity = {}
+    for view in posed.views:
+        if view.name in exif:
+            upright = is_upright(settings, view.path, posed.cameras[view.camera])
+            down = exif[view.name].down_as_shown if upright else exif[view.name].down
+            if down is not None:
+                gravity[view.name] = down
+    scene = read_scene(new, camera_height=settings.camera_height, gravity=gravity)
+    scene = with_capture_flags(scene)
+    positions = {name: each.gps for name, each in exif.items() if each.gps is not None}
+    found = find_georeference(scene, positions)
+    warning = gps_warning(found, {picture.name: picture.source for picture in imported.pictures})
+    if warning is not None:
+        scene = replace(scene, warnings=(*scene.warnings, warning))
+    if not isinstance(found, Georeference):
+        return scene
+    return apply_georeference(scene, found, keep_scale=settings.camera_height is not None)
+
+
+def is_upright(settings: CaptureSettings, path: Path, camera: Camera) -> bool:
+    """Return whether a camera describes its photo as viewers show it, and not as it is stored.
+
+    Pictures that this program imports are upright. A COLMAP model's are if only that fits.
+    """
+    return settings.from_colmap is None or picture_header(path).rotates_to_fit(camera)
+
+
+def with_sidecars(
+    settings: CaptureSettings,
+    scene: Scene,
+    imported: PhotoImport,
+    model: Model,
+    listener: Listener,
+) -> Scene:
+    """Return the scene with the user's labels, masks and depth files for its photos."""
+    pictures = {picture.name: picture for picture in imported.pictures}
+    photos = {
+        view.name: Photo(
+            pictures[view.name].source,
+            model.lenses[view.name],
+            pictures[view.name].exif.orientation,
+            is_upright(settings, view.path, scene.cameras[view.camera]),
+        )
+        for view in scene.views
+    }
+    for kind, folder in settings.sidecars.items():
+        scene = import_sidecars(scene, kind, folder, photos)
+    if "depth" not in settings.sidecars:
+        return scene
+    scale = scale_from_depth_files(scene)
+    if scale is None:
+        listener.note("The depth files have no common scale; they do not set the scene's scale.")
+        return scene
+    return with_scale_evidence(scene, "depth files", *scale)
+
+
+@contextmanager
+def naming_photos(settings: CaptureSettings, new: Path) -> Iterator[None]:
+    """Let errors name the user's photos where a scene's pictures are copies of them."""
+    try:
+        yield
+    except UserError as error:
+        if settings.from_colmap is None:
+            raise
+        copies = str(new.absolute() / "images")
+        raise UserError(str(error).replace(copies, str(settings.photos))) from error
