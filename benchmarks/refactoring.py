@@ -26,7 +26,6 @@ from pathlib import Path
 
 import common
 
-SHORT, LONG = 20, 120  # steps of the two fits
 WEATHERS = {
     "clean": [],
     "flood": ["--flood.level", "0.4 m", "--flood.wind-speed", "3 m/s"],
@@ -47,14 +46,17 @@ def fit(tree: Path, street: Path, options: argparse.Namespace) -> dict[str, floa
         `seconds` a step and `peak_mb`.
     """
     seconds, peaks = [], []
-    for steps in (SHORT, LONG):
+    for steps in options.steps:
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
             words = ["fit", str(street), "-o", str(run), "--steps", str(steps), "--seed", "0"]
             words += ["--downscale", str(options.downscale)]
             peaks.append(climatenerf(tree, words, options.threads))
             seconds.append(json.loads((run / "metrics.json").read_text())["seconds"])
-    return {"seconds": (seconds[1] - seconds[0]) / (LONG - SHORT), "peak_mb": max(peaks)}
+    return {
+        "seconds": (seconds[1] - seconds[0]) / (options.steps[1] - options.steps[0]),
+        "peak_mb": max(peaks),
+    }
 
 
 def frame(tree: Path, weather: str, options: argparse.Namespace) -> dict[str, float]:
@@ -135,13 +137,16 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="run folder that both checkouts can read")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--pairs", type=int, default=7, help="pairs that count")
+    parser.add_argument(
+        "--steps", type=int, nargs=2, default=[20, 120], help="lengths of the two fits"
+    )
     parser.add_argument("--downscale", type=int, default=2, help="of the photos for the fits")
     parser.add_argument("--frames", type=int, default=4, help="frames of each render, at least 2")
     parser.add_argument("--size", default="480x270", help="size of the frames")
     parser.add_argument("--threads", type=int, help="threads of each process; default: all cores")
     options = parser.parse_args()
-    if options.pairs < 1 or options.frames < 2:
-        parser.error("--pairs must be at least 1 and --frames at least 2")
+    if options.pairs < 1 or options.frames < 2 or not 0 < options.steps[0] < options.steps[1]:
+        parser.error("--pairs must be at least 1, --frames at least 2, and --steps must increase")
     trees = {"before": options.before.resolve(), "after": options.after.resolve()}
     options.run = options.run.resolve()
     for tree in trees.values():
@@ -156,7 +161,8 @@ def main() -> None:
     for weather in WEATHERS:
         jobs[weather] = lambda tree, weather=weather: frame(tree, weather, options)
     results = {part: compare(jobs[part], trees, options.pairs) for part in options.parts}
-    settings = {"size": options.size, "downscale": options.downscale, "threads": options.threads}
+    names = ("steps", "downscale", "frames", "size", "threads")
+    settings = {name: getattr(options, name) for name in names}
     common.report("speed and memory of two checkouts", {**settings, "parts": results}, 0)
 
 

@@ -1,4 +1,4 @@
-"""Benchmarks, examples and the street's generator, as far as it shows without running them."""
+"""Static checks of benchmarks, examples and tools, which the tests do not run."""
 
 import builtins
 import dis
@@ -11,25 +11,25 @@ ROOT = Path(__file__).resolve().parents[1]
 GLOBALS = ("LOAD_GLOBAL", "LOAD_NAME")
 
 
-def codes(code):
-    """A code object and all within it."""
+def code_objects(code):
+    """Yield a code object and all that it contains."""
     yield code
     for inner in code.co_consts:
         if isinstance(inner, types.CodeType):
-            yield from codes(inner)
+            yield from code_objects(inner)
 
 
-def stored(code):
-    """Names that a module or a class body gives to something."""
+def bound_names(code):
+    """Return the names that a module or class body binds."""
     return {i.argval for i in dis.get_instructions(code) if i.opname == "STORE_NAME"}
 
 
 @pytest.mark.parametrize("folder", ["benchmarks", "examples", "tools", "tools/reference_street"])
-def test_scripts_use_no_name_that_is_nowhere(folder):
-    """Ruff cannot tell: shapes in annotations are such names by design."""
+def test_scripts_use_defined_names_only(folder):
+    """Ruff's check of undefined names is off: shapes in annotations look like such names."""
     for path in sorted((ROOT / folder).glob("*.py")):
         module = compile(path.read_text(), str(path), "exec")
-        known = {*dir(builtins), "__file__", "__annotations__", *stored(module)}
-        for code in codes(module):
+        defined = {*dir(builtins), "__file__", "__annotations__", *bound_names(module)}
+        for code in code_objects(module):
             used = {i.argval for i in dis.get_instructions(code) if i.opname in GLOBALS}
-            assert used <= known | stored(code), f"{path.name}: {used - known - stored(code)}"
+            assert used <= defined | bound_names(code), f"{path.name}: {used - defined}"

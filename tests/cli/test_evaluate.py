@@ -1,4 +1,4 @@
-"""`climatenerf evaluate`: the whole of it on a short fit, and what it refuses."""
+"""`climatenerf evaluate`: a whole report of a short fit, and refused input."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ from climatenerf.output.score_report import check_folder
 REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "street"
 
 
-def complaint(capsys, *words):
+def error_of(capsys, *words):
     capsys.readouterr()
     assert cli.main([str(word) for word in words]) == 2
     err = capsys.readouterr().err
@@ -25,32 +25,32 @@ def complaint(capsys, *words):
     return err
 
 
-def test_it_wants_to_know_against_what(capsys, tmp_path):
-    assert "--reference" in complaint(capsys, "evaluate", tmp_path, "-o", tmp_path / "out")
+def test_evaluation_requires_a_reference(capsys, tmp_path):
+    assert "--reference" in error_of(capsys, "evaluate", tmp_path, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_an_ablation_wants_a_capture_with_its_truth(capsys, tmp_path, monkeypatch):
+def test_an_ablation_requires_a_reference_set(capsys, tmp_path, monkeypatch):
     words = ["evaluate", REFERENCE, "--ablation", "-o", tmp_path / "out"]
-    assert "above 0" in complaint(capsys, *words, "--minutes", "0")
-    assert "--reference" in complaint(capsys, *words, "--reference")
-    assert "no row 'sun'; choose from: plain NGP" in complaint(capsys, *words, "--rows", "sun")
-    assert "--rows" in complaint(capsys, "evaluate", REFERENCE, "--rows", "full", "-o", tmp_path)
+    assert "above 0" in error_of(capsys, *words, "--minutes", "0")
+    assert "--reference" in error_of(capsys, *words, "--reference")
+    assert "no row 'sun'; choose from: plain NGP" in error_of(capsys, *words, "--rows", "sun")
+    assert "--rows" in error_of(capsys, "evaluate", REFERENCE, "--rows", "full", "-o", tmp_path)
     street = REFERENCE.parents[1] / "src/climatenerf/assets/street"
-    err = complaint(capsys, "evaluate", street, "--ablation", "-o", tmp_path / "out")
+    err = error_of(capsys, "evaluate", street, "--ablation", "-o", tmp_path / "out")
     assert "reference" in err and not (tmp_path / "out").exists()
-    err = complaint(capsys, *words[:-1], REFERENCE / "truth")
+    err = error_of(capsys, *words[:-1], REFERENCE / "truth")
     assert "lies in the reference set" in err
 
 
 def test_a_folder_without_a_run_is_refused(capsys, tmp_path):
-    err = complaint(capsys, "evaluate", tmp_path, "--reference", "-o", tmp_path / "out")
+    err = error_of(capsys, "evaluate", tmp_path, "--reference", "-o", tmp_path / "out")
     assert str(tmp_path) in err and not (tmp_path / "out").exists()
 
 
-def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
+def test_a_report_replaces_an_earlier_report_and_no_other_file(tmp_path):
     check_folder(tmp_path / "new" / "report", ["clean"])
-    assert not (tmp_path / "new" / "report").exists(), "nothing stays of a run that is stopped"
+    assert not (tmp_path / "new" / "report").exists(), "the check leaves no folder"
     other = tmp_path / "other"
     other.mkdir()
     (other / "clean.jpg").write_bytes(b"mine")
@@ -65,13 +65,13 @@ def test_a_report_replaces_a_report_and_nothing_else(tmp_path):
         check_folder(other, ["clean"])
     assert (other / "clean.jpg").read_bytes() == b"mine" and (other / "haze.jpg").exists()
     (other / "clean.jpg").unlink()
-    assert "haze.jpg" in check_folder(other, ["clean"]), "to be removed when the new one is there"
+    assert "haze.jpg" in check_folder(other, ["clean"]), "`write_report` deletes it"
     assert (other / "haze.jpg").exists()
 
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
-    """A short fit of the reference street in small steps with small grids."""
+    """Fit the reference street for 400 small steps with small grids."""
     from climatenerf.cli import fit as cli_fit
     from climatenerf.field.presets import PRESETS
     from climatenerf.training import run as run_module
@@ -92,7 +92,7 @@ def run_folder(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_whole_report(run_folder, tmp_path, capsys):
+def test_a_report_has_all_scores_and_pictures(run_folder, tmp_path, capsys):
     out = tmp_path / "report"
     names = ["smog-mid", "flood-low", "snow-deep"]
     words = ["evaluate", str(run_folder), "--reference", "-o", str(out), "--views", "t04"]
@@ -101,7 +101,7 @@ def test_the_whole_report(run_folder, tmp_path, capsys):
     assert "screen-reflection" in table and "report.md" in table
     report = json.loads((out / "report.json").read_text())
     assert report["scores"]["clean"] == report["clean"]
-    # Blurred as it is, the fit knows the street: better than grey, worse than the truth.
+    # The fit is blurred, but better than a grey picture.
     assert 12 < report["clean"]["psnr"] < 40 and 0 < report["clean"]["ssim"] < 1
     geometry = report["geometry"]
     assert 0 < geometry["depth_abs_rel"] < 0.6 and 0 < geometry["depth_rmse_m"] < 30
@@ -110,7 +110,7 @@ def test_the_whole_report(run_folder, tmp_path, capsys):
     assert 0.2 < report["labels"]["miou"] < 1
     assert set(report["weather"]) == set(names)
     for name in names:
-        # In the haze of so short a fit hardly any snow lies: 7 dB.
+        # So short a fit is hazy and holds little snow: 7 dB.
         assert 5 < report["weather"][name]["psnr"] < 40
         with Image.open(out / f"{name}.jpg") as picture:
             assert picture.width > 3 * 300
@@ -128,23 +128,23 @@ def test_the_whole_report(run_folder, tmp_path, capsys):
     assert warped["clean"]["next"] < warped["clean"]["far"]
     assert warped["baselines"]["frame-noise"]["smog"]["next"] > 1.5 * warped["smog"]["next"]
     assert np.isfinite(report["completeness"]["mirror_psnr"])
-    # A weather that there is none of is named.
-    assert "flood-low" in complaint(capsys, *words, "--weathers", "flod-low")
+    # The message names the unknown weather.
+    assert "flood-low" in error_of(capsys, *words, "--weathers", "flod-low")
 
 
 @pytest.mark.slow
-def test_a_run_of_another_place_is_refused(run_folder, tmp_path, capsys):
+def test_a_run_without_a_reference_set_is_refused(run_folder, tmp_path, capsys):
     other = tmp_path / "run"
     other.mkdir()
     for path in run_folder.iterdir():
         if path.is_file():
             (other / path.name).write_bytes(path.read_bytes())
-    told = json.loads((other / "scene.json").read_text())
-    place = tmp_path / "place"
-    (place / "images").mkdir(parents=True)
-    for view in told["views"]:
-        (place / view["path"]).write_bytes(b"")
-    told["root_absolute"], told["root"] = str(place), str(place)
-    (other / "scene.json").write_text(json.dumps(told))
-    err = complaint(capsys, "evaluate", other, "--reference", "-o", tmp_path / "out")
+    data = json.loads((other / "scene.json").read_text())
+    capture = tmp_path / "capture"
+    (capture / "images").mkdir(parents=True)
+    for view in data["views"]:
+        (capture / view["path"]).write_bytes(b"")
+    data["root_absolute"], data["root"] = str(capture), str(capture)
+    (other / "scene.json").write_text(json.dumps(data))
+    err = error_of(capsys, "evaluate", other, "--reference", "-o", tmp_path / "out")
     assert "no reference set" in err and not (tmp_path / "out").exists()

@@ -13,7 +13,7 @@ def photo():
 
 
 def slow_ssim(a, b):
-    """The formula of Wang et al. 2004, written with scipy's own windows, one channel at a time."""
+    """Compute SSIM (Wang et al. 2004) per channel with windows of scipy: a slow twin."""
     values = []
     for channel in range(a.shape[2]):
         x, y = a[..., channel], b[..., channel]
@@ -29,7 +29,7 @@ def slow_ssim(a, b):
     return np.mean(values)
 
 
-def test_psnr_known_values(photo):
+def test_psnr_of_known_errors(photo):
     assert psnr(photo, photo) == float("inf")
     grey = np.full((4, 5, 3), 0.5)
     assert psnr(grey, grey + 0.1) == pytest.approx(20.0)
@@ -56,14 +56,14 @@ def test_ssim_equals_the_slow_twin(photo):
     assert ssim(1 - photo, photo) < 0.3
 
 
-def test_colour_correction_undoes_any_affine_map_and_nothing_else(photo):
+def test_colour_correction_inverts_affine_maps_but_keeps_noise(photo):
     rng = np.random.default_rng(1)
     matrix = np.eye(3) + 0.2 * rng.normal(size=(3, 3))
     tinted = photo @ matrix + rng.normal(size=3) * 0.1
     assert psnr(tinted, photo) < 30
     assert psnr_cc(tinted, photo) > 200
     noisy = photo + 0.05 * rng.normal(size=photo.shape)
-    # Twelve parameters cannot explain noise.
+    # Twelve parameters cannot fit the noise.
     assert psnr(noisy, photo) - 0.01 <= psnr_cc(noisy, photo) < psnr(noisy, photo) + 1.0
     corrected = colour_corrected(photo, np.clip(3 * photo, 0, 1))
     assert corrected.min() >= 0 and corrected.max() <= 1

@@ -1,4 +1,4 @@
-"""Scores against the reference truth: known answers on scenes made by hand."""
+"""Scores against ground truth: known answers on analytic scenes."""
 
 import dataclasses
 import json
@@ -19,10 +19,10 @@ from climatenerf.evaluation.reference import Truth, read_reference, world_rays
 from climatenerf.scene import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
-ROAD, TERRAIN, LEAVES, SKY = 0, 9, 8, 10  # Cityscapes train ids
+ROAD, TERRAIN, VEGETATION, SKY = 0, 9, 8, 10  # Cityscapes train ids
 
 
-def looking_down(height=2.0, pitch=-25.0):
+def pitched_pose(height=2.0, pitch=-25.0):
     a = np.deg2rad(pitch)
     forward = np.array([0.0, np.cos(a), np.sin(a)])
     right = np.array([1.0, 0.0, 0.0])
@@ -33,7 +33,7 @@ def looking_down(height=2.0, pitch=-25.0):
 
 
 def sloped_ground(pose, rise=0.0, offset=0.0):
-    """Ray lengths to the plane z = offset + rise y."""
+    """Return the ray lengths to the plane z = offset + rise y."""
     rays = world_rays(CAMERA, pose).astype(float)
     fall = rays[..., 2] - rise * rays[..., 1]
     with np.errstate(divide="ignore"):
@@ -42,7 +42,7 @@ def sloped_ground(pose, rise=0.0, offset=0.0):
 
 
 def truth_of(rise=0.0, label=ROAD):
-    pose = looking_down()
+    pose = pitched_pose()
     depth = sloped_ground(pose, rise)
     normal = np.array([0.0, -rise, 1.0]) / np.hypot(1, rise)
     sky = np.isinf(depth)
@@ -59,7 +59,7 @@ def truth_of(rise=0.0, label=ROAD):
 
 
 class TwoLayers:
-    """Half of the light from 1 m, half from 5 m; or, for every other ray, next to nothing."""
+    """A field with equal weights at 1 m and 5 m on even rays, and low opacity on odd rays."""
 
     near = 0.1
 
@@ -70,13 +70,13 @@ class TwoLayers:
         return Samples(2 * torch.arange(n + 1), t, torch.ones_like(t), sigma.reshape(-1))
 
 
-def test_the_spread_of_depth_is_that_of_the_light():
+def test_depth_spread_is_the_relative_deviation_of_the_weights():
     found = depth_spread(TwoLayers(), CAMERA, np.eye(4)).numpy()
-    assert np.allclose(found[::2], 2 / 3, atol=1e-4)  # 3 m in the mean, 2 m off
+    assert np.allclose(found[::2], 2 / 3, atol=1e-4)  # mean 3 m, deviation 2 m
     assert np.isnan(found[1::2]).all()
 
 
-def test_depth_errors_are_those_put_in():
+def test_depth_scores_of_a_known_relative_error():
     truth = truth_of()
     found = geometry.depth_scores([1.1 * truth.depth], (truth,))
     assert found["depth_abs_rel"] == pytest.approx(0.1, rel=1e-4)
@@ -86,8 +86,8 @@ def test_depth_errors_are_those_put_in():
     assert geometry.depth_scores([nothing], (truth,))["depth_abs_rel"] == pytest.approx(1.0)
 
 
-def test_holes_in_the_ground_are_those_put_in():
-    truth, leaves = truth_of(), truth_of(label=LEAVES)
+def test_ground_holes_of_a_known_number_of_pixels():
+    truth, vegetation = truth_of(), truth_of(label=VEGETATION)
     ground = np.argwhere(truth.depth < geometry.MAX_DISTANCE)
     depth = 1.2 * truth.depth
     for row, column in ground[:30]:
@@ -96,44 +96,46 @@ def test_holes_in_the_ground_are_those_put_in():
     assert geometry.ground_holes([depth], (truth,)) == pytest.approx(31 / len(ground))
     lawn = truth_of(label=TERRAIN)
     assert geometry.ground_holes([depth], (lawn,)) == pytest.approx(31 / len(ground))
-    # Of two views, one of which has no ground.
-    both = geometry.ground_holes([depth, depth], (truth, leaves))
+    # A second view without ground changes nothing.
+    both = geometry.ground_holes([depth, depth], (truth, vegetation))
     assert both == pytest.approx(31 / len(ground))
-    assert geometry.ground_holes([depth], (leaves,)) == 0
+    assert geometry.ground_holes([depth], (vegetation,)) == 0
 
 
-def test_normals_turned_by_ten_degrees_are_ten_degrees_off():
+def test_normal_scores_of_a_known_rotation():
     truth = truth_of()
     a = np.deg2rad(10.0)
-    turn = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    found = geometry.normal_scores([truth.normal @ turn.T], (truth,))
+    rotation = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
+    found = geometry.normal_scores([truth.normal @ rotation.T], (truth,))
     assert found["normal_median_deg"] == pytest.approx(10.0, abs=1e-3)
     assert found["normal_ground_roof_median_deg"] == pytest.approx(10.0, abs=1e-3)
-    leaves = truth_of(label=LEAVES)
-    found = geometry.normal_scores([leaves.normal @ turn.T], (leaves,))
+    vegetation = truth_of(label=VEGETATION)
+    found = geometry.normal_scores([vegetation.normal @ rotation.T], (vegetation,))
     assert np.isnan(found["normal_median_deg"]) and found["normal_all_median_deg"] > 9
 
 
-def test_a_roof_is_what_of_a_building_looks_up():
+def test_upward_facing_building_surfaces_are_roofs():
     roof, wall = truth_of(rise=0.5, label=2), truth_of(label=2)
     assert geometry.ground_or_roof(roof)[~roof.sky].all()
     wall.normal[:] = [0.0, 0.0, -1.0]
     assert not geometry.ground_or_roof(wall).any()
-    assert not geometry.ground_or_roof(truth_of(label=LEAVES)).any()
+    assert not geometry.ground_or_roof(truth_of(label=VEGETATION)).any()
 
 
-def test_floaters_and_sky_are_counted_where_they_are():
+def test_floater_and_sky_scores_of_known_transmittances():
     truth = truth_of()
-    lost = np.where(truth.sky, 0.9, 0.25)
+    absorbed = np.where(truth.sky, 0.9, 0.25)
     passed = np.where(truth.sky, 1.0, 0.0)
     passed[0, :8] = 0.5
-    found = geometry.emptiness_scores([lost], [passed], (truth,))
+    found = geometry.emptiness_scores([absorbed], [passed], (truth,))
     assert found["floater_mass"] == pytest.approx(0.25)
     assert found["floaters_road"] == pytest.approx(0.25) and "floaters_terrain" not in found
     grown = dataclasses.replace(truth, label=truth.label.copy())
     half = np.arange(truth.label.shape[1])[None, :] < 32
-    grown.label[~truth.sky & half] = LEAVES
-    each = geometry.emptiness_scores([np.where(half, 0.5, 0.125) + 0 * lost], [passed], (grown,))
+    grown.label[~truth.sky & half] = VEGETATION
+    each = geometry.emptiness_scores(
+        [np.where(half, 0.5, 0.125) + 0 * absorbed], [passed], (grown,)
+    )
     assert each["floaters_vegetation"] == pytest.approx(0.5)
     assert each["floaters_road"] == pytest.approx(0.125)
     assert truth.sky[0, :8].all()
@@ -142,12 +144,12 @@ def test_floaters_and_sky_are_counted_where_they_are():
     assert (free[~truth.sky] < truth.depth[~truth.sky]).all() and np.isinf(free[truth.sky]).all()
 
 
-def test_clear_sky_has_sky_all_around():
+def test_clear_sky_excludes_pixels_beside_other_classes():
     truth = truth_of()
     truth.depth[:10] = np.inf
-    truth.depth[5, 5] = 3.0  # a leaf
+    truth.depth[5, 5] = 3.0  # one pixel of vegetation
     passed = np.ones(truth.depth.shape)
-    passed[4:7, 4:7] = passed[9] = 0.5  # what is beside it, and above the ground
+    passed[4:7, 4:7] = passed[9] = 0.5  # its neighbours, and those of the ground
     found = geometry.emptiness_scores([1 - passed], [passed], (truth,))
     assert found["clear_sky_empty_fraction"] == 1 > found["sky_empty_fraction"] + 0.05
     passed[2, :8] = 0.5
@@ -156,19 +158,19 @@ def test_clear_sky_has_sky_all_around():
     assert found["clear_sky_empty_fraction"] == pytest.approx(1 - 8 / clear)
 
 
-def test_floaters_are_told_off_edges_too():
+def test_clear_floater_mass_excludes_depth_edges():
     truth = truth_of()
     truth.depth[:] = 10.0
-    truth.depth[8:11, 8:11] = 4.0  # a leaf, and the ring of pixels about it
+    truth.depth[8:11, 8:11] = 4.0  # a nearer surface
     beside = np.zeros(truth.depth.shape, bool)
     beside[7:12, 7:12] = True
     beside[8:11, 8:11] = False
     assert np.array_equal(geometry.occluded_edges(truth), beside)
-    lost = np.where(beside, 1.0, 0.125)
-    found = geometry.emptiness_scores([lost], [1 - lost], (truth,))
+    absorbed = np.where(beside, 1.0, 0.125)
+    found = geometry.emptiness_scores([absorbed], [1 - absorbed], (truth,))
     assert found["clear_floater_mass"] == pytest.approx(0.125)
     assert found["floater_mass"] == pytest.approx(0.125 + 0.875 * beside.mean())
-    # A surface that recedes is its own neighbour, not an edge; nor is what the sky is behind.
+    # Neither a receding surface nor a surface before the sky is an occluded edge.
     truth.depth[:] = np.linspace(5, 9, truth.depth.shape[0])[:, None]
     truth.depth[:4] = np.inf
     assert not geometry.occluded_edges(truth)[4:].any()
@@ -180,7 +182,7 @@ def waterline(depth, level, truth, mask):
     )
 
 
-def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_distance():
+def test_waterline_scores_of_the_truth_and_of_a_known_displacement():
     truth = truth_of(rise=0.1)  # water at 0.3 m ends at y = 3
     from_eye = truth.points - truth.c2w[:3, 3]
     line, _ = weather_scores.crossings(from_eye, truth.points[..., 2] - 0.3)
@@ -190,18 +192,18 @@ def test_the_waterline_of_the_truth_itself_has_no_error_and_a_moved_one_its_dist
     right = waterline(truth.depth, 0.3, truth, wet)
     assert right["waterline_error_cm"] < 0.01 and right["waterline_error_px"] < 0.01
     assert right["waterline_height_error_cm"] < 2 and right["water_iou"] == 1.0
-    # 2 cm too high on a slope of one in ten: the line lies 20 cm further.
+    # On a slope of one in ten, 2 cm of height move the line by 20 cm.
     high = waterline(truth.depth, 0.32, truth, weather_scores.water_visible(truth, 0.32))
     assert high["waterline_error_cm"] == pytest.approx(20.0, rel=0.05)
     assert high["waterline_height_error_cm"] == pytest.approx(2.0, abs=0.5)
     assert 0.9 < high["water_iou"] < 1
-    # 10 m is said where there is no line of ours at all.
+    # A missing line counts as 10 m.
     none = waterline(truth.depth, -5.0, truth, np.zeros(wet.shape))
     assert none["waterline_error_cm"] == pytest.approx(1000.0) and none["water_iou"] == 0.0
 
 
-def test_a_shore_that_is_not_there_counts():
-    """A hump of ours in the middle of the water has a shore of its own."""
+def test_a_false_shore_increases_the_waterline_error():
+    """A false bump in the water adds a shore to the rendered line."""
     truth = truth_of(rise=0.1)
     hump = truth.depth.copy()
     hump[36:46, 10:54] *= 0.85
@@ -209,7 +211,7 @@ def test_a_shore_that_is_not_there_counts():
     assert found["waterline_error_cm"] > 1
 
 
-def test_snow_too_thin_by_two_centimetres_is_two_centimetres_off():
+def test_snow_scores_of_a_known_thickness_error():
     truth = truth_of()
     snowy = sloped_ground(truth.c2w, offset=0.15)
     real = {"depth": snowy, "thickness": np.where(truth.sky, 0.0, 0.15)}
@@ -226,7 +228,7 @@ def test_snow_too_thin_by_two_centimetres_is_two_centimetres_off():
     assert weather_scores.snow_scores([bare], (truth,), [real], 1 / 50)["snow_iou"] == 0.0
 
 
-def test_classes_unknown_to_the_field_are_wrong():
+def test_unknown_classes_count_as_wrong():
     truth = truth_of()
     right = geometry.MERGED[truth.label]
     found = geometry.label_scores([right], (truth,))
@@ -236,7 +238,7 @@ def test_classes_unknown_to_the_field_are_wrong():
     assert geometry.label_scores([half], (truth,))["iou_sky"] == 0.0
 
 
-def dry_view(rise=0.0):
+def analytic_view(rise=0.0):
     truth = truth_of(rise)
     red = np.linspace(0.1, 0.6, 64) * np.ones((48, 1))
     linear = np.stack([red, 0.3 * np.ones_like(red), 0.2 * np.ones_like(red)], -1)
@@ -245,22 +247,24 @@ def dry_view(rise=0.0):
     return CleanView(linear, truth.depth, normal, truth.rays_d, truth.c2w, CAMERA)
 
 
-def test_tuning_finds_the_constants_that_made_the_truth():
-    dry, colour = dry_view(), np.array([0.8, 0.7, 0.6])
-    foggy = to_display(baselines.depth_fog(dry, 0.1, colour))
-    found = baselines.tuned_sigma([dry], [np.round(255 * foggy).astype(np.uint8)], 0.05, colour)
+def test_tuning_recovers_the_constants_of_synthetic_truth():
+    view, colour = analytic_view(), np.array([0.8, 0.7, 0.6])
+    foggy = to_display(baselines.depth_fog(view, 0.1, colour))
+    found = baselines.tuned_sigma([view], [np.round(255 * foggy).astype(np.uint8)], 0.05, colour)
     assert found == pytest.approx(0.1, rel=0.1)
-    share = baselines.snow_coverage(dry)
-    assert share[~np.isinf(dry.depth)].min() > 0.99 and share[np.isinf(dry.depth)].max() < 1e-6
-    painted = to_display(baselines.overlay(dry.linear, share, colour))
+    coverage = baselines.snow_coverage(view)
+    assert (
+        coverage[~np.isinf(view.depth)].min() > 0.99 and coverage[np.isinf(view.depth)].max() < 1e-6
+    )
+    painted = to_display(baselines.overlay(view.linear, coverage, colour))
     true = [np.round(255 * painted).astype(np.uint8)]
-    white = baselines.tuned_colour([dry.linear * (1 - share[..., None])], [share], true)
+    white = baselines.tuned_colour([view.linear * (1 - coverage[..., None])], [coverage], true)
     np.testing.assert_allclose(white, colour, atol=0.01)
 
 
-def test_a_screen_reflects_what_it_shows_and_its_sky():
-    """A wall beyond water: rays that leave the water for the wall find its colour."""
-    pose = looking_down(1.5, 0.0)
+def test_screen_reflection_finds_visible_surfaces_and_the_sky():
+    """A wall behind water: reflected rays towards the wall get its colour, others the sky."""
+    pose = pitched_pose(1.5, 0.0)
     rays = world_rays(CAMERA, pose).astype(float)
     with np.errstate(divide="ignore"):
         ground = np.where(rays[..., 2] < 0, -1.5 / np.minimum(rays[..., 2], -1e-9), np.inf)
@@ -269,24 +273,24 @@ def test_a_screen_reflects_what_it_shows_and_its_sky():
     depth = np.where(high, np.inf, np.minimum(ground, wall))
     linear = np.where((wall < ground)[..., None], [0.7, 0.1, 0.1], [0.2, 0.2, 0.2])
     linear[high] = (0.1, 0.2, 0.9)
-    dry = CleanView(linear, depth, np.zeros_like(linear), rays, pose, CAMERA)
-    wet, t = baselines.wet_pixels(dry, 0.1)
+    view = CleanView(linear, depth, np.zeros_like(linear), rays, pose, CAMERA)
+    wet, t = baselines.wet_pixels(view, 0.1)
     assert wet.any() and (t[wet] < depth[wet]).all()
-    shown, part = baselines.screen_reflection(dry, 0.1, 1.333, np.zeros((48, 64, 2)))
+    radiance, reflectance = baselines.screen_reflection(view, 0.1, 1.333, np.zeros((48, 64, 2)))
     column = 32
     rows = np.flatnonzero(wet[:, column])
-    assert np.allclose(shown[rows[0], column], [0.7, 0.1, 0.1]), "just below the wall: the wall"
-    assert part[rows[0], column] > part[rows[-1], column], "more of it at grazing"
-    sky = [r for r in rows if np.allclose(shown[r, column], [0.1, 0.2, 0.9])]
-    assert sky and min(sky) > rows[0], "the sky above the wall mirrors nearer to the eye"
+    assert np.allclose(radiance[rows[0], column], [0.7, 0.1, 0.1]), "the wall"
+    assert reflectance[rows[0], column] > reflectance[rows[-1], column], "grazing angles"
+    sky = [r for r in rows if np.allclose(radiance[r, column], [0.1, 0.2, 0.9])]
+    assert sky and min(sky) > rows[0], "the reflected sky is nearer to the camera"
 
 
-def test_a_colour_is_tuned_for_what_is_displayed():
-    """No one colour stands for dark and bright: the best on the screen is darker than the mean."""
+def test_tuned_colour_minimises_the_error_of_display_values():
+    """For dark and bright pixels the best single display colour is darker than the linear mean."""
     rng = np.random.default_rng(1)
     true = [np.where(rng.uniform(size=(20, 20, 1)) < 0.3, 250, 40).astype(np.uint8).repeat(3, -1)]
-    base, share = [np.zeros((20, 20, 3))], [np.ones((20, 20))]
-    found = baselines.tuned_colour(base, share, true)
+    base, coverage = [np.zeros((20, 20, 3))], [np.ones((20, 20))]
+    found = baselines.tuned_colour(base, coverage, true)
 
     def error(colour):
         return ((to_display(colour) - true[0] / 255.0) ** 2).mean()
@@ -295,7 +299,7 @@ def test_a_colour_is_tuned_for_what_is_displayed():
     assert error(found) < 0.97 * error(mean)
 
 
-def test_the_air_of_the_truth_has_no_error():
+def test_transmittance_error_is_the_mean_absolute_difference():
     passed = np.linspace(0, 1, 12).reshape(3, 4)
     assert weather_scores.transmittance_scores([passed], [passed])["transmittance_error"] == 0
     off = weather_scores.transmittance_scores([passed], [np.clip(passed + 0.1, 0, 2)])
@@ -303,51 +307,51 @@ def test_the_air_of_the_truth_has_no_error():
 
 
 def frames_of(pattern, step=0.5):
-    """Two frames of a textured plane, taken `step` metres apart."""
+    """Return two frames of a textured plane from cameras `step` metres apart."""
     out = []
     for index in (0, 1):
-        pose = looking_down(3.0, -50.0)
+        pose = pitched_pose(3.0, -50.0)
         pose[1, 3] = index * step
         depth = sloped_ground(pose)
         rays = world_rays(CAMERA, pose).astype(float)
-        place = pose[:3, 3] + depth[..., None] * rays
-        out.append(Frame(pattern(place, index), depth, np.zeros(depth.shape, bool), pose, CAMERA))
+        points = pose[:3, 3] + depth[..., None] * rays
+        out.append(Frame(pattern(points, index), depth, np.zeros(depth.shape, bool), pose, CAMERA))
     return out
 
 
-def waves(place, _):
-    x, y = place[..., 0], place[..., 1]
+def smooth_pattern(points, _):
+    x, y = points[..., 0], points[..., 1]
     return np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.5 + 0 * x], -1)
 
 
-def test_frames_of_one_place_agree_and_noise_of_each_frame_does_not():
-    first, second = frames_of(waves)
+def test_warp_error_is_small_for_a_rigid_scene_and_large_for_frame_noise():
+    first, second = frames_of(smooth_pattern)
     assert warp_error(first, second) < 0.02
     assert warp_error(first, first) < 1e-6
-    noisy = frames_of(lambda place, i: baselines.frame_noise(waves(place, i), i))
+    noisy = frames_of(lambda x, i: baselines.frame_noise(smooth_pattern(x, i), i))
     assert warp_error(*noisy) > 5 * warp_error(first, second)
-    apart = Frame(
+    excluded = Frame(
         second.picture, second.depth, np.ones(second.depth.shape, bool), second.c2w, CAMERA
     )
-    assert np.isnan(warp_error(first, apart)), "all of it is water"
+    assert np.isnan(warp_error(first, excluded)), "all pixels are water"
 
 
-def test_hidden_places_are_not_compared():
-    first, second = frames_of(waves)
+def test_warp_error_ignores_hidden_points():
+    first, second = frames_of(smooth_pattern)
     blocked = Frame(
         np.zeros_like(second.picture), 0.5 * second.depth, second.excluded, second.c2w, CAMERA
     )
     assert np.isnan(warp_error(first, blocked))
 
 
-def test_bilinear_meets_pixel_centres():
+def test_bilinear_interpolation_is_exact_at_pixel_centres():
     picture = np.random.default_rng(0).uniform(size=(5, 7, 3))
     found = bilinear(picture, np.array([[2.5, 1.5], [3.0, 1.5]]))
     np.testing.assert_allclose(found[0], picture[1, 2])
     np.testing.assert_allclose(found[1], 0.5 * (picture[1, 2] + picture[1, 3]))
 
 
-def test_a_folder_that_is_no_reference_set_is_refused(tmp_path):
+def test_other_folders_are_refused_as_reference_sets(tmp_path):
     with pytest.raises(UserError, match="no reference set"):
         read_reference(tmp_path)
     (tmp_path / "reference.json").write_text(json.dumps({"schema_version": 1}))
@@ -355,13 +359,13 @@ def test_a_folder_that_is_no_reference_set_is_refused(tmp_path):
         read_reference(tmp_path)
 
 
-def test_open_ground_is_what_nothing_stands_over():
-    """Of level ground all is open; under a wall that another view shows, and beside it, none."""
+def test_open_ground_has_no_surface_above_it():
+    """All level ground is open, unless another view shows a surface above it."""
     ground = truth_of()
     found = geometry.open_ground((ground,))
     assert len(found) > 10
     middle = found.mean(0)
-    over = dataclasses.replace(ground, c2w=ground.c2w + np.outer([0, 0, 3.0, 0], [0, 0, 0, 1]))
-    # The same ground seen 3 m higher shelters all of the lower one, and is open itself.
-    both = geometry.open_ground((ground, over))
+    raised = dataclasses.replace(ground, c2w=ground.c2w + np.outer([0, 0, 3.0, 0], [0, 0, 0, 1]))
+    # The same ground 3 m higher covers all of the lower ground, and is open itself.
+    both = geometry.open_ground((ground, raised))
     assert len(both) and both[:, 2].min() > middle[2] + 1.5

@@ -29,20 +29,20 @@ def tiny(monkeypatch):
 
 
 def differences(one, other):
-    """Names of the settings and losses in which two differ."""
-    own = {
+    """Return the names of the settings and losses in which two differ."""
+    settings = {
         f.name for f in dataclasses.fields(FitSettings) if f.name != "losses"
         and getattr(one, f.name) != getattr(other, f.name)
     }  # fmt: skip
-    return own | {
+    return settings | {
         f.name
         for f in dataclasses.fields(Losses)
         if getattr(one.losses, f.name) != getattr(other.losses, f.name)
     }
 
 
-def test_slopes_are_the_density_s_at_the_surfaces_in_the_camera_s_axes():
-    """Matter about the plane x = 2: where the rays end, in the field's units; 0 in the sky."""
+def test_density_normals_are_taken_at_the_surfaces_in_camera_axes():
+    """The normals point away from the plane x = 2 on both sides; they are 0 in the sky."""
 
     class Slanted:
         def to_grid(self, x):
@@ -63,7 +63,7 @@ def test_slopes_are_the_density_s_at_the_surfaces_in_the_camera_s_axes():
         assert np.allclose(found, [[[0.0, -along, 0.0], [0.0, 0.0, 0.0]]]), found
 
 
-def test_each_row_leaves_out_just_what_it_says():
+def test_each_row_leaves_out_one_part():
     rows = ablation.rows(4.0)
     full = rows["full"]
     assert full == FitSettings(minutes=4.0)
@@ -89,16 +89,16 @@ def test_each_row_leaves_out_just_what_it_says():
     assert {row.samples_per_step for row in rows.values()} == {full.samples_per_step}
 
 
-def test_rows_are_chosen_by_name_in_the_table_s_order():
+def test_rows_are_selected_by_name_in_table_order():
     assert list(ablation.select_rows(4.0, ())) == list(ablation.rows(4.0))
-    some = ablation.select_rows(2.0, ("full", "plain NGP"))
-    assert list(some) == ["plain NGP", "full"] and some["full"] == FitSettings(minutes=2.0)
+    two = ablation.select_rows(2.0, ("full", "plain NGP"))
+    assert list(two) == ["plain NGP", "full"] and two["full"] == FitSettings(minutes=2.0)
     with pytest.raises(UserError, match="'no sun'; choose from: plain NGP, no appearance"):
         ablation.select_rows(4.0, ("full", "no sun"))
 
 
-def test_the_papers_weights_are_the_papers():
-    """Its print 3^{-4} and so on is 3e-4: the first public code has these."""
+def test_the_paper_preset_has_the_weights_of_the_paper():
+    """Where the paper prints 3^{-4}, the authors' first public code has 3e-4."""
     weights = PAPER.losses
     assert (weights.classes, weights.normals, weights.distortion) == (4e-2, 7e-4, 3e-4)
     assert (weights.sky, weights.opacity_entropy, PAPER.decay) == (1e-1, 2e-4, 0.0)
@@ -106,7 +106,7 @@ def test_the_papers_weights_are_the_papers():
     assert settings_of("gpu").preset == "gpu"
 
 
-def test_the_papers_heads_sit_on_its_appearance_grid():
+def test_the_paper_preset_has_surface_heads_on_the_appearance_grid():
     paper = PRESETS["paper"]
     assert paper.surface_levels == 0 and FieldSize().surface_levels > 0
     assert (paper.geometry_levels, paper.geometry_log2_rows) == (16, 19)
@@ -114,7 +114,7 @@ def test_the_papers_heads_sit_on_its_appearance_grid():
     assert PAPER.preset == "paper" and PAPER.opaque_sky
 
 
-def test_a_finished_row_is_kept_and_one_of_other_settings_refused(tmp_path):
+def test_finished_rows_are_kept_and_other_settings_refused(tmp_path):
     scene = make_scene(tmp_path / "toy")
     settings = FitSettings(minutes=None, steps=2, samples_per_step=2**12)
     run, steps = tmp_path / "run", []
@@ -128,7 +128,7 @@ def test_a_finished_row_is_kept_and_one_of_other_settings_refused(tmp_path):
             ablation.fit_row(scene, run, other, downscale, lambda state: None)
 
 
-def test_a_row_stopped_midway_is_finished_later(tmp_path):
+def test_an_interrupted_row_is_resumed(tmp_path):
     scene = make_scene(tmp_path / "toy")
     settings = FitSettings(minutes=None, steps=6, samples_per_step=2**12)
     run, steps = tmp_path / "run", []
@@ -144,14 +144,14 @@ def test_a_row_stopped_midway_is_finished_later(tmp_path):
     assert steps == [1, 2, 3, 4, 5, 6]
 
 
-def test_a_capture_without_truth_is_refused_before_any_fit(tmp_path):
+def test_a_capture_without_ground_truth_is_refused_before_any_fit(tmp_path):
     scene = make_scene(tmp_path / "toy")
     with pytest.raises(UserError, match="reference"):
         ablation.ablate(scene, tmp_path / "out", 1.0, 1, 1, print, print, ablation.rows(1.0))
     assert not (tmp_path / "out").exists()
 
 
-def test_the_table_has_means_and_half_the_range():
+def test_the_table_shows_means_and_half_ranges():
     data = {
         "minutes": 2.0,
         "downscale": 2,
@@ -162,7 +162,7 @@ def test_the_table_has_means_and_half_the_range():
     assert "| plain NGP | 20.5 ± 0.5 | - |" in text and "| full | 25 | - |" in text
 
 
-def test_pictures_of_depth_and_normals():
+def test_depth_and_normal_pictures_have_known_values():
     depth = np.array([[1.0, 4.0, np.inf]])
     assert ablation.depth_picture(depth)[0, :, 0].tolist() == [255, 128, 0]
     normal = np.array([[[0.0, 0.0, 1.0], [0.0, 0.0, 0.0]]])
@@ -188,8 +188,8 @@ def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
-    """Worse than docs/reference-scene.md has after 10 minutes, and better than what is broken."""
-    monkeypatch.undo()  # the preset that users have
+    """The bounds lie between the scores of docs/reference-scene.md and those of broken fits."""
+    monkeypatch.undo()  # the real preset
     monkeypatch.setattr(ablation, "WEATHERS", ())
     scene = read_scene(REFERENCE)
     settings = FitSettings(minutes=None, steps=700)
@@ -198,27 +198,27 @@ def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
     found, _ = ablation.score_row(run, settings, False)
     assert found["psnr"] > 24 and found["depth_abs_rel"] < 0.06 and found["miou"] > 0.85
     assert found["normal_ground_roof_median_deg"] < 8 and found["floater_mass"] < 0.12
-    # What is shown is far smoother than what the density alone would give.
+    # Predicted normals are much smoother than those of the density.
     assert found["normal_median_deg"] < 0.6 * found["slope_median_deg"]
     assert found["open_sky"] > 0.95 and found["sky_empty_fraction"] > 0.9
-    # Upwards all round, where reflections go: nothing is black.
+    # Reflections show the sky in all directions above the horizon; none may be black.
     photos = np.concatenate([truth.clean.reshape(-1, 3) for truth in run.reference.truths])
-    least = 0.25 * np.median(photos.mean(-1))
-    angle, up = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0.05, 1.0, 20))
+    darkest = 0.25 * np.median(photos.mean(-1))
+    azimuth, up = np.meshgrid(np.linspace(0, 2 * np.pi, 64), np.linspace(0.05, 1.0, 20))
     level = np.sqrt(1 - up**2)
-    d = np.stack([level * np.cos(angle), level * np.sin(angle), up], -1).reshape(-1, 3)
+    d = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], -1).reshape(-1, 3)
     sky = run.field.sky(torch.from_numpy(d.astype(np.float32)))
-    assert sky.mean(-1).min() > least
+    assert sky.mean(-1).min() > darkest
 
 
-def test_a_report_of_more_rows_is_not_replaced_by_one_of_fewer(tmp_path):
+def test_a_report_of_fewer_rows_does_not_replace_one_of_more(tmp_path):
     (tmp_path / ablation.FILE_NAME).write_text(json.dumps({"rows": {"full": [], "no sky": []}}))
     ablation.check_folder(tmp_path, REFERENCE, ("no sky", "full", "no depth"))
     with pytest.raises(UserError, match="more rows .no sky.; choose another folder"):
         ablation.check_folder(tmp_path, REFERENCE, ("full",))
 
 
-def test_what_cannot_be_measured_is_refused_before_the_first_fit(tmp_path, monkeypatch):
+def test_wrong_input_is_refused_before_the_first_fit(tmp_path, monkeypatch):
     monkeypatch.setattr(ablation, "fit_scene", lambda *_: pytest.fail("a fit began"))
     scene = read_scene(REFERENCE)
 
