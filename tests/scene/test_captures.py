@@ -1,4 +1,4 @@
-"""The four real captures; "up" comes from their README and is only checked against."""
+"""The four real captures, compared with the up directions and camera heights of their README."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def degrees(a, b):
 @pytest.mark.parametrize(
     ("name", "views", "size", "up", "tolerance", "height"),
     [
-        # Camera height in input units, from the README; ditch's is of what is seen nearby.
+        # Bounds of the camera height in input units.
         ("ditch", 48, (800, 450), (0, -0.99, -0.12), 7, (2.2, 4.2)),
         ("stone_sign", 83, (450, 800), (-0.11, -0.94, -0.31), 4, (1.6, 1.85)),
         ("kitti_drive", 54, (1000, 302), (0, 0, 1), 2, (1.55, 1.75)),
@@ -27,7 +27,7 @@ def test_colmap_captures(captures, name, views, size, up, tolerance, height):
     assert all(v.label_path is not None for v in scene.views)
     assert degrees(scene.world_from_input[2, :3], np.array(up)) < tolerance
     assert height[0] < 1.6 / scene.scale < height[1]
-    # Nearly all sparse points project into some picture in front of the camera.
+    # A view in the middle shows a good part of the sparse points.
     view, points = scene.views[views // 2], scene.points
     assert points is not None
     w2c = np.linalg.inv(view.c2w)
@@ -37,14 +37,14 @@ def test_colmap_captures(captures, name, views, size, up, tolerance, height):
     assert load_image(view, scene, 2).shape == (size[1] // 2, size[0] // 2, 3)
 
 
-def test_ditch_lowest_ground_is_the_bed(captures):
+def test_lowest_ground_of_ditch_is_its_bottom(captures):
     scene = read_scene(captures / "ditch")
     assert scene.lowest_ground_z < -1.5
     points = scene.points_world()
     assert points is not None and -5 < np.percentile(points[:, 2], 2) - scene.lowest_ground_z < 1
 
 
-def test_kitti_drive_as_metric_input(captures):
+def test_metric_input_of_kitti_drive(captures):
     scene = read_scene(captures / "kitti_drive", metric_input=True)
     np.testing.assert_array_equal(scene.world_from_input, np.eye(4))
     z = np.median([scene.c2w_world(v)[2, 3] for v in scene.views])
@@ -52,7 +52,7 @@ def test_kitti_drive_as_metric_input(captures):
     assert max(v for k, v in scene.up_report.items() if k != "used") < 3
 
 
-def test_fox(captures):
+def test_fox_capture(captures):
     scene = read_scene(captures / "fox")
     assert scene.source == "transforms" and len(scene.views) == 50
     assert any(w.startswith("17 of the 67") for w in scene.warnings)

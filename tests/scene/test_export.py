@@ -1,4 +1,4 @@
-"""What is written is read again by our readers, and by COLMAP itself."""
+"""Exported scenes are read by the readers of this package and by COLMAP."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,7 @@ def assert_same(views, cameras, scene):
             assert getattr(cameras[a.camera], name) == pytest.approx(value, rel=1e-9), name
 
 
-def test_transforms_are_read_again(scene):
+def test_transforms_round_trip(scene):
     export_transforms(scene, scene.root)
     again = read_transforms(scene.root)
     assert_same(again.views, again.cameras, scene)
@@ -59,7 +59,7 @@ def test_transforms_are_read_again(scene):
     assert read_scene(scene.root).views[0].name == "000.png"
 
 
-def test_colmap_text_is_read_again_with_its_tracks(scene):
+def test_colmap_round_trip_with_tracks(scene):
     export_colmap(scene, scene.root)
     again = read_colmap(scene.root)
     assert_same(again.views, again.cameras, scene)
@@ -68,7 +68,7 @@ def test_colmap_text_is_read_again_with_its_tracks(scene):
         np.testing.assert_array_equal(np.sort(a.seen), b.seen)
 
 
-def test_colmap_itself_reads_it_and_finds_the_points_where_they_are(scene):
+def test_pycolmap_reads_the_model_without_reprojection_error(scene):
     pycolmap = pytest.importorskip("pycolmap")
     views = tuple(replace(v, camera=0) for v in scene.views)
     model = export_colmap(replace(scene, views=views), scene.root)
@@ -80,7 +80,7 @@ def test_colmap_itself_reads_it_and_finds_the_points_where_they_are(scene):
     np.testing.assert_allclose(image.projection_center(), scene.views[3].c2w[:3, 3], atol=1e-9)
 
 
-def test_pictures_elsewhere_are_named_in_full_and_nothing_is_overwritten(scene, tmp_path):
+def test_paths_outside_the_folder_are_absolute_and_files_are_not_overwritten(scene, tmp_path):
     path = export_transforms(scene, tmp_path / "out")
     names = [f["file_path"] for f in json.loads(path.read_text())["frames"]]
     assert names[0] == str(scene.views[0].path)

@@ -1,4 +1,4 @@
-"""Numberings of classes: what comes out of `load_labels` are Cityscapes train ids."""
+"""Label spaces: `load_labels` returns Cityscapes train ids for each of them."""
 
 import json
 
@@ -12,15 +12,19 @@ from climatenerf.core.errors import UserError
 from climatenerf.scene import load_scene, read_scene, save_scene
 from climatenerf.scene.images import load_labels
 
-# By the data set's own table: id -> train id.
-OF_ID = {
+# From the table of the data set: id -> train id.
+TRAIN_FROM_CITYSCAPES = {
     0: 255, 6: 255, 7: 0, 8: 1, 9: 255, 10: 255, 11: 2, 12: 3, 13: 4, 14: 255, 17: 5, 18: 255,
     19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15, 29: 255, 30: 255,
     31: 16, 32: 17, 33: 18, 34: 2, 35: 4, 36: 255, 37: 5, 38: 255, 41: 255, 44: 255, 255: 255,
 }  # fmt: skip
-OF_SEVEN = {0: 0, 1: 2, 2: 8, 3: 9, 4: 10, 5: 11, 6: 13, 255: 255}
-OF_TRAIN = {**{i: i for i in range(19)}, 255: 255}
-SPACES = {"cityscapes-ids": OF_ID, "seven": OF_SEVEN, "cityscapes-train-ids": OF_TRAIN}
+TRAIN_FROM_SEVEN = {0: 0, 1: 2, 2: 8, 3: 9, 4: 10, 5: 11, 6: 13, 255: 255}
+TRAIN_FROM_TRAIN = {**{i: i for i in range(19)}, 255: 255}
+SPACES = {
+    "cityscapes-ids": TRAIN_FROM_CITYSCAPES,
+    "seven": TRAIN_FROM_SEVEN,
+    "cityscapes-train-ids": TRAIN_FROM_TRAIN,
+}
 
 
 def make(root, ids, points=()):
@@ -33,7 +37,7 @@ def make(root, ids, points=()):
 
 
 @pytest.mark.parametrize("space", SPACES)
-def test_every_space_comes_out_as_train_ids(tmp_path, space):
+def test_load_labels_converts_to_train_ids(tmp_path, space):
     values = make(tmp_path, SPACES[space])
     scene = read_scene(tmp_path, label_space=space)
     found = load_labels(scene.views[0], scene)
@@ -41,19 +45,19 @@ def test_every_space_comes_out_as_train_ids(tmp_path, space):
     np.testing.assert_array_equal(found, np.vectorize(SPACES[space].get)(values))
 
 
-def test_the_space_is_kept_with_the_scene(tmp_path):
-    values = make(tmp_path, OF_SEVEN)
+def test_label_space_is_saved_with_the_scene(tmp_path):
+    values = make(tmp_path, TRAIN_FROM_SEVEN)
     save_scene(read_scene(tmp_path, label_space="seven"), tmp_path / "scene")
     again = read_scene(tmp_path / "scene")
     assert load_scene(tmp_path / "scene").label_space == again.label_space == "seven"
     found = load_labels(again.views[0], again)
-    np.testing.assert_array_equal(found, np.vectorize(OF_SEVEN.get)(values))
+    np.testing.assert_array_equal(found, np.vectorize(TRAIN_FROM_SEVEN.get)(values))
     assert read_scene(tmp_path / "scene", metric_input=True).label_space == "seven"
     assert read_scene(tmp_path / "scene", camera_height=2.0).label_space == "seven"
     assert read_scene(tmp_path / "scene", label_space="cityscapes-ids").label_space != "seven"
 
 
-def test_a_new_scale_and_a_new_space_together(tmp_path):
+def test_camera_height_and_label_space_together(tmp_path):
     x, y = np.mgrid[-6:6:40j, -6:6:40j]
     ground = np.stack([x, y, 0.01 * np.sin(9 * x + 7 * y)], axis=-1).reshape(-1, 3)
     make(tmp_path, [7], ground)
@@ -64,8 +68,8 @@ def test_a_new_scale_and_a_new_space_together(tmp_path):
     assert scene.label_space == "cityscapes-ids"
 
 
-def test_scenes_of_before_still_load(tmp_path):
-    make(tmp_path, OF_TRAIN)
+def test_scene_file_without_label_space_has_train_ids(tmp_path):
+    make(tmp_path, TRAIN_FROM_TRAIN)
     path = save_scene(read_scene(tmp_path), tmp_path / "scene")
     data = json.loads(path.read_text())
     assert data.pop("label_space") == "cityscapes-train-ids"
@@ -79,17 +83,17 @@ def test_scenes_of_before_still_load(tmp_path):
 @pytest.mark.parametrize(
     ("space", "bad"), [("cityscapes-train-ids", 26), ("seven", 7), ("cityscapes-ids", 45)]
 )
-def test_ids_that_cannot_be(tmp_path, space, bad):
+def test_undefined_ids_raise(tmp_path, space, bad):
     make(tmp_path, [0, 1, bad])
     scene = read_scene(tmp_path, label_space=space)
-    with pytest.raises(UserError, match=rf"000\.png hold the id {bad}, which {space} does not"):
+    with pytest.raises(UserError, match=rf"000\.png contain the id {bad}, which {space} does not"):
         load_labels(scene.views[0], scene)
 
 
-def test_a_wrong_space_is_refused_on_the_command_line(tmp_path, capsys):
+def test_command_line_rejects_unknown_label_space_and_stray_frames(tmp_path, capsys):
     make(tmp_path, [0])
-    words = ["fit", str(tmp_path), "-o", str(tmp_path / "run")]
-    assert main([*words, "--label-space", "coco"]) == 2
+    command = ["fit", str(tmp_path), "-o", str(tmp_path / "run")]
+    assert main([*command, "--label-space", "coco"]) == 2
     assert '--label-space is "coco"; choose one of' in " ".join(capsys.readouterr().err.split())
-    assert main([*words, "--frames", "3:9"]) == 2
+    assert main([*command, "--frames", "3:9"]) == 2
     assert "frames of a KITTI-360 drive" in " ".join(capsys.readouterr().err.split())

@@ -11,7 +11,7 @@ from climatenerf.scene.images import (
     downscaled_camera,
     load_depth,
     load_relative_depth,
-    picture_header,
+    read_header,
 )
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
@@ -30,7 +30,7 @@ def save(tmp_path, image: Image.Image, name="a.png", **options):
 RGB = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
 
 
-def test_rgb_is_untouched(tmp_path):
+def test_rgb_is_unchanged(tmp_path):
     np.testing.assert_array_equal(load_image(*save(tmp_path, Image.fromarray(RGB))), RGB)
 
 
@@ -39,7 +39,7 @@ def test_grey_becomes_rgb(tmp_path):
     np.testing.assert_array_equal(values, np.repeat(RGB[..., :1], 3, axis=-1))
 
 
-def test_16_bit_grey(tmp_path):
+def test_16_bit_grey_is_reduced_to_8_bits(tmp_path):
     deep = RGB[..., 0].astype(np.uint16) * 257
     values = load_image(*save(tmp_path, Image.fromarray(deep)))
     np.testing.assert_array_equal(values[..., 1], RGB[..., 0])
@@ -54,30 +54,30 @@ def test_alpha_is_dropped_not_composited(tmp_path):
     alpha = np.zeros((24, 32, 1), dtype=np.uint8)
     view, scene = save(tmp_path, Image.fromarray(np.concatenate([RGB, alpha], axis=-1)))
     np.testing.assert_array_equal(load_image(view, scene), RGB)
-    assert picture_header(view.path).alpha
+    assert read_header(view.path).alpha
 
 
-def test_palette(tmp_path):
+def test_palette_becomes_rgb(tmp_path):
     image = Image.fromarray(RGB).quantize(16)
     values = load_image(*save(tmp_path, image))
     np.testing.assert_array_equal(values, np.asarray(image.convert("RGB")))
 
 
-def test_downscale_averages_light(tmp_path):
-    # Half the pixels white: half the light is sRGB 188, not 128.
+def test_downscale_averages_linear_light(tmp_path):
+    # Half of the linear light is sRGB 188, not 128.
     checks = ((np.indices((24, 32)).sum(axis=0) % 2) * 255).astype(np.uint8)
     values = load_image(*save(tmp_path, Image.fromarray(checks)), 2)
     assert values.shape == (12, 16, 3) and (values == 188).all()
 
 
-def test_downscale_keeps_flat_colours_and_cuts_the_rest(tmp_path):
-    for level in (0, 1, 7, 128, 255):
-        view, scene = save(tmp_path, Image.new("L", (32, 24), level))
+def test_downscale_keeps_uniform_colours_and_crops_the_rest(tmp_path):
+    for value in (0, 1, 7, 128, 255):
+        view, scene = save(tmp_path, Image.new("L", (32, 24), value))
         values = load_image(view, scene, 5)
-        assert values.shape == (4, 6, 3) and (values == level).all()
+        assert values.shape == (4, 6, 3) and (values == value).all()
 
 
-def test_downscaled_camera_sees_the_same_rays():
+def test_downscaled_camera_has_the_same_rays():
     small = downscaled_camera(CAMERA, 5)
     assert (small.width, small.height) == (6, 4)
     full, coarse = CAMERA.directions(), small.directions()
@@ -93,14 +93,14 @@ def exif(orientation):
     return tags
 
 
-def test_exif_orientation_is_ignored_when_poses_fit_the_stored_size(tmp_path):
+def test_exif_orientation_is_ignored_if_the_stored_size_fits(tmp_path):
     for orientation in (3, 6, 8):
         view, scene = save(tmp_path, Image.fromarray(RGB), exif=exif(orientation))
         np.testing.assert_array_equal(load_image(view, scene), RGB)
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
-def test_exif_orientation_is_used_when_only_it_fits(tmp_path, orientation):
+def test_exif_orientation_is_applied_if_only_the_rotated_size_fits(tmp_path, orientation):
     from PIL import ImageOps
 
     camera = Camera(24, 32, 30.0, 30.0, 12.0, 16.0)
@@ -112,12 +112,12 @@ def test_exif_orientation_is_used_when_only_it_fits(tmp_path, orientation):
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_where_the_shown_top_is(tmp_path, orientation):
+def test_up_direction_of_the_displayed_image(tmp_path, orientation):
     from PIL import ImageOps
 
-    # A gradient that brightens towards `up_in_picture` is brightest at the top once shown.
+    # A gradient along `up_direction` is brightest at the top of the displayed image.
     view, _ = save(tmp_path, Image.fromarray(RGB), exif=exif(orientation))
-    x, y = picture_header(view.path).up_in_picture(CAMERA)
+    x, y = read_header(view.path).up_direction(CAMERA)
     rows, columns = np.mgrid[:24, :32]
     ramp = Image.fromarray((100 + 3 * (x * columns + y * rows)).astype(np.uint8))
     ramp.getexif()[0x0112] = orientation
@@ -125,13 +125,13 @@ def test_where_the_shown_top_is(tmp_path, orientation):
     assert (np.diff(shown, axis=0) < 0).all() and (np.diff(shown, axis=1) == 0).all()
 
 
-def test_wrong_size(tmp_path):
+def test_wrong_image_size_raises(tmp_path):
     view, scene = save(tmp_path, Image.new("RGB", (10, 10)))
     with pytest.raises(UserError, match="10x10"):
         load_image(view, scene)
 
 
-def test_relative_depth_is_found_by_either_name(tmp_path):
+def test_relative_depth_is_found_with_and_without_the_image_suffix(tmp_path):
     view, scene = save(tmp_path, Image.fromarray(RGB))
     other, _ = save(tmp_path, Image.fromarray(RGB), "a.jpg")
     assert load_relative_depth(view, scene) is None
@@ -145,7 +145,7 @@ def test_relative_depth_is_found_by_either_name(tmp_path):
     assert (load_relative_depth(other, scene) == 3).all()
 
 
-def test_relative_depth_of_the_unturned_photo_is_refused(tmp_path):
+def test_relative_depth_of_another_shape_raises(tmp_path):
     view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
     path = tmp_path / "depth_relative" / "a.npz"
     path.parent.mkdir()
@@ -154,13 +154,13 @@ def test_relative_depth_of_the_unturned_photo_is_refused(tmp_path):
         load_relative_depth(view, scene)
 
 
-def test_relative_depth_that_cannot_be_used_is_one_sentence(tmp_path):
+def test_unusable_relative_depth_raises(tmp_path):
     view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
     path = tmp_path / "depth_relative" / "a.npz"
     path.parent.mkdir()
     with path.open("wb") as file:
-        np.save(file, np.ones((24, 32)))  # an NPY by another name
-    for spoil in (
+        np.save(file, np.ones((24, 32)))  # an NPY file named .npz
+    for damage in (
         lambda: None,
         lambda: np.savez(path, x=np.ones((2, 24, 32))),
         lambda: np.savez(path, x=np.ones((24, 32), complex)),
@@ -168,13 +168,13 @@ def test_relative_depth_that_cannot_be_used_is_one_sentence(tmp_path):
         lambda: np.savez(path),
         lambda: path.write_bytes(b"PK junk"),
     ):
-        spoil()
+        damage()
         with pytest.raises(UserError, match="relative depth") as caught:
             load_relative_depth(view, scene)
         assert "pickle" not in str(caught.value)
 
 
-def test_measured_depth_serves_as_relative_depth_unless_there_is_such(tmp_path):
+def test_relative_depth_falls_back_to_the_depth_file(tmp_path):
     view, scene = save(tmp_path, Image.fromarray(RGB))
     z = np.full((24, 32), 4.0, np.float32)
     z[:, 16:] = 2.0
@@ -193,7 +193,7 @@ def test_measured_depth_serves_as_relative_depth_unless_there_is_such(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_measured_depth_by_another_name_is_one_sentence(tmp_path, suffix):
+def test_depth_file_with_the_wrong_suffix_raises(tmp_path, suffix):
     view, scene = save(tmp_path, Image.new("RGB", (32, 24)))
     path = tmp_path / f"a{suffix}"
     with path.open("wb") as file:

@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 from dataclasses import replace
@@ -9,7 +10,6 @@ from support.scene_builders import names_of, ring, write_colmap, write_images
 
 from climatenerf.core.errors import UserError
 from climatenerf.scene import load_scene, read_scene, save_scene
-from climatenerf.scene import scene as scene_module
 from climatenerf.scene.readers.ply import read_points, write_points
 
 POINTS = np.random.default_rng(1).normal(size=(50, 3))
@@ -24,7 +24,7 @@ def scene(tmp_path):
     return read_scene(root)
 
 
-def test_round_trip(scene, tmp_path):
+def test_scene_round_trip(scene, tmp_path):
     path = save_scene(scene, tmp_path / "run")
     again = load_scene(tmp_path / "run")
     assert path.name == "scene.json" and load_scene(path).root == scene.root
@@ -39,7 +39,7 @@ def test_round_trip(scene, tmp_path):
     assert again.up_report == scene.up_report and again.warnings == scene.warnings
 
 
-def test_the_points_that_each_view_shows_are_kept(scene, tmp_path):
+def test_observations_round_trip_and_can_be_deleted(scene, tmp_path):
     rng = np.random.default_rng(0)
     seen = [np.sort(rng.choice(50, size=i, replace=False)) for i in range(9)]
     views = tuple(replace(v, seen=s) for v, s in zip(scene.views, seen, strict=True))
@@ -56,21 +56,21 @@ def test_the_points_that_each_view_shows_are_kept(scene, tmp_path):
     file.write_bytes(b"")
     with pytest.raises(UserError, match="delete it"):
         load_scene(tmp_path / "run")
-    file.unlink()  # the advice is followed
+    file.unlink()  # as the message advises
     assert load_scene(tmp_path / "run").views[3].seen is None
-    unknown = tuple(replace(v, seen=None) for v in scene.views)
-    save_scene(replace(scene, views=unknown), tmp_path / "run")
+    unobserved = tuple(replace(v, seen=None) for v in scene.views)
+    save_scene(replace(scene, views=unobserved), tmp_path / "run")
     assert not file.exists() and load_scene(tmp_path / "run").views[0].seen is None
 
 
-def test_paths_are_relative(scene, tmp_path):
+def test_saved_paths_are_relative(scene, tmp_path):
     save_scene(scene, tmp_path / "run")
     data = json.loads((tmp_path / "run/scene.json").read_text())
     assert data["views"][0]["path"] == "images/000.png"
     assert data["root"] == os.path.join("..", "capture") and data["schema_version"] == 1
 
 
-def test_both_folders_moved_together(scene, tmp_path):
+def test_scene_loads_after_both_folders_moved(scene, tmp_path):
     save_scene(scene, tmp_path / "run")
     (tmp_path / "new").mkdir()
     for name in ("run", "capture"):
@@ -78,7 +78,7 @@ def test_both_folders_moved_together(scene, tmp_path):
     assert load_scene(tmp_path / "new/run").views[0].path.is_file()
 
 
-def test_run_folder_moved_alone(scene, tmp_path):
+def test_scene_loads_after_the_run_folder_moved(scene, tmp_path):
     save_scene(scene, tmp_path / "run")
     (tmp_path / "a/b").mkdir(parents=True)
     (tmp_path / "run").rename(tmp_path / "a/b/run")
@@ -93,11 +93,11 @@ def test_world_poses_are_rigid_and_in_metres(scene):
         np.testing.assert_allclose(pose[:, 3], expected, atol=1e-12)
 
 
-def test_newer_schema_names_both_versions(scene, tmp_path):
+def test_newer_schema_raises_with_both_versions(scene, tmp_path):
     path = save_scene(scene, tmp_path / "run")
     data = json.loads(path.read_text())
     path.write_text(json.dumps({**data, "schema_version": 7}))
-    with pytest.raises(UserError, match=r"version 7 .* up to 1"):
+    with pytest.raises(UserError, match=r"version 7.* up to 1"):
         load_scene(tmp_path / "run")
 
 
@@ -115,7 +115,7 @@ def test_newer_schema_names_both_versions(scene, tmp_path):
         lambda d: d["cameras"][0].update(zoom=3),
     ],
 )
-def test_damaged_file(scene, tmp_path, change):
+def test_damaged_scene_file_raises(scene, tmp_path, change):
     path = save_scene(scene, tmp_path / "run")
     data = json.loads(path.read_text())
     change(data)
@@ -124,26 +124,26 @@ def test_damaged_file(scene, tmp_path, change):
         load_scene(tmp_path / "run")
 
 
-def test_no_file_and_no_json(tmp_path):
-    with pytest.raises(UserError, match=r"no scene\.json"):
+def test_missing_and_malformed_scene_files_raise(tmp_path):
+    with pytest.raises(UserError, match=r"scene\.json does not exist"):
         load_scene(tmp_path)
     (tmp_path / "scene.json").write_text("{")
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="not valid JSON"):
         load_scene(tmp_path)
     (tmp_path / "scene.json").write_text("[1]")
-    with pytest.raises(UserError, match="no schema_version"):
+    with pytest.raises(UserError, match="JSON object"):
         load_scene(tmp_path)
 
 
-def test_full_disk_harms_nothing(scene, tmp_path, monkeypatch):
+def test_full_disk_leaves_the_saved_scene_intact(scene, tmp_path, monkeypatch):
     path = save_scene(scene, tmp_path / "run")
     before = path.read_bytes()
 
-    def full(self, *args, **kwargs):
-        raise OSError(28, "No space left on device")
+    def full(self, data):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(scene_module.Path, "write_text", full)
-    with pytest.raises(UserError, match="No space left"):
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(UserError, match="disk is full"):
         save_scene(replace(scene, ground_z=5.0), tmp_path / "run")
     assert path.read_bytes() == before
     assert sorted(p.name for p in (tmp_path / "run").iterdir()) == [
@@ -153,13 +153,13 @@ def test_full_disk_harms_nothing(scene, tmp_path, monkeypatch):
     ]
 
 
-def test_folder_that_cannot_be_made(scene, tmp_path):
+def test_folder_that_cannot_be_created_raises(scene, tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(UserError, match="cannot be made"):
+    with pytest.raises(UserError, match="cannot create"):
         save_scene(scene, tmp_path / "file" / "run")
 
 
-def test_ply_ascii_and_big_endian(tmp_path):
+def test_ply_in_ascii_and_big_endian(tmp_path):
     head = "element vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
     head += "property uchar red\nelement face 0\nproperty list uchar int vertex_indices\n"
     a = tmp_path / "a.ply"
@@ -174,7 +174,7 @@ def test_ply_ascii_and_big_endian(tmp_path):
         read_points(a)
 
 
-def test_ply_garbage(tmp_path):
+def test_invalid_ply_raises(tmp_path):
     path = Path(tmp_path / "x.ply")
     path.write_bytes(b"hello")
     with pytest.raises(UserError, match=r"x\.ply"):

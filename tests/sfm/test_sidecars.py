@@ -193,7 +193,7 @@ def test_files_that_cannot_be_used(scene, tmp_path):
         with pytest.raises(UserError, match="cannot be read"):
             brought(scene, "depth", folder)
     np.save(folder / "A.npy", np.zeros((3, 4, 5)))
-    with pytest.raises(UserError, match="no picture of numbers"):
+    with pytest.raises(UserError, match="not an array of numbers"):
         brought(scene, "depth", folder)
     (folder / "A.npy").unlink()
     Image.new("L", (160, 120)).save(folder / "A.png")

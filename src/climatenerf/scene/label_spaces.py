@@ -1,4 +1,4 @@
-"""Numberings of semantic classes, and the way from each to Cityscapes train ids.
+"""Numberings of semantic classes, and their mapping to Cityscapes train ids.
 
 Train ids: 0 road, 1 sidewalk, 2 building, 3 wall, 4 fence, 5 pole, 6 traffic light, 7 traffic sign,
 8 vegetation, 9 terrain, 10 sky, 11 person, 12 rider, 13 car, 14 truck, 15 bus, 16 train,
@@ -20,46 +20,46 @@ CITYSCAPES_IDS = "cityscapes-ids"
 SEVEN = "seven"
 
 UNKNOWN = 255
-_ABSENT = -1
-_TRAIN_OF_TRAIN = {i: i for i in range(19)}
-# Cityscapes' own ids, then KITTI-360's garage, gate and small pole. Not listed: what neither
-# Cityscapes nor KITTI-360 gives a train id (static, parking, rail track, bridge, caravan, trailer,
-# stop, lamp, trash bin, vending machine, box, ...).
-_TRAIN_OF_ID = {
+_UNDEFINED = -1
+_TRAIN_FROM_TRAIN = {i: i for i in range(19)}
+# Cityscapes ids, then the KITTI-360 ids of garage, gate and small pole. Classes that neither data
+# set assigns a train id are absent (static, parking, rail track, bridge, caravan, trailer, stop,
+# lamp, trash bin, vending machine, box, ...) and become unknown.
+_TRAIN_FROM_CITYSCAPES = {
     7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12,
     26: 13, 27: 14, 28: 15, 31: 16, 32: 17, 33: 18, 34: 2, 35: 4, 37: 5,
 }  # fmt: skip
-# Road, building, vegetation, terrain, sky, person, vehicle: each stands for several classes, and
-# its most frequent one stands for it here.
-_TRAIN_OF_SEVEN = {0: 0, 1: 2, 2: 8, 3: 9, 4: 10, 5: 11, 6: 13}
+# Road, building, vegetation, terrain, sky, person, vehicle. Each merges several train ids and maps
+# to the most frequent one.
+_TRAIN_FROM_SEVEN = {0: 0, 1: 2, 2: 8, 3: 9, 4: 10, 5: 11, 6: 13}
 
 
-def _table(train_of: Mapping[int, int], count: int) -> Int16[np.ndarray, " 256"]:
-    """Train id of each of 256 numbers; those from `count` to 254 mean nothing."""
-    table = np.full(256, _ABSENT, dtype=np.int16)
+def _table(train_ids: Mapping[int, int], count: int) -> Int16[np.ndarray, " 256"]:
+    """Return the train id of each 8-bit id; ids from `count` to 254 are undefined."""
+    table = np.full(256, _UNDEFINED, dtype=np.int16)
     table[:count] = UNKNOWN
     table[UNKNOWN] = UNKNOWN
-    table[list(train_of)] = list(train_of.values())
+    table[list(train_ids)] = list(train_ids.values())
     return table
 
 
 _TABLES = {
-    TRAIN_IDS: _table(_TRAIN_OF_TRAIN, 19),
-    CITYSCAPES_IDS: _table(_TRAIN_OF_ID, 45),
-    SEVEN: _table(_TRAIN_OF_SEVEN, 7),
+    TRAIN_IDS: _table(_TRAIN_FROM_TRAIN, 19),
+    CITYSCAPES_IDS: _table(_TRAIN_FROM_CITYSCAPES, 45),
+    SEVEN: _table(_TRAIN_FROM_SEVEN, 7),
 }
 LABEL_SPACES = tuple(_TABLES)
 
 
 def checked_label_space(name: str, where: str) -> str:
-    """The name itself if there is such a label space.
+    """Return the name if it is a known label space.
 
     Args:
-        name: What a file or the user says.
-        where: Who says it, for the message.
+        name: Name from a file or the command line.
+        where: Origin of the name, for the message.
 
     Raises:
-        UserError: There is none of this name.
+        UserError: No label space has this name.
     """
     if name not in _TABLES:
         raise UserError(f'{where} is "{name}"; choose one of {", ".join(LABEL_SPACES)}.')
@@ -69,20 +69,21 @@ def checked_label_space(name: str, where: str) -> str:
 def to_train_ids(
     labels: UInt8[np.ndarray, "h w"], space: str, path: Path
 ) -> UInt8[np.ndarray, "h w"]:
-    """Labels of one space as Cityscapes train ids, 255 where unknown.
+    """Convert labels to Cityscapes train ids, 255 where unknown.
 
     Args:
-        labels: Ids as the file has them.
+        labels: Class ids as stored in the file.
         space: One of `LABEL_SPACES`.
         path: The file, for the message.
 
     Raises:
-        UserError: An id that the space does not have.
+        UserError: An id is undefined in the label space.
     """
-    train = _TABLES[space][labels]
-    if (train == _ABSENT).any():
+    train_ids = _TABLES[space][labels]
+    undefined = train_ids == _UNDEFINED
+    if undefined.any():
         raise UserError(
-            f"The labels {path} hold the id {labels[train == _ABSENT].max()}, which {space} does"
-            f" not have; say with --label-space which of {', '.join(LABEL_SPACES)} they are in."
+            f"The labels {path} contain the id {labels[undefined].max()}, which {space} does not"
+            f" define; set --label-space to one of {', '.join(LABEL_SPACES)}."
         )
-    return train.astype(np.uint8)
+    return train_ids.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""One entry for all captures: find the format, check the pictures, split, level."""
+"""Read a capture of any supported format: detect the format, check the images, align the world."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.scene.alignment.scale import rescale_by_camera_height
-from climatenerf.scene.alignment.up import level
-from climatenerf.scene.images import Header, picture_header
+from climatenerf.scene.alignment.world_frame import align_scene
+from climatenerf.scene.images import Header, read_header
 from climatenerf.scene.label_spaces import checked_label_space
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.colmap import model_folders, read_colmap
@@ -24,7 +24,8 @@ from climatenerf.scene.readers.transforms_json import read_transforms, transform
 from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_split
 
 HOLDOUT_EVERY = 8
-MINIMUM_IMAGES = 3
+MIN_IMAGES = 3
+MAX_ROUND_TRIP = 0.5  # pixels: error of inverting the lens distortion that is worth a warning
 _SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 
@@ -38,25 +39,26 @@ def read_scene(
     frames: str | tuple[int, int] | None = None,
     label_space: str | None = None,
 ) -> Scene:
-    """Read a capture of any supported format and level it.
+    """Read a capture of any supported format and align it to a metric, z-up world.
 
     Args:
-        path: A folder (own scene, `transforms.json`, COLMAP, Tanks and Temples, KITTI-360,
+        path: A folder (`scene.json`, `transforms.json`, COLMAP, Tanks and Temples, KITTI-360,
             Mega-NeRF) or a `.json` file.
-        holdout: None for the capture's own split or else every 8th picture by sorted name
-            (first, ninth, ...); "0" for none; or names separated by commas.
+        holdout: None for the capture's predefined split, or every 8th image by sorted name (first,
+            ninth, ...) if it has none; "0" for none; or names separated by commas.
         camera_height: Height of the cameras above the ground, metres, which sets the scale.
-        metric_input: The poses are in metres with z up already; they are kept as they are.
-        gravity: Down in the camera's axes by picture name, where the cameras told.
+        metric_input: The poses are in metres with z up already and are kept unchanged.
+        gravity: Direction of gravity in camera axes, unit vector, by image name, where the
+            camera's accelerometer recorded it.
         frames: First and last frame of a KITTI-360 drive, both included, as a pair or "1538:1601".
-        label_space: What the numbers in the label files mean, one of `LABEL_SPACES`; None for what
-            the capture says.
+        label_space: Numbering of the ids in the label files, one of `LABEL_SPACES`; None for the
+            numbering that the format prescribes.
 
     Returns:
-        The scene; `warnings` has what the user should know.
+        The scene; `warnings` holds sentences for the user.
 
     Raises:
-        UserError: Anything about the input that the user can mend, in one sentence.
+        UserError: The input cannot be used; the message names the cause and the remedy.
     """
     path = Path(path).absolute()
     if not path.exists():
@@ -67,53 +69,63 @@ def read_scene(
         raise UserError("Give either the camera height or metric input, not both.")
     if label_space is not None:
         checked_label_space(label_space, "--label-space")
-    relevel = camera_height is not None or metric_input
+    saved = None
     if (path / FILE_NAME).is_file() or path.name == FILE_NAME:
-        scene = load_scene(path)
-        where = str(path)
-        cameras = tuple(checked_camera(c, where) for c in scene.cameras)
-        poses = [checked_pose(v.c2w, v.name, where) for v in scene.views]
-        views = tuple(replace(v, c2w=c) for v, c in zip(scene.views, poses, strict=True))
-        capture = Capture(scene.root, scene.source, cameras, views, scene.points, own_split=True)
-        space = label_space or scene.label_space
+        saved = load_scene(path)
+        capture = _capture_from_scene(saved, path)
     else:
-        scene, capture = None, _read_foreign(path, None if frames is None else parse_frames(frames))
-        space = label_space or capture.label_space
-    if frames is not None and (scene is not None or capture.source != "kitti360"):
+        capture = _read_capture(path, None if frames is None else parse_frames(frames))
+    if frames is not None and (saved is not None or capture.source != "kitti360"):
         raise UserError(
-            f"--frames picks frames of a KITTI-360 drive, which {path} is not; omit it."
+            f"--frames selects frames of a KITTI-360 drive, which {path} is not; omit it."
         )
-    capture = _check_images(capture)
-    views = _find_extras(capture)
-    capture = replace(capture, warnings=(*capture.warnings, *_unmatched(capture.root, views)))
-    views = _split(views, capture.own_split, holdout, capture.root)
-    kept = () if scene is None else tuple(dict.fromkeys((*scene.warnings, *capture.warnings)))
-    if scene is not None and not relevel:
-        return replace(
-            scene, cameras=capture.cameras, views=views, warnings=kept, label_space=space
-        )
-    if scene is not None and camera_height is not None:
-        # Up and place are known already, maybe from what the pictures no longer tell.
-        changed = {"cameras": capture.cameras, "views": views, "label_space": space}
-        known = replace(scene, warnings=kept, **changed)
-        scaled = rescale_by_camera_height(known, camera_height)
-        if scaled is not None:
-            return scaled
+    capture = _find_sidecars(_check_images(capture))
     scene = Scene(
         root=capture.root,
         source=capture.source,
         cameras=capture.cameras,
-        views=views,
+        views=_split(capture.views, capture.predefined_split, holdout, capture.root),
         points=capture.points,
         warnings=capture.warnings,
-        label_space=space,
+        label_space=label_space or capture.label_space,
     )
-    # A height that the user gives is believed more than the data set.
+    if saved is not None and not metric_input:
+        # Keep the saved alignment: it may rest on GPS or gravity, which the images lack.
+        aligned = replace(
+            saved,
+            cameras=scene.cameras,
+            views=scene.views,
+            warnings=tuple(dict.fromkeys((*saved.warnings, *scene.warnings))),
+            label_space=scene.label_space,
+        )
+        if camera_height is None:
+            return aligned
+        if (rescaled := rescale_by_camera_height(aligned, camera_height)) is not None:
+            return rescaled
+    # An explicit camera height takes precedence over the scale of a metric format.
     metric_input |= capture.metric and camera_height is None
-    return level(scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity)
+    return align_scene(
+        scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity
+    )
 
 
-def _read_foreign(path: Path, frames: tuple[int, int] | None) -> Capture:
+def _capture_from_scene(scene: Scene, path: Path) -> Capture:
+    """Return a saved scene as a capture, with its cameras and poses checked."""
+    cameras = tuple(checked_camera(c, str(path)) for c in scene.cameras)
+    views = tuple(replace(v, c2w=checked_pose(v.c2w, v.name, str(path))) for v in scene.views)
+    return Capture(
+        scene.root,
+        scene.source,
+        cameras,
+        views,
+        scene.points,
+        predefined_split=True,
+        label_space=scene.label_space,
+    )
+
+
+def _read_capture(path: Path, frames: tuple[int, int] | None) -> Capture:
+    """Detect the format and read it; `scene.json` is handled before."""
     if path.is_file() and path.suffix.lower() != ".json":
         raise UserError(f"{path} is not a folder or a .json file; give the folder of a capture.")
     if transforms_files(path):
@@ -126,95 +138,90 @@ def _read_foreign(path: Path, frames: tuple[int, int] | None) -> Capture:
         return read_kitti360(path, frames)
     if is_mega_nerf(path):
         return read_mega_nerf(path)
-    pictures = [p for p in (path, path / "images") if p.is_dir() and _has_pictures(p)]
-    if not pictures:
+    if not any(p.is_dir() and _has_images(p) for p in (path, path / "images")):
         raise UserError(
-            f"{path} holds no pictures and no poses; give a folder with images/ and sparse/0/ "
+            f"{path} contains neither images nor poses; give a folder with images/ and sparse/0/ "
             "(COLMAP), a transforms.json, or one of the data sets in docs/formats.md."
         )
     raise UserError(
-        f"{path} holds pictures but no poses in a known layout (scene.json, transforms.json, "
+        f"{path} contains images but no poses in a supported layout (scene.json, transforms.json, "
         "sparse/0/cameras.bin); run COLMAP on it first."
     )
 
 
-def _holds_files(folder: Path) -> bool:
-    return any(p.suffix.lower() in {*_SUFFIXES, ".npz", ".npy"} for p in folder.rglob("*"))
-
-
-def _has_pictures(folder: Path) -> bool:
+def _has_images(folder: Path) -> bool:
     return any(p.suffix.lower() in _SUFFIXES for p in folder.iterdir())
 
 
 def _check_images(capture: Capture) -> Capture:
-    """Leave out missing pictures, compare sizes with the cameras, sort by name."""
+    """Leave out missing images, fit the cameras to the image sizes, and sort views by name."""
     warnings = list(capture.warnings)
     present = [v for v in capture.views if v.path.is_file()]
     missing = len(capture.views) - len(present)
-    if len(present) < MINIMUM_IMAGES:
-        where = capture.views[0].path.parent if capture.views else capture.root
+    if len(present) < MIN_IMAGES:
+        folder = capture.views[0].path.parent if capture.views else capture.root
         raise UserError(
-            f"Only {len(present)} of the {len(capture.views)} pictures that the poses name are in "
-            f"{where}; at least {MINIMUM_IMAGES} are needed, so restore them or correct the names."
+            f"Only {len(present)} of the {len(capture.views)} images with poses exist in {folder}; "
+            f"at least {MIN_IMAGES} are needed, so restore them or correct the names."
         )
     if missing:
         first = next(v.name for v in capture.views if not v.path.is_file())
         warnings.append(
-            f"{missing} of the {len(capture.views)} pictures that the poses name are not on disk "
+            f"{missing} of the {len(capture.views)} images with poses are not on disk "
             f"(first: {first}); they are left out."
         )
     present.sort(key=lambda v: v.name)
     for a, b in zip(present, present[1:], strict=False):
         if a.name == b.name:
-            raise UserError(f"The poses name the picture {a.name} twice; remove one of them.")
+            raise UserError(f"The image {a.name} has two poses; remove one of them.")
     cameras: dict[Camera, int] = {}
     views, scaled, transparent = [], 0, 0
     for view in present:
         camera = capture.cameras[view.camera]
-        header = picture_header(view.path)
-        fitting = _fit_camera(view, camera, header)
-        scaled += fitting != camera
+        header = read_header(view.path)
+        fitted = _fit_camera(view, camera, header)
+        scaled += fitted != camera
         transparent += header.alpha
-        views.append(replace(view, camera=cameras.setdefault(fitting, len(cameras))))
+        views.append(replace(view, camera=cameras.setdefault(fitted, len(cameras))))
     if scaled:
         warnings.append(
-            f"{scaled} pictures have another size than the poses say, with the same shape; their "
+            f"{scaled} images differ in size from their cameras but have the same shape; their "
             "intrinsics are scaled."
         )
     if transparent:
         warnings.append(
-            f"{transparent} pictures have an alpha channel, which is ignored; give masks for what "
-            "is to be left out."
+            f"{transparent} images have an alpha channel, which is ignored; use masks to exclude "
+            "pixels."
         )
     for camera in cameras:
-        worst = _round_trip(camera)
-        if worst > 0.5:
+        error = _round_trip_error(camera)
+        if error > MAX_ROUND_TRIP:
             warnings.append(
-                f"The lens distortion of a {camera.width}x{camera.height} camera cannot be undone "
-                f"everywhere (off by {worst:.1f} px near the border); undistort the pictures if "
-                "the border matters."
+                f"The lens distortion of a {camera.width}x{camera.height} camera cannot be "
+                f"inverted everywhere (error {error:.1f} px near the border); undistort the images "
+                "if the border matters."
             )
     return replace(capture, cameras=tuple(cameras), views=tuple(views), warnings=tuple(warnings))
 
 
 def _fit_camera(view: View, camera: Camera, header: Header) -> Camera:
-    """The camera scaled to the picture's real size."""
+    """Return the camera scaled to the size of the image on disk."""
     width, height = header.width, header.height
     if (width, height) == (camera.width, camera.height) or header.rotates_to_fit(camera):
         return camera
     sx, sy = width / camera.width, height / camera.height
-    # Down-scalers round each side to a whole pixel, by up to one in the smaller picture.
-    slack = 1.0 / min(camera.width, camera.height, width, height)
-    if abs(sx / sy - 1) > max(0.005, 1.5 * slack):
+    # Downscaling rounds each side to a whole pixel, by up to one in the smaller image.
+    pixel = 1.0 / min(camera.width, camera.height, width, height)
+    if abs(sx / sy - 1) > max(0.005, 1.5 * pixel):
         raise UserError(
-            f"The picture {view.path} has {width}x{height} pixels but its camera {camera.width}x"
-            f"{camera.height}, another shape; use the pictures that were posed."
+            f"The image {view.path} has {width}x{height} pixels but its camera {camera.width}x"
+            f"{camera.height}, another shape; use the images for which the poses were computed."
         )
     return camera.resized(width, height)
 
 
-def _round_trip(camera: Camera) -> float:
-    """Largest error, pixels, of pixel -> ray -> pixel over a coarse net that reaches the border."""
+def _round_trip_error(camera: Camera) -> float:
+    """Return the largest error, pixels, of pixel -> ray -> pixel on a coarse grid of the image."""
     x = np.linspace(0.5, camera.width - 0.5, 17)
     y = np.linspace(0.5, camera.height - 0.5, 17)
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
@@ -222,71 +229,74 @@ def _round_trip(camera: Camera) -> float:
     return float(np.nan_to_num(np.abs(error), nan=np.inf).max())
 
 
-def _find_extras(capture: Capture) -> tuple[View, ...]:
-    """Views with `labels/`, `masks/` and `depth/` files where they exist.
+def _find_sidecars(capture: Capture) -> Capture:
+    """Attach the files of `labels/`, `masks/` and `depth/` to their views.
 
-    They are called `NAME.png` or `NAME.jpg.png`; depths may be `.npz` and `.npy` too.
+    A sidecar is named `NAME.png` or `NAME.jpg.png`; depths may also be `.npz` or `.npy`. Incomplete
+    folders give a warning.
     """
-
-    def find(folder: str, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
-        if Path(view.name).is_absolute():  # joined to a folder it would be the photo itself
-            return None
-        base = capture.root / folder / view.name
-        for suffix in suffixes:
-            for candidate in (base.with_suffix(suffix), Path(f"{base}{suffix}")):
-                if candidate.is_file():
-                    return candidate
-        return None
-
-    out = []
+    views = []
     for view in capture.views:
-        label = view.label_path or find("labels", view)
-        mask = view.mask_path or find("masks", view)
-        depth = view.depth_path or find("depth", view, (".npz", ".npy", ".png"))
+        label = view.label_path or _sidecar(capture.root / "labels", view)
+        mask = view.mask_path or _sidecar(capture.root / "masks", view)
+        depth = view.depth_path or _sidecar(capture.root / "depth", view, (".npz", ".npy", ".png"))
         if mask is not None and not mask.is_file():
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
-        out.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
-    return tuple(out)
+        views.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
+    warnings = (*capture.warnings, *_sidecar_warnings(capture.root, views))
+    return replace(capture, views=tuple(views), warnings=warnings)
 
 
-def _unmatched(root: Path, views: tuple[View, ...]) -> list[str]:
-    """Warns of folders whose files belong to some of the photos only, or to none."""
+def _sidecar(folder: Path, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
+    if Path(view.name).is_absolute():  # joining it to `folder` would give the photo itself
+        return None
+    base = folder / view.name
+    candidates = [p for s in suffixes for p in (base.with_suffix(s), Path(f"{base}{s}"))]
+    return next((p for p in candidates if p.is_file()), None)
+
+
+def _sidecar_warnings(root: Path, views: Sequence[View]) -> list[str]:
+    """Return a warning for each sidecar folder that does not cover all views."""
     out = []
-    for folder, paths, kinds in (
+    for name, paths, formats in (
         ("labels", [v.label_path for v in views], "PNG"),
         ("masks", [v.mask_path for v in views], "PNG"),
         ("depth", [v.depth_path for v in views], "NPZ, NPY or PNG"),
     ):
-        own = sum(path is not None for path in paths)
-        if own < len(views) and (root / folder).is_dir() and _holds_files(root / folder):
+        count, folder = sum(path is not None for path in paths), root / name
+        if count == len(views) or not folder.is_dir():
+            continue
+        suffixes = {*_SUFFIXES, ".npz", ".npy"}
+        if any(p.suffix.lower() in suffixes for p in folder.rglob("*")):
             out.append(
-                f"{own} of {len(views)} pictures have {folder}, though there is a folder {folder}/;"
-                f" a file that counts is called like its picture, and is {kinds}."
+                f"Only {count} of {len(views)} images have a file in {name}/; name each file after "
+                f"its image and store it as {formats}."
             )
     return out
 
 
 def _split(
-    views: tuple[View, ...], own_split: bool, holdout: str | None, root: Path
+    views: tuple[View, ...], predefined: bool, holdout: str | None, root: Path
 ) -> tuple[View, ...]:
-    if holdout is None and own_split and any(v.split == "train" for v in views):
+    """Return the views with their split set; `holdout` as for `read_scene`."""
+    if holdout is None and predefined and any(v.split == "train" for v in views):
         heldout = {v.name for v in views if v.split != "train"}
     elif holdout is None:
         heldout = {v.name for v in views[::HOLDOUT_EVERY]}
     elif holdout.strip() == "0":
         heldout = set()
     else:
-        heldout = _named(views, [n.strip() for n in holdout.split(",") if n.strip()], root)
-    left = len(views) - len(heldout)
-    if left == 0:
-        raise UserError("All pictures are held out, so none is left to fit; hold out fewer.")
-    if left == 1:
-        raise UserError("One picture alone, which tells no depth, is left to fit; hold out fewer.")
+        heldout = _match_names(views, [n.strip() for n in holdout.split(",") if n.strip()], root)
+    remaining = len(views) - len(heldout)
+    if remaining == 0:
+        raise UserError("All images are held out, so none is left to fit; hold out fewer.")
+    if remaining == 1:
+        raise UserError("Only one image is left to fit, which gives no depth; hold out fewer.")
     return with_split(Scene(root, "", (), views), heldout).views
 
 
-def _named(views: tuple[View, ...], names: list[str], root: Path) -> set[str]:
-    """The views that the names mean: the full name, its last part, or that without extension."""
+def _match_names(views: tuple[View, ...], names: list[str], root: Path) -> set[str]:
+    """Return the names of the views given by full name, file name or stem."""
     found: set[str] = set()
     unknown = []
     for name in names:
@@ -297,7 +307,7 @@ def _named(views: tuple[View, ...], names: list[str], root: Path) -> set[str]:
     if unknown or not names:
         listed = ", ".join(unknown) or "no name at all"
         raise UserError(
-            f"--holdout names pictures that {root} has no pose for: {listed}; give names such as "
+            f"--holdout names images that have no pose in {root}: {listed}; give names such as "
             f"{views[0].name}, or 0 for none."
         )
     return found

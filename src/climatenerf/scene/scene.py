@@ -1,4 +1,8 @@
-"""A posed capture: cameras, views, sparse points and the way from its frame to metres with z up."""
+"""A posed capture: cameras, views, sparse points and the transform to a metric, z-up world.
+
+Frames: *camera* (OpenCV axes: x right, y down, z forward), *input* (the frame and unit of the pose
+files) and *world* (metres, z up). `Scene.world_from_input` maps the second to the third.
+"""
 
 from __future__ import annotations
 
@@ -16,30 +20,31 @@ from jaxtyping import Float, Int
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.storage import atomic_path
+from climatenerf.core.storage import atomic_path, check_schema, make_folder, read_json, write_bytes
 from climatenerf.scene.label_spaces import TRAIN_IDS, checked_label_space
 from climatenerf.scene.readers.ply import read_points, write_points
 
 SCHEMA_VERSION = 1
 FILE_NAME = "scene.json"
 POINTS_NAME = "points.ply"
-SEEN_NAME = "points_seen.npz"
+OBSERVATIONS_NAME = "points_seen.npz"
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph and where it was taken.
+    """One photograph with its pose.
 
     Attributes:
-        name: The picture's name as the poses give it, e.g. "0001.jpg".
-        path: Absolute path of the picture.
+        name: Image name as the pose files give it, e.g. "0001.jpg".
+        path: Absolute path of the image.
         camera: Index into `Scene.cameras`.
-        c2w: Camera-to-input-frame pose, 4x4, OpenCV axes, orthonormal rotation, input units.
-        split: "train", or "heldout" for measuring only.
-        label_path: 8-bit picture of ids in the scene's label space, if there is one.
-        mask_path: Picture whose black pixels are to be ignored, if there is one.
-        depth_path: Z-depths, as `images.load_depth` reads them, if there are any.
-        seen: Which of the scene's sparse points the picture shows, if that is known.
+        c2w: Camera-to-input pose, 4x4: orthonormal rotation, position in input units.
+        split: "train", or "heldout" for evaluation only.
+        label_path: 8-bit image of class ids in the scene's label space, or None.
+        mask_path: Image whose black pixels are ignored, or None.
+        depth_path: Z-depth file as `images.load_depth` reads it, or None.
+        seen: Row indices into `Scene.points` of the points observed in the image, or None if the
+            capture has no such record.
     """
 
     name: str
@@ -55,26 +60,27 @@ class View:
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture together with up, scale and ground.
+    """A capture with its up direction, scale and ground height.
 
     Attributes:
         root: Absolute folder of the capture.
-        source: Name of the reader that read it.
+        source: Name of the format it was read from.
         cameras: Intrinsics, shared by the views.
         views: Photographs, sorted by name.
         points: Sparse points in the input frame, or None.
         world_from_input: Similarity from the input frame to the world (metres, z up).
-        scale_source: Where the scale comes from: "gps", "known-length", "camera-height",
+        scale_source: Evidence that sets the scale: "gps", "known-length", "camera-height",
             "metric-input" or "camera-height-assumed".
-        scale_error: Relative error of the scale, 0.3 for 30 %.
-        scale_report: What other evidence of scale says; see `scale.py`.
-        georeference: The origin's latitude and longitude, degrees, and how well GPS fits; empty
-            without GPS. Then x is east and y north.
-        ground_z: Height of the ground datum, metres: the median ground under the camera path.
-        lowest_ground_z: Height of the lowest ground, metres.
-        up_report: How up was found: "used", then the degrees between it and each other method.
+        scale_error: Relative standard error of the scale, 0.3 for 30 %.
+        scale_report: Scale according to the other evidence; see `alignment/scale.py`.
+        georeference: Latitude and longitude of the origin, degrees, number of photos used and
+            spread of their GPS positions, m. Empty without GPS; otherwise x is east and y north.
+        ground_z: Height of the ground datum, m: median ground height under the camera path.
+        lowest_ground_z: Height of the lowest ground near the camera path, m.
+        up_report: Under "used" the methods that determine up; under each method's name its angle
+            to the result, degrees.
         warnings: Sentences for the user.
-        label_space: What the numbers in the label files mean; see `label_spaces.py`.
+        label_space: Numbering of the class ids in the label files; see `label_spaces.py`.
     """
 
     root: Path
@@ -95,42 +101,51 @@ class Scene:
 
     @property
     def scale(self) -> float:
-        """Metres in one input unit."""
+        """Metres per input unit."""
         return float(np.cbrt(np.linalg.det(self.world_from_input[:3, :3])))
 
     def c2w_world(self, view: View) -> Float[np.ndarray, "4 4"]:
-        """The view's camera-to-world pose: orthonormal rotation, position in metres."""
+        """Return the view's camera-to-world pose: orthonormal rotation, position in metres."""
         pose = self.world_from_input @ view.c2w
         pose[:3, :3] /= self.scale
         return pose
 
     def points_world(self) -> Float[np.ndarray, "n 3"] | None:
-        """The sparse points in metres, or None."""
+        """Return the sparse points in the world frame, metres, or None if there are none."""
         if self.points is None:
             return None
         return self.points @ self.world_from_input[:3, :3].T + self.world_from_input[:3, 3]
 
     def of_split(self, split: str) -> tuple[View, ...]:
-        """The views of one split, in order."""
+        """Return the views of one split, sorted by name."""
         return tuple(v for v in self.views if v.split == split)
 
 
-def save_scene(scene: Scene, folder: Path | str) -> Path:
-    """Write `scene.json` (and `points.ply` beside it) and return its path.
+def with_split(scene: Scene, heldout: set[str]) -> Scene:
+    """Return the scene with exactly the named views held out."""
+    views = tuple(
+        replace(v, split="heldout" if v.name in heldout else "train") for v in scene.views
+    )
+    return replace(scene, views=views)
 
-    Picture paths are stored relative to the capture's folder, and that folder both relative to
-    `folder` and absolutely, so that either may be moved together with the other or alone.
+
+def save_scene(scene: Scene, folder: Path | str) -> Path:
+    """Write `scene.json`, and the sparse points beside it, atomically.
+
+    Image paths are stored relative to the capture's folder. That folder is stored both relative to
+    `folder` and absolute, so both folders can be moved together, and `folder` can be moved alone.
+
+    Returns:
+        Path of `scene.json`.
+
+    Raises:
+        UserError: The folder or a file cannot be written.
     """
-    folder = Path(folder).absolute()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(
-            f"The folder {folder} cannot be made ({error.strerror}); choose another one."
-        ) from None
+    folder = make_folder(Path(folder).absolute())
     if scene.points is not None:
         write_points(folder / POINTS_NAME, scene.points)
-        _save_seen(scene, folder / SEEN_NAME)
+        _save_observations(scene, folder / OBSERVATIONS_NAME)
+    has_observations = (folder / OBSERVATIONS_NAME).is_file()
     data = {
         "schema_version": SCHEMA_VERSION,
         "source": scene.source,
@@ -141,7 +156,7 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "cameras": [asdict(c) for c in scene.cameras],
         "views": [_view_to_json(v, scene.root) for v in scene.views],
         "points": None if scene.points is None else POINTS_NAME,
-        "points_seen": SEEN_NAME if (folder / SEEN_NAME).is_file() else None,
+        "points_seen": OBSERVATIONS_NAME if has_observations else None,
         "world_from_input": scene.world_from_input.tolist(),
         "scale_source": scene.scale_source,
         "scale_error": scene.scale_error,
@@ -153,35 +168,24 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "warnings": list(scene.warnings),
     }
     target = folder / FILE_NAME
-    _write_atomically(target, json.dumps(data, indent=1))
+    write_bytes(target, json.dumps(data, indent=1).encode())
     return target
 
 
 def load_scene(folder: Path | str) -> Scene:
-    """Read what `save_scene` wrote; the pictures themselves need not be there.
+    """Read a scene that `save_scene` wrote; the images themselves may be absent.
+
+    Args:
+        folder: Folder that holds `scene.json`, or the file itself.
 
     Raises:
-        UserError: There is no such file, it is damaged, or a newer version wrote it.
+        UserError: The file is absent or damaged, or a newer version wrote it.
     """
     path = Path(folder).absolute()
     if path.is_dir():
         path = path / FILE_NAME
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"There is no {FILE_NAME} in {path.parent}; give a scene folder.") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(
-            f"{path} cannot be read ({error}); read the capture again to make a new one."
-        ) from None
-    version = data.get("schema_version") if isinstance(data, dict) else None
-    if not isinstance(version, int):
-        raise UserError(f"{path} has no schema_version, so it is not a scene of climatenerf.")
-    if version > SCHEMA_VERSION:
-        raise UserError(
-            f"{path} has schema version {version} but this climatenerf reads up to "
-            f"{SCHEMA_VERSION}; update climatenerf or read the capture again."
-        )
+    data = read_json(path, "scene")
+    check_schema(data.get("schema_version"), SCHEMA_VERSION, f"scene {path}")
     try:
         return _scene_from_json(data, path.parent)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -213,32 +217,16 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
     root = Path(os.path.normpath(folder / data["root"]))
     if not (root / data["views"][0]["path"]).is_file() and "root_absolute" in data:
         root = Path(data["root_absolute"])
-
-    def absolute(path: str | None) -> Path | None:
-        return None if path is None else root / path
-
     cameras = tuple(_camera(c) for c in data["cameras"])
-    views = tuple(
-        View(
-            name=_text(v["name"]),
-            path=root / v["path"],
-            camera=int(v["camera"]),
-            c2w=_matrix(v["c2w"]),
-            split=v["split"],
-            label_path=absolute(v["label_path"]),
-            mask_path=absolute(v["mask_path"]),
-            depth_path=absolute(v.get("depth_path")),
-        )
-        for v in data["views"]
-    )
+    views = tuple(_view_from_json(v, root) for v in data["views"])
     if any(not 0 <= v.camera < len(cameras) for v in views):
         raise ValueError("a view names a camera that is not listed")
     if any(v.split not in ("train", "heldout") for v in views):
         raise ValueError("a view's split is neither train nor heldout")
     points = None if data["points"] is None else read_points(folder / data["points"])
-    seen = data.get("points_seen")
-    if points is not None and seen and (folder / seen).exists():
-        views = _with_seen(views, len(points), folder / seen)
+    observations = data.get("points_seen")
+    if points is not None and observations and (folder / observations).exists():
+        views = _with_observations(views, len(points), folder / observations)
     return Scene(
         root=root,
         source=_text(data["source"]),
@@ -249,8 +237,8 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
         scale_source=_text(data["scale_source"]),
         scale_error=_number(data["scale_error"]),
         scale_report={
-            _text(name): {key: _number(value) for key, value in said.items()}
-            for name, said in data.get("scale_report", {}).items()
+            _text(name): {key: _number(value) for key, value in entry.items()}
+            for name, entry in data.get("scale_report", {}).items()
         },
         georeference={k: _number(v) for k, v in data.get("georeference", {}).items()},
         ground_z=_number(data["ground_z"]),
@@ -263,8 +251,24 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
     )
 
 
-def _save_seen(scene: Scene, path: Path) -> None:
-    """Pairs of view and point, as two arrays; nothing if no view knows its points."""
+def _view_from_json(data: dict[str, Any], root: Path) -> View:
+    def absolute(path: str | None) -> Path | None:
+        return None if path is None else root / path
+
+    return View(
+        name=_text(data["name"]),
+        path=root / data["path"],
+        camera=int(data["camera"]),
+        c2w=_matrix(data["c2w"]),
+        split=data["split"],
+        label_path=absolute(data["label_path"]),
+        mask_path=absolute(data["mask_path"]),
+        depth_path=absolute(data.get("depth_path")),
+    )
+
+
+def _save_observations(scene: Scene, path: Path) -> None:
+    """Write (view, point) index pairs as two int32 arrays, or remove the file if there are none."""
     seen = [v.seen if v.seen is not None else np.empty(0, np.int64) for v in scene.views]
     if not any(map(len, seen)):
         path.unlink(missing_ok=True)
@@ -276,17 +280,20 @@ def _save_seen(scene: Scene, path: Path) -> None:
         )
 
 
-def _with_seen(views: tuple[View, ...], points: int, path: Path) -> tuple[View, ...]:
-    """The views with the points that each shows, as `_save_seen` wrote them."""
+def _with_observations(views: tuple[View, ...], points: int, path: Path) -> tuple[View, ...]:
+    """Return the views with `seen` set from a file that `_save_observations` wrote."""
     try:
         with np.load(path) as data:
             view, point = data["view"].astype(np.int64), data["point"].astype(np.int64)
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(
-            f"{path} cannot be read ({error}); delete it to go on without it."
+            f"{path} cannot be read ({error}); delete it to load the scene without observations."
         ) from None
     if view.shape != point.shape or (point < 0).any() or (point >= points).any():
-        raise UserError(f"{path} names points that there are none of; delete it to go on.")
+        raise UserError(
+            f"{path} refers to points that do not exist; delete it to load the scene without"
+            " observations."
+        )
     return tuple(replace(v, seen=point[view == i]) for i, v in enumerate(views))
 
 
@@ -306,7 +313,7 @@ def _camera(data: dict[str, Any]) -> Camera:
 
 def _text(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError(f"{value!r} should be a text")
+        raise ValueError(f"{value!r} is not a string")
     return value
 
 
@@ -315,24 +322,3 @@ def _number(value: Any) -> float:
     if not math.isfinite(number):
         raise ValueError("a number is not finite")
     return number
-
-
-def with_split(scene: Scene, heldout: set[str]) -> Scene:
-    """The scene with exactly the named views held out."""
-    views = tuple(
-        replace(v, split="heldout" if v.name in heldout else "train") for v in scene.views
-    )
-    return replace(scene, views=views)
-
-
-def _write_atomically(target: Path, text: str) -> None:
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UserError(
-            f"{target} cannot be written ({error.strerror}); free some space or choose another "
-            "folder."
-        ) from None

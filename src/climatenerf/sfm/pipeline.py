@@ -23,7 +23,7 @@ from climatenerf.scene.alignment.scale import (
     with_capture_flags,
     with_scale_evidence,
 )
-from climatenerf.scene.images import picture_header
+from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.colmap import read_colmap
 from climatenerf.scene.scene import FILE_NAME
 from climatenerf.sfm.diagnose import Unposed, diagnose
@@ -278,7 +278,7 @@ def is_upright(settings: CaptureSettings, path: Path, camera: Camera) -> bool:
 
     Pictures that this program imports are upright. A COLMAP model's are if only that fits.
     """
-    return settings.from_colmap is None or picture_header(path).rotates_to_fit(camera)
+    return settings.from_colmap is None or read_header(path).rotates_to_fit(camera)
 
 
 def with_sidecars(

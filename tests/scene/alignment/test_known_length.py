@@ -7,7 +7,7 @@ from support.scene_builders import ring
 from climatenerf.core.errors import UserError
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.scene.alignment.known_length import (
-    Measured,
+    LengthMeasurement,
     apply_known_lengths,
     measure,
     read_marks,
@@ -29,48 +29,48 @@ def scene(tmp_path):
     )  # fmt: skip
 
 
-def marks_of(scene, names=("000.jpg", "002.jpg", "004.jpg"), noise=0.0, seed=0):
+def make_marks(scene, names=("000.jpg", "002.jpg", "004.jpg"), noise=0.0, seed=0):
     rng = np.random.default_rng(seed)
     marks = {"DOOR": {"from": {}, "to": {}}}
-    for end, place in (("from", FOOT), ("to", HEAD)):
+    for end, point in (("from", FOOT), ("to", HEAD)):
         for view in scene.views:
             if view.name in names:
                 w2c = np.linalg.inv(scene.c2w_world(view))
-                pixel = CAMERA.project(w2c[:3, :3] @ place + w2c[:3, 3])
+                pixel = CAMERA.project(w2c[:3, :3] @ point + w2c[:3, 3])
                 pixel = pixel + noise * rng.normal(size=2)
                 marks["DOOR"][end][view.name] = tuple(float(x) for x in pixel)
     return marks
 
 
-def test_a_length_is_measured_through_the_lens(scene):
-    found = measure(scene, marks_of(scene), "DOOR", 2.0)
-    assert found.found == pytest.approx(2.0, abs=1e-6)
-    # Nobody clicks better than 2 pixels: here 2 cm, in three pictures, at either end.
+def test_length_is_measured_through_a_distorted_lens(scene):
+    found = measure(scene, make_marks(scene), "DOOR", 2.0)
+    assert found.measured == pytest.approx(2.0, abs=1e-6)
+    # Marks are accurate to 2 pixels, here 2 cm, in three images at either end.
     assert 0.005 < found.error < 0.02
 
 
-def test_the_error_that_is_told_is_the_error_that_is_made(scene):
-    some = [measure(scene, marks_of(scene, noise=6.0, seed=s), "DOOR", 2.0) for s in range(80)]
-    made = np.sqrt(np.mean([(m.found / 2 - 1) ** 2 for m in some]))
-    assert np.mean([m.error for m in some]) == pytest.approx(made, rel=0.6)
+def test_error_matches_the_scatter_of_the_lengths(scene):
+    lengths = [measure(scene, make_marks(scene, noise=6.0, seed=s), "DOOR", 2.0) for s in range(80)]
+    actual = np.sqrt(np.mean([(m.measured / 2 - 1) ** 2 for m in lengths]))
+    assert np.mean([m.error for m in lengths]) == pytest.approx(actual, rel=0.6)
 
 
-def test_the_scene_is_scaled_about_its_ground(scene):
-    known = measure(scene, marks_of(scene), "DOOR", 3.0)
-    out = apply_known_lengths(replace(scene, ground_z=0.5), [known])
+def test_scene_is_scaled_about_its_ground_datum(scene):
+    length = measure(scene, make_marks(scene), "DOOR", 3.0)
+    out = apply_known_lengths(replace(scene, ground_z=0.5), [length])
     assert out.scale == pytest.approx(1.5) and out.scale_source == "known-length"
-    assert out.scale_error == pytest.approx(known.error)
+    assert out.scale_error == pytest.approx(length.error)
     assert out.lowest_ground_z == pytest.approx(0.5 - 1.5 * 1.5)
     height = scene.c2w_world(scene.views[0])[2, 3] - 0.5
     assert out.c2w_world(out.views[0])[2, 3] - 0.5 == pytest.approx(1.5 * height)
     assert out.warnings == ("Other.",)
-    said = out.scale_report["camera-height-assumed"]
-    assert said == {"times": pytest.approx(1 / 1.5), "error": 0.3}
+    entry = out.scale_report["camera-height-assumed"]
+    assert entry == {"times": pytest.approx(1 / 1.5), "error": 0.3}
 
 
-def test_several_lengths_and_their_disagreement(scene):
-    good, bad = Measured("A", 2.0, 1.0, 0.01), Measured("B", 3.0, 1.0, 0.01)
-    out = apply_known_lengths(scene, [good, replace(good, name="C", found=1.01)])
+def test_several_lengths_are_averaged_and_disagreement_is_a_warning(scene):
+    good, bad = LengthMeasurement("A", 2.0, 1.0, 0.01), LengthMeasurement("B", 3.0, 1.0, 0.01)
+    out = apply_known_lengths(scene, [good, replace(good, name="C", measured=1.01)])
     assert out.scale == pytest.approx(1.99, abs=0.01)
     assert not any("disagree" in w for w in out.warnings)
     out = apply_known_lengths(scene, [good, bad])
@@ -79,29 +79,29 @@ def test_several_lengths_and_their_disagreement(scene):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
-        (lambda m: m.pop("DOOR"), "hold no 'DOOR'"),
+        (lambda m: m.pop("DOOR"), "contain no 'DOOR'"),
         (lambda m: m["DOOR"]["to"].update({"x.jpg": (1.0, 1.0)}), "x.jpg"),
         (lambda m: m["DOOR"]["to"].update({"000.jpg": (900.0, 1.0)}), "outside"),
-        (lambda m: m["DOOR"].update(to=m["DOOR"]["from"]), "one place"),
+        (lambda m: m["DOOR"].update(to=m["DOOR"]["from"]), "same position"),
     ],
 )
-def test_marks_that_cannot_be_used(scene, change, words):
-    marks = marks_of(scene)
+def test_unusable_marks_raise(scene, change, message):
+    marks = make_marks(scene)
     change(marks)
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match=message):
         measure(scene, marks, "DOOR", 2.0)
 
 
-def test_marks_from_nearly_one_place(scene):
+def test_marks_from_nearly_one_position_raise(scene):
     twin = replace(scene.views[0], name="twin.jpg")
-    near = replace(scene, views=(*scene.views, twin))
-    with pytest.raises(UserError, match="nearly one place"):
-        measure(near, marks_of(near, ("000.jpg", "twin.jpg")), "DOOR", 2.0)
+    scene = replace(scene, views=(*scene.views, twin))
+    with pytest.raises(UserError, match="nearly one position"):
+        measure(scene, make_marks(scene, ("000.jpg", "twin.jpg")), "DOOR", 2.0)
 
 
-def test_the_file(tmp_path):
+def test_read_marks_and_malformed_files(tmp_path):
     path = tmp_path / "marks.toml"
     with pytest.raises(UserError, match="mark.html"):
         read_marks(path)

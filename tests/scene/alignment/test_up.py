@@ -7,14 +7,15 @@ from support.scene_builders import look_at, posts_picture, ring
 
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.scene.alignment.ground_plane import find_ground, ground_plane
-from climatenerf.scene.alignment.up import UpEstimate, combine, level, up_from_cameras
+from climatenerf.scene.alignment.up import UpEstimate, combine, up_from_cameras
 from climatenerf.scene.alignment.vanishing_point import (
-    _with_halves,
+    find_vanishing_point,
     segment_normals,
     upright_segments,
-    vertical_from_normals,
-    vertical_lines,
+    vanishing_point_from_normals,
+    vanishing_point_with_split_error,
 )
+from climatenerf.scene.alignment.world_frame import align_scene
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 160.0, 120.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -76,7 +77,7 @@ def test_everything_within_a_degree_and_a_few_percent(tmp_path):
     random = np.random.default_rng(5)
     poses = [tilted(p, *random.normal(0, 3, 2)) for p in ring(12)]
     scene, up = scene_from(tmp_path, poses, points, posts, seed=4, scale=0.37)
-    out = level(scene)
+    out = align_scene(scene)
     assert degrees(used_up(out), up) < 1
     assert set(out.up_report) == {"used", "cameras", "ground", "lines"}
     assert out.scale == pytest.approx(1 / 0.37, rel=0.03)
@@ -91,7 +92,7 @@ def test_everything_within_a_degree_and_a_few_percent(tmp_path):
 def test_camera_height_sets_the_scale(tmp_path):
     points, posts = street()
     scene, _ = scene_from(tmp_path, ring(9), points, posts, scale=2.5)
-    out = level(scene, camera_height=3.2)
+    out = align_scene(scene, camera_height=3.2)
     assert out.scale == pytest.approx(2 / 2.5, rel=0.03)
     assert out.scale_source == "camera-height" and out.scale_error < 0.2
     assert not any("assumed" in w for w in out.warnings)
@@ -105,7 +106,7 @@ def test_common_pitch_is_found_by_lines_and_reported(tmp_path):
         look_at((x, 0, 1.6), (x, 10.0, 1.6 - 10 * np.tan(np.radians(7)))) for x in range(-4, 5)
     ]
     scene, up = scene_from(tmp_path, poses, None, posts, seed=1)
-    out = level(scene)
+    out = align_scene(scene)
     assert degrees(used_up(out), up) < 1
     assert out.up_report["cameras"] > 5 and "lines" in out.up_report["used"]
     assert any("Up is uncertain: cameras" in w for w in out.warnings)
@@ -126,8 +127,8 @@ def test_gravity_leads_where_pictures_cannot_tell(tmp_path):
     # From a drone: all cameras look straight down, so that their own axes say nothing of up.
     poses = [look_at((x, 0, 20.0), (x, 0.001, 0.0)) for x in range(-4, 5)]
     scene, up = scene_from(tmp_path, poses, None, street()[1], seed=2)
-    assert degrees(used_up(level(scene)), up) > 45
-    out = level(scene, gravity=felt(scene, up, tilt=2.0))
+    assert degrees(used_up(align_scene(scene)), up) > 45
+    out = align_scene(scene, gravity=felt(scene, up, tilt=2.0))
     assert degrees(used_up(out), up) < 1 and out.up_report["used"].startswith("gravity")
     assert out.up_report["cameras"] > 45
     assert any("Up is uncertain: cameras" in w for w in out.warnings)
@@ -143,10 +144,10 @@ def test_gravity_that_contradicts_itself_or_is_rare_is_left_out(tmp_path):
         wild[name] = tuple(v / np.linalg.norm(v))
     rare = dict(list(felt(scene, up).items())[:2])
     for gravity in (wild, rare):
-        out = level(scene, gravity=gravity)
+        out = align_scene(scene, gravity=gravity)
         assert "gravity" not in out.up_report and degrees(used_up(out), up) < 1
     one_wrong = felt(scene, up) | {scene.views[0].name: (0.0, 0.0, 1.0)}
-    assert level(scene, gravity=one_wrong).up_report["gravity"] < 1
+    assert align_scene(scene, gravity=one_wrong).up_report["gravity"] < 1
 
 
 def test_metric_input_is_kept_exactly(tmp_path):
@@ -158,7 +159,7 @@ def test_metric_input_is_kept_exactly(tmp_path):
         p[2, 3] += 42
     views = scene_from(tmp_path, poses, None, posts)[0].views
     views = tuple(replace(v, c2w=p) for v, p in zip(views, poses, strict=True))
-    out = level(Scene(tmp_path, "test", (CAMERA,), views, points), metric_input=True)
+    out = align_scene(Scene(tmp_path, "test", (CAMERA,), views, points), metric_input=True)
     np.testing.assert_array_equal(out.world_from_input, np.eye(4))
     assert out.ground_z == pytest.approx(42, abs=0.05)
     assert out.scale_source == "metric-input" and out.scale_error == 0
@@ -173,7 +174,7 @@ def test_map_coordinates_come_near_the_origin_and_keep_their_metres(tmp_path):
         p[:3, 3] += away
     views = scene_from(tmp_path, ring(9), None, posts)[0].views
     views = tuple(replace(v, c2w=p) for v, p in zip(views, poses, strict=True))
-    out = level(Scene(tmp_path, "test", (CAMERA,), views, points + away), metric_input=True)
+    out = align_scene(Scene(tmp_path, "test", (CAMERA,), views, points + away), metric_input=True)
     centre = np.mean([out.c2w_world(v)[:3, 3] for v in out.views], axis=0)
     assert np.abs(centre[:2]).max() < 1001 and centre[2] > 10
     np.testing.assert_array_equal(out.world_from_input[:3, :3], np.eye(3))
@@ -184,14 +185,14 @@ def test_map_coordinates_come_near_the_origin_and_keep_their_metres(tmp_path):
 def test_metric_input_with_another_up_is_reported(tmp_path):
     points, posts = street()
     scene, _ = scene_from(tmp_path, ring(9), points, posts, seed=2)
-    out = level(scene, metric_input=True)
+    out = align_scene(scene, metric_input=True)
     assert any("the input's z axis disagree" in w for w in out.warnings)
 
 
 def test_no_points_puts_the_ground_below_all_cameras(tmp_path):
     poses = [*ring(6), look_at((4, 0, 0.4), (0, 0, 1.2)), look_at((0, 4, 3), (0, 0, 1.2))]
     scene, _ = scene_from(tmp_path, poses, None, [])
-    out = level(scene)
+    out = align_scene(scene)
     heights = [out.c2w_world(v)[2, 3] for v in out.views]
     assert min(heights) > 0 and np.median(heights) == pytest.approx(1.6)
     assert out.scale_error == 0.5 and any("No ground" in w for w in out.warnings)
@@ -206,7 +207,7 @@ def test_photos_taken_on_edge_but_stored_lying(tmp_path):
     scene, up = scene_from(tmp_path, poses, points, posts, exif=tags)
     c2w = scene.views[0].c2w[:3, :3]
     assert degrees(-c2w[:, 0], up) < 20  # the builder does what its comment says
-    assert degrees(used_up(level(scene)), up) < 1
+    assert degrees(used_up(align_scene(scene)), up) < 1
 
 
 def test_up_from_cameras_ignores_pitch_when_headings_spread():
@@ -296,18 +297,18 @@ def test_vanishing_point_survives_wrong_lines():
     bad = np.cross(guess + 0.4 * random.normal(size=(60, 3)), random.normal(size=(60, 3)))
     normals = np.concatenate([good, bad])
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    found = vertical_from_normals(normals, np.ones(120), np.arange(120) % 10, guess)
+    found = vanishing_point_from_normals(normals, np.ones(120), np.arange(120) % 10, guess)
     assert found is not None and degrees(found.up, up) < 0.5
-    assert found.images == 10 and 0.4 < found.share < 0.7
+    assert found.images == 10 and 0.4 < found.fraction < 0.7
     # Chance agreement is unmasked by halves of the pictures; true uprights pass.
     image = np.arange(120) % 16
-    real = _with_halves(normals, np.ones(120), image, guess)
-    chance = _with_halves(normals[60:], np.ones(60), image[60:], guess)
+    real = vanishing_point_with_split_error(normals, np.ones(120), image, guess)
+    chance = vanishing_point_with_split_error(normals[60:], np.ones(60), image[60:], guess)
     assert real is not None and real.sigma < 1
     assert chance is None or chance.sigma > 1.5
-    assert vertical_from_normals(normals[:3], np.ones(3), np.arange(3), guess) is None
+    assert vanishing_point_from_normals(normals[:3], np.ones(3), np.arange(3), guess) is None
 
 
 def test_blank_pictures_have_no_lines(tmp_path):
     scene, up = scene_from(tmp_path, ring(4), None, [])
-    assert vertical_lines(scene, up) is None
+    assert find_vanishing_point(scene, up) is None

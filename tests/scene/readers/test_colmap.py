@@ -29,8 +29,8 @@ def test_poses_intrinsics_and_points(tmp_path, binary, sub):
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_pictures_know_the_points_that_they_show(tmp_path, binary):
-    """Their features name point 3, and one feature none; ids are not rows."""
+def test_views_have_the_rows_of_their_observed_points(tmp_path, binary):
+    """One feature has point id 3 and one has none; ids differ from rows."""
     points = [(float(i), 0.0, 0.0) for i in range(6)]
     model = tmp_path / "sparse/0"
     write_colmap(model, ring(4), names_of(4), points=points, binary=binary)
@@ -38,7 +38,7 @@ def test_pictures_know_the_points_that_they_show(tmp_path, binary):
     views = read_colmap(tmp_path).views
     assert [list(v.seen) for v in views] == ([[3]] * 4 if binary else [[3], [], [3], []])
     write_colmap(model, ring(4), names_of(4), points=points[:3], binary=binary)
-    assert not any(len(v.seen) for v in read_colmap(tmp_path).views), "point 3 is not there"
+    assert not any(len(v.seen) for v in read_colmap(tmp_path).views), "point 3 does not exist"
     if not binary:
         lines = (model / "points3D.txt").read_text().splitlines()
         (model / "points3D.txt").write_text("\n".join([f"3 7 8 9 {lines[1][2:]}", *lines[2:]]))
@@ -46,7 +46,7 @@ def test_pictures_know_the_points_that_they_show(tmp_path, binary):
         assert [list(capture.points[v.seen]) for v in capture.views[:1]][0][0].tolist() == [7, 8, 9]
 
 
-def test_centre_is_minus_rt_t_and_w_comes_first(tmp_path):
+def test_pose_is_inverted_and_quaternion_is_w_first(tmp_path):
     # 90 degrees about z: q = (cos 45, 0, 0, sin 45); R x = y. Centre = -R^T t.
     write_images(tmp_path / "images", names_of(3))
     model = tmp_path / "sparse" / "0"
@@ -59,14 +59,14 @@ def test_centre_is_minus_rt_t_and_w_comes_first(tmp_path):
     np.testing.assert_allclose(pose[:3, 3], [-2, 1, -3], atol=1e-12)
 
 
-def test_binary_is_preferred(tmp_path):
+def test_binary_model_is_preferred_over_text(tmp_path):
     write_images(tmp_path / "images", names_of(4))
     write_colmap(tmp_path / "sparse/0", ring(4), names_of(4), binary=True)
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), binary=False)
     assert len(read_colmap(tmp_path).views) == 4
 
 
-def test_largest_submodel_wins(tmp_path):
+def test_largest_submodel_is_read(tmp_path):
     write_images(tmp_path / "images", names_of(10))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
     write_colmap(tmp_path / "sparse/1", ring(7), names_of(10)[3:])
@@ -76,14 +76,14 @@ def test_largest_submodel_wins(tmp_path):
     assert "0: 3, 1: 7, 10: 4" in capture.warnings[0]
 
 
-def test_model_folder_itself_finds_the_pictures(tmp_path):
+def test_images_are_found_from_the_model_folder(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
     scene = read_scene(tmp_path / "sparse/0")
     assert scene.root == tmp_path and len(scene.views) == 3
 
 
-def test_scaled_pictures_scale_the_intrinsics(tmp_path):
+def test_intrinsics_are_scaled_to_the_images(tmp_path):
     write_images(tmp_path / "images_2", names_of(3), size=(16, 12))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
     scene = read_scene(tmp_path)
@@ -103,19 +103,19 @@ def test_scaled_pictures_scale_the_intrinsics(tmp_path):
         ("FULL_OPENCV", [9, 8, 4, 3, 0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0], {"k3": 0.5, "p2": 0.4}),
     ],
 )
-def test_models(model, params, expected):
+def test_camera_models(model, params, expected):
     camera = camera_from_params(model, 8, 6, params, "here")
     assert {k: getattr(camera, k) for k in expected} == expected
 
 
 @pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "EUCM", "FULL_OPENCV"])
-def test_unsupported_model_is_named(model):
+def test_error_names_the_unsupported_model(model):
     params = [1.0] * {"FOV": 5, "EUCM": 6}.get(model, 12)
     with pytest.raises(UserError, match=f"{model}.*undistort"):
         camera_from_params(model, 8, 6, params, "here")
 
 
-def test_unknown_model_id_in_binary(tmp_path):
+def test_error_names_the_unknown_model_id(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     eucm = (1, "EUCM", 32, 24, (30.0, 30.0, 16.0, 12.0, 0.5, 1.0))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(eucm,))
@@ -125,7 +125,7 @@ def test_unknown_model_id_in_binary(tmp_path):
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
 @pytest.mark.parametrize("keep", [0, 3, 0.5, 0.95])
-def test_truncated_binary_names_the_file(tmp_path, file, keep):
+def test_error_names_the_truncated_file(tmp_path, file, keep):
     write_images(tmp_path / "images", names_of(4))
     write_colmap(tmp_path / "sparse/0", ring(4), names_of(4), points=POINTS)
     path = tmp_path / "sparse/0" / file
@@ -136,7 +136,7 @@ def test_truncated_binary_names_the_file(tmp_path, file, keep):
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_garbled_binary_names_the_file(tmp_path, file):
+def test_error_names_the_corrupt_file(tmp_path, file):
     write_images(tmp_path / "images", names_of(4))
     write_colmap(tmp_path / "sparse/0", ring(4), names_of(4), points=POINTS)
     path = tmp_path / "sparse/0" / file
@@ -145,19 +145,19 @@ def test_garbled_binary_names_the_file(tmp_path, file):
         read_scene(tmp_path)
 
 
-def test_every_truncation_is_a_user_error(tmp_path):
+def test_truncation_at_any_offset_raises(tmp_path):
     write_images(tmp_path / "images", names_of(3))
-    write_colmap(tmp_path / "whole", ring(3), names_of(3), points=POINTS)
+    write_colmap(tmp_path / "complete", ring(3), names_of(3), points=POINTS)
     for file in ("cameras.bin", "images.bin"):
-        data = (tmp_path / "whole" / file).read_bytes()
+        data = (tmp_path / "complete" / file).read_bytes()
         for length in range(0, len(data), 11):
-            shutil.copytree(tmp_path / "whole", tmp_path / "sparse", dirs_exist_ok=True)
+            shutil.copytree(tmp_path / "complete", tmp_path / "sparse", dirs_exist_ok=True)
             (tmp_path / "sparse" / file).write_bytes(data[:length])
             with pytest.raises(UserError):
                 read_colmap(tmp_path)
 
 
-def test_garbled_text(tmp_path):
+def test_corrupt_text_file_raises(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse", ring(3), names_of(3), binary=False)
     (tmp_path / "sparse/images.txt").write_text("1 0.5 what 0 0\n\n")
@@ -165,15 +165,15 @@ def test_garbled_text(tmp_path):
         read_scene(tmp_path)
 
 
-def test_empty_model(tmp_path):
+def test_empty_model_raises(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse/0", [], [])
-    with pytest.raises(UserError, match="no posed picture"):
+    with pytest.raises(UserError, match="no image with a pose"):
         read_scene(tmp_path)
 
 
 @pytest.mark.parametrize("focal", [0.0, -5.0, float("nan")])
-def test_bad_focal_length(tmp_path, focal):
+def test_invalid_focal_length_raises(tmp_path, focal):
     write_images(tmp_path / "images", names_of(3))
     camera = (1, "PINHOLE", 32, 24, (focal, 30.0, 16.0, 12.0))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3), cameras=(camera,))
@@ -182,7 +182,7 @@ def test_bad_focal_length(tmp_path, focal):
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_non_finite_pose(tmp_path, bad):
+def test_non_finite_pose_raises(tmp_path, bad):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
     path = tmp_path / "sparse/0/images.bin"
@@ -193,7 +193,7 @@ def test_non_finite_pose(tmp_path, bad):
         read_scene(tmp_path)
 
 
-def test_zero_quaternion(tmp_path):
+def test_zero_quaternion_raises(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
     path = tmp_path / "sparse/0/images.bin"
@@ -204,7 +204,7 @@ def test_zero_quaternion(tmp_path):
         read_scene(tmp_path)
 
 
-def test_picture_with_unlisted_camera(tmp_path):
+def test_image_with_unlisted_camera_raises(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse", ring(3), names_of(3), binary=False)
     text = (tmp_path / "sparse/cameras.txt").read_text().replace("1 PINHOLE", "7 PINHOLE")
@@ -213,7 +213,7 @@ def test_picture_with_unlisted_camera(tmp_path):
         read_scene(tmp_path)
 
 
-def test_two_cameras(tmp_path):
+def test_views_refer_to_their_cameras(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     other = (5, "SIMPLE_PINHOLE", 32, 24, (44.0, 16.0, 12.0))
     write_colmap(tmp_path / "sparse", ring(3), names_of(3), (PINHOLE, other), binary=False)

@@ -10,7 +10,7 @@ from support.scene_builders import look_at, pinhole, seen_at, write_images
 from climatenerf.core.errors import UserError
 from climatenerf.scene import load_image, read_scene, save_scene
 from climatenerf.scene.images import load_labels
-from climatenerf.scene.readers.kitti360 import MAX_PICTURES, parse_frames, read_kitti360
+from climatenerf.scene.readers.kitti360 import MAX_IMAGES, parse_frames, read_kitti360
 
 DRIVE = "2013_05_28_drive_0000_sync"
 OTHER = "2013_05_28_drive_0002_sync"
@@ -23,7 +23,7 @@ K = {
 BASELINE = 0.6
 
 
-def turned(axis, degrees):
+def rotated(axis, degrees):
     a = np.radians(degrees)
     pose = np.eye(4)
     i, j = [k for k in range(3) if k != axis]
@@ -32,19 +32,19 @@ def turned(axis, degrees):
     return pose
 
 
-# How the two real cameras sit on the IMU, and how rectification turns them; no symmetry anywhere.
-MOUNTED = {
-    "00": turned(0, 80) @ turned(1, 12) @ turned(2, 5),
-    "01": turned(0, 70) @ turned(2, -8) @ turned(1, 33),
+# Camera-to-IMU poses and rectifying rotations, without any symmetry.
+CAMERA_TO_IMU = {
+    "00": rotated(0, 80) @ rotated(1, 12) @ rotated(2, 5),
+    "01": rotated(0, 70) @ rotated(2, -8) @ rotated(1, 33),
 }
-MOUNTED["00"][:3, 3], MOUNTED["01"][:3, 3] = (0.8, 0.3, -0.5), (0.7, -0.4, -0.45)
-RECTIFIED = {"00": turned(0, 1) @ turned(2, -2), "01": turned(1, 3) @ turned(0, -1)}
+CAMERA_TO_IMU["00"][:3, 3], CAMERA_TO_IMU["01"][:3, 3] = (0.8, 0.3, -0.5), (0.7, -0.4, -0.45)
+RECTIFICATION = {"00": rotated(0, 1) @ rotated(2, -2), "01": rotated(1, 3) @ rotated(0, -1)}
 
 
 def true_pose(camera, frame):
-    """Rectified camera: 1.55 m above the ground, driving north east; camera 1 to its right."""
-    place = np.array([1040.0 + frame - 1538, 3738.0 + 0.5 * (frame - 1538), 115.0])
-    pose = look_at(place, place + (2.0, 1.0, 0.0))
+    """Pose of a rectified camera that drives north east; camera 1 is to the right of camera 0."""
+    position = np.array([1040.0 + frame - 1538, 3738.0 + 0.5 * (frame - 1538), 115.0])
+    pose = look_at(position, position + (2.0, 1.0, 0.0))
     pose[:3, 3] += BASELINE * (camera == "01") * pose[:3, 0]
     return pose
 
@@ -62,19 +62,19 @@ def make(root, frames=FRAMES, drive=DRIVE, package=False, cameras=("00", "01"), 
     text = "calib_time: 13-Aug-2019 20:34:32\ncorner_dist: 0.1\n"
     for c in ("00", "01"):
         text += f"S_{c}: 50 30\nK_{c}: 1 2 3\n"
-        text += f"R_rect_{c}: {line(RECTIFIED[c][:3, :3])}\nP_rect_{c}: {line(K[c])}\n"
+        text += f"R_rect_{c}: {line(RECTIFICATION[c][:3, :3])}\nP_rect_{c}: {line(K[c])}\n"
         text += f"S_rect_{c}: {SIZE[0]:.6e} {SIZE[1]:.6e}\n"
     (root / "calibration/perspective.txt").write_text(text)
-    mounts = "".join(f"image_{c}: {line(m[:3])}\n" for c, m in MOUNTED.items())
-    (root / "calibration/calib_cam_to_pose.txt").write_text(mounts)
+    extrinsics = "".join(f"image_{c}: {line(m[:3])}\n" for c, m in CAMERA_TO_IMU.items())
+    (root / "calibration/calib_cam_to_pose.txt").write_text(extrinsics)
     poses = root / "data_poses" / drive
     poses.mkdir(parents=True)
     first, imu = "", ""
     for f in frames:
         if f not in unposed:
             first += f"{f} {line(true_pose('00', f))} \n"
-            # The way from the pictures back to the IMU, from the other side than the reader's.
-            car = true_pose("01", f) @ RECTIFIED["01"] @ np.linalg.inv(MOUNTED["01"])
+            # The inverse of the reader's product.
+            car = true_pose("01", f) @ RECTIFICATION["01"] @ np.linalg.inv(CAMERA_TO_IMU["01"])
             imu += f"{f} {line(car[:3])}\n"
     (poses / "cam0_to_world.txt").write_text(first)
     (poses / "poses.txt").write_text(imu)
@@ -82,7 +82,7 @@ def make(root, frames=FRAMES, drive=DRIVE, package=False, cameras=("00", "01"), 
 
 
 @pytest.mark.parametrize("package", [False, True])
-def test_a_known_point_is_seen_where_it_was_put(tmp_path, package):
+def test_points_project_to_their_true_pixels(tmp_path, package):
     make(tmp_path, package=package)
     scene = read_scene(tmp_path)
     assert scene.source == "kitti360" and len(scene.views) == 2 * len(FRAMES)
@@ -90,13 +90,13 @@ def test_a_known_point_is_seen_where_it_was_put(tmp_path, package):
     for view in scene.views:
         camera, frame = view.name[6:8], int(view.path.stem)
         ahead = true_pose(camera, frame) @ np.array([0.7, -0.3, 9.0, 1.0])
-        # The data set's pixel (0, 0) is the middle of the first one, ours is its corner.
-        wanted = pinhole(K[camera], true_pose(camera, frame), ahead[:3]) + 0.5
-        np.testing.assert_allclose(seen_at(scene, view, ahead[:3]), wanted, atol=1e-4)
+        # Pixel (0, 0) of the data set is the centre of the first pixel; ours is its corner.
+        expected = pinhole(K[camera], true_pose(camera, frame), ahead[:3]) + 0.5
+        np.testing.assert_allclose(seen_at(scene, view, ahead[:3]), expected, atol=1e-4)
         np.testing.assert_allclose(view.c2w, true_pose(camera, frame), atol=1e-8)
 
 
-def test_the_pixel_that_the_data_set_means(tmp_path):
+def test_principal_point_is_the_centre_of_its_pixel(tmp_path):
     pictures = make(tmp_path)
     path = pictures / "image_00/data_rect/0000001540.png"
     dot = np.zeros((*SIZE[::-1], 3), np.uint8)
@@ -108,7 +108,7 @@ def test_the_pixel_that_the_data_set_means(tmp_path):
     assert load_image(view, scene)[y, x].tolist() == [255, 255, 255]
 
 
-def test_the_world_is_metres_with_z_up(tmp_path):
+def test_world_frame_is_the_metric_input_frame(tmp_path):
     make(tmp_path)
     scene = read_scene(tmp_path)
     np.testing.assert_array_equal(scene.world_from_input, np.eye(4))
@@ -123,23 +123,23 @@ def test_frames_without_a_pose_are_left_out(tmp_path):
     make(tmp_path, unposed=(1539, 1541))
     scene = read_scene(tmp_path)
     assert [int(v.path.stem) for v in scene.views] == [1538, 1540, 1542, 1543] * 2
-    assert any(w.startswith("4 pictures of") and "no pose" in w for w in scene.warnings)
+    assert any(w.startswith("4 images of") and "no pose" in w for w in scene.warnings)
 
 
 @pytest.mark.parametrize("frames", ["1539:1541", (1539, 1541), " 1539 : 1541 "])
-def test_frames_are_picked(tmp_path, frames):
+def test_frames_are_selected(tmp_path, frames):
     make(tmp_path)
     scene = read_scene(tmp_path, frames=frames)
     assert [int(v.path.stem) for v in scene.views] == [1539, 1540, 1541] * 2
 
 
-def test_camera_0_alone_needs_no_imu(tmp_path):
+def test_camera_0_does_not_need_the_imu_poses(tmp_path):
     make(tmp_path, cameras=("00",))
     (tmp_path / "data_poses" / DRIVE / "poses.txt").unlink()
     assert {v.name[:8] for v in read_scene(tmp_path).views} == {"image_00"}
 
 
-def test_the_folder_of_one_drive_of_several(tmp_path):
+def test_several_drives_need_the_folder_of_one(tmp_path):
     make(tmp_path)
     pictures = make(tmp_path, range(5, 9), OTHER)
     with pytest.raises(UserError, match=f"several drives .*{DRIVE}, {OTHER}.*give the folder of"):
@@ -149,16 +149,16 @@ def test_the_folder_of_one_drive_of_several(tmp_path):
     assert {int(v.path.stem) for v in read_scene(tmp_path).views} == {5, 6, 7, 8}
 
 
-def test_too_many_pictures_name_the_remedy(tmp_path):
-    frames = range(10, 11 + MAX_PICTURES)
+def test_too_many_images_require_a_selection_of_frames(tmp_path):
+    frames = range(10, 11 + MAX_IMAGES)
     make(tmp_path, frames, cameras=("00",))
-    with pytest.raises(UserError, match=r"has 401 pictures .* --frames 1538:1601"):
+    with pytest.raises(UserError, match=r"has 401 images .* --frames 1538:1601"):
         read_kitti360(tmp_path)
     assert len(read_kitti360(tmp_path, (10, 409)).views) == 400
-    assert len(read_kitti360(tmp_path, (10, 410)).views) == 401, "who picks may have more"
+    assert len(read_kitti360(tmp_path, (10, 410)).views) == 401, "a selection has no limit"
 
 
-def test_official_labels_are_ids(tmp_path):
+def test_official_labels_are_cityscapes_ids(tmp_path):
     make(tmp_path)
     folder = tmp_path / "data_2d_semantics/train" / DRIVE / "image_00/semantic"
     folder.mkdir(parents=True)
@@ -174,7 +174,7 @@ def test_official_labels_are_ids(tmp_path):
     assert [int(found[i, 0]) for i in (0, 1, 9, 19)] == [255, 10, 5, 0]
 
 
-def test_the_package_has_its_own_labels_and_list_of_frames(tmp_path):
+def test_package_labels_and_visible_frames_are_read(tmp_path):
     make(tmp_path, package=True)
     folder = tmp_path / "pspnet" / DRIVE / "seq0_1538-1601"
     folder.mkdir(parents=True)
@@ -197,7 +197,7 @@ def test_the_package_has_its_own_labels_and_list_of_frames(tmp_path):
     ]
 
 
-def test_without_labels_ones_own_are_train_ids(tmp_path):
+def test_labels_of_the_user_are_train_ids(tmp_path):
     make(tmp_path)
     (tmp_path / "labels/image_01").mkdir(parents=True)
     Image.fromarray(np.full(SIZE[::-1], 13, np.uint8)).save(
@@ -218,10 +218,10 @@ def replaced(path, old, new):
     ("damage", "message"),
     [
         (lambda r: (r / "calibration/perspective.txt").unlink(), r"perspective\.txt is missing"),
-        (lambda r: (r / "calibration/calib_cam_to_pose.txt").unlink(), "pose.txt is missing; get"),
+        (lambda r: (r / "calibration/calib_cam_to_pose.txt").unlink(), "pose.txt is missing"),
         (
             lambda r: replaced(r / "calibration/perspective.txt", "P_rect_00", "P_00"),
-            "has no P_rect_00; get",
+            "has no P_rect_00; download",
         ),
         (
             lambda r: replaced(r / "calibration/perspective.txt", "R_rect_01: ", "R_rect_01: 7 "),
@@ -233,7 +233,7 @@ def replaced(path, old, new):
         ),
         (
             lambda r: replaced(r / "calibration/perspective.txt", "P_rect_01: 41", "P_rect_01: x"),
-            "not numbers only",
+            "contains more than numbers",
         ),
         (
             lambda r: replaced(r / f"data_poses/{DRIVE}/poses.txt", "1539 ", "1539 8 "),
@@ -253,7 +253,7 @@ def replaced(path, old, new):
             lambda r: (r / f"data_poses/{DRIVE}/cam0_to_world.txt").write_text(
                 "\n".join(f"{f} {line(np.diag([1, 1, -1, 1]))}" for f in FRAMES)
             ),
-            "holds no rotation matrix",
+            "contains no rotation matrix",
         ),
         (
             lambda r: write_images(
@@ -261,10 +261,10 @@ def replaced(path, old, new):
             ),
             "another shape",
         ),
-        (lambda r: shutil.rmtree(r / "data_2d_raw"), "no pictures of theirs"),
+        (lambda r: shutil.rmtree(r / "data_2d_raw"), "no images of them"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(tmp_path, damage, message):
+def test_damage_raises_one_sentence(tmp_path, damage, message):
     make(tmp_path)
     damage(tmp_path)
     with pytest.raises(UserError, match=message) as caught:
@@ -275,25 +275,25 @@ def test_what_is_wrong_is_said_in_one_sentence(tmp_path, damage, message):
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
-        ("1538", "give the first and last, such as 1538:1601"),
-        ("a:b", "give the first and last"),
+        ("1538", "give two frames, such as 1538:1601"),
+        ("a:b", "give two frames"),
         ("1540:1538", "ends before it begins"),
-        ((5, 6), "no picture with a pose in frames 5:6"),
+        ((5, 6), "no image with a pose in frames 5:6"),
     ],
 )
-def test_frames_that_cannot_be(tmp_path, frames, message):
+def test_invalid_frames_raise(tmp_path, frames, message):
     make(tmp_path)
     with pytest.raises(UserError, match=message):
         read_scene(tmp_path, frames=frames)
 
 
-def test_a_scene_has_its_frames_already(tmp_path):
+def test_saved_scene_rejects_a_selection_of_frames(tmp_path):
     make(tmp_path)
     save_scene(read_scene(tmp_path, frames="1538:1541"), tmp_path / "run")
     assert len(read_scene(tmp_path / "run").views) == 8
-    with pytest.raises(UserError, match="picks frames of a KITTI-360 drive"):
+    with pytest.raises(UserError, match="selects frames of a KITTI-360 drive"):
         read_scene(tmp_path / "run", frames="1538:1540")
 
 
-def test_one_frame_is_a_range():
+def test_single_frame_is_a_valid_range():
     assert parse_frames("7:7") == (7, 7)

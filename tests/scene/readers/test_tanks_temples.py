@@ -28,17 +28,17 @@ def make(root, stems=STEMS, folder="rgb", poses=None, intrinsics=None):
 
 
 @pytest.mark.parametrize("folder", ["rgb", "images"])
-def test_a_known_point_is_seen_where_it_was_put(tmp_path, folder):
+def test_points_project_to_their_true_pixels(tmp_path, folder):
     poses = make(tmp_path, folder=folder)
     scene = read_scene(tmp_path)
     assert scene.source == "tanks-temples" and len(scene.views) == 9
     for view in scene.views:
-        wanted = pinhole(K, poses[view.path.stem], POINT)
-        np.testing.assert_allclose(seen_at(scene, view, POINT), wanted, atol=1e-9)
+        expected = pinhole(K, poses[view.path.stem], POINT)
+        np.testing.assert_allclose(seen_at(scene, view, POINT), expected, atol=1e-9)
         assert view.path.parent.name == folder and view.path.is_file()
 
 
-def test_the_prefix_is_the_split(tmp_path):
+def test_split_follows_the_prefix(tmp_path):
     make(tmp_path)
     scene = read_scene(tmp_path)
     assert [v.name for v in scene.of_split("heldout")] == [f"1_{i:05}.png" for i in (0, 3, 6)]
@@ -47,25 +47,24 @@ def test_the_prefix_is_the_split(tmp_path):
 @pytest.mark.parametrize(
     ("prefixes", "heldout"), [("002", ["2_00002"]), ("000000000", ["0_00000", "0_00008"])]
 )
-def test_two_is_for_testing_and_no_test_picture_means_every_eighth(tmp_path, prefixes, heldout):
+def test_prefix_2_is_held_out_and_default_split_is_every_eighth(tmp_path, prefixes, heldout):
     make(tmp_path, [f"{p}_{i:05}" for i, p in enumerate(prefixes)])
     assert [v.path.stem for v in read_scene(tmp_path).of_split("heldout")] == heldout
 
 
-def test_distances_are_those_of_the_files(tmp_path):
-    """Positions alone enter scale and centre.
+def test_distances_scale_with_the_poses(tmp_path):
+    """Scale and centre depend on positions only, not on their homogeneous coordinate.
 
-    The homogeneous 1 would be most of the norm of positions as small as these, and scale and
-    distances would no longer go together when the scene is written a hundred times as large.
+    For positions as small as these, the homogeneous 1 would dominate their norm.
     """
     poses = make(tmp_path, poses=ring(9, radius=0.01, height=0.016))
     scene = read_scene(tmp_path)
     raw = np.array([poses[v.path.stem][:3, 3] for v in scene.views])
     np.testing.assert_allclose([v.c2w[:3, 3] for v in scene.views], raw, atol=1e-12)
     world = np.array([scene.c2w_world(v)[:3, 3] for v in scene.views])
-    apart = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (raw, world)]
-    np.testing.assert_allclose(apart[1], apart[0] * scene.scale, rtol=1e-9, atol=1e-12)
-    # The same scene a hundred times as large is the same scene in metres.
+    before, after = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (raw, world)]
+    np.testing.assert_allclose(after, before * scene.scale, rtol=1e-9, atol=1e-12)
+    # A scene written a hundred times as large is the same scene in metres.
     (tmp_path / "b").mkdir()
     large = ring(9, radius=0.01, height=0.016)
     for pose in large:
@@ -77,7 +76,7 @@ def test_distances_are_those_of_the_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("intrinsics", "wanted"),
+    ("intrinsics", "expected"),
     [
         (" ".join(repr(float(v)) for v in K.flat), (30, 31, 15, 13)),
         ("28.5 16 12 0.\n0. 0. 0.\n0.\n1.\n24 32\n", (28.5, 28.5, 16, 12)),
@@ -85,40 +84,40 @@ def test_distances_are_those_of_the_files(tmp_path):
         (text(K[:3]), (30, 31, 15, 13)),
     ],
 )
-def test_ways_to_write_intrinsics(tmp_path, intrinsics, wanted):
+def test_forms_of_intrinsics(tmp_path, intrinsics, expected):
     make(tmp_path, intrinsics=intrinsics)
     camera = read_scene(tmp_path).cameras[0]
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == wanted
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == expected
 
 
-def test_pictures_without_pose_and_poses_without_picture_are_told(tmp_path):
+def test_unposed_images_and_missing_images_give_warnings(tmp_path):
     make(tmp_path)
     (tmp_path / "rgb/0_00001.png").unlink()
     (tmp_path / "pose/0_00002.txt").unlink()
     scene = read_scene(tmp_path)
     assert len(scene.views) == 7
     assert any("1 of the 8" in w and "0_00001.png" in w for w in scene.warnings)
-    assert any("1 pictures have no pose (first: 0_00002.png)" in w for w in scene.warnings)
+    assert any("1 images have no pose (first: 0_00002.png)" in w for w in scene.warnings)
 
 
-def damaged_pose(root, words):
+def damage_pose(root, words):
     (root / "pose/0_00001.txt").write_text(words)
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda r: (r / "intrinsics.txt").unlink(), r"intrinsics\.txt is missing; get it"),
-        (lambda r: (r / "intrinsics.txt").write_text(" \n"), "is empty; it must hold"),
+        (lambda r: (r / "intrinsics.txt").unlink(), r"intrinsics\.txt is missing; restore it"),
+        (lambda r: (r / "intrinsics.txt").write_text(" \n"), "is empty; write"),
         (lambda r: (r / "intrinsics.txt").write_text(text(K)[:-4]), "has 15 numbers instead of"),
         (lambda r: (r / "intrinsics.txt").write_text("nan"), "not finite"),
         (lambda r: (r / "intrinsics.txt").write_text(text(K + np.eye(4, k=1))), "has skew"),
-        (lambda r: (r / "intrinsics.txt").write_text("f = 3"), "not numbers only: 'f = 3'"),
-        (lambda r: (r / "intrinsics.txt").write_text(text(4 * K)), "outside of the 32x24"),
-        (lambda r: damaged_pose(r, "1 2 3"), r"0_00001\.txt has 3 numbers instead of the 16"),
-        (lambda r: damaged_pose(r, text(np.full((4, 4), np.nan))), "not finite"),
-        (lambda r: damaged_pose(r, text(np.diag([1, 1, -1, 1]))), "holds no rotation matrix"),
-        (lambda r: damaged_pose(r, text(np.diag([1, 2, 3, 1]))), "holds no rotation matrix"),
+        (lambda r: (r / "intrinsics.txt").write_text("f = 3"), "more than numbers: 'f = 3'"),
+        (lambda r: (r / "intrinsics.txt").write_text(text(4 * K)), "outside the 32x24"),
+        (lambda r: damage_pose(r, "1 2 3"), r"0_00001\.txt has 3 numbers instead of the 16"),
+        (lambda r: damage_pose(r, text(np.full((4, 4), np.nan))), "not finite"),
+        (lambda r: damage_pose(r, text(np.diag([1, 1, -1, 1]))), "contains no rotation matrix"),
+        (lambda r: damage_pose(r, text(np.diag([1, 2, 3, 1]))), "contains no rotation matrix"),
         (lambda r: write_images(r / "rgb", ["0_00001.png"], (20, 24)), "another shape"),
         (lambda r: (r / "rgb").rename(r / "pictures"), "neither rgb/ nor images/"),
         (
@@ -127,7 +126,7 @@ def damaged_pose(root, words):
         ),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(tmp_path, damage, message):
+def test_damage_raises_one_sentence(tmp_path, damage, message):
     make(tmp_path)
     damage(tmp_path)
     with pytest.raises(UserError, match=message) as caught:

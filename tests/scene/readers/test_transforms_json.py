@@ -1,5 +1,6 @@
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ def images_of(count):
     return [f"images/{n}" for n in names_of(count)]
 
 
-def test_nerfstudio_dialect(tmp_path):
+def test_nerfstudio_intrinsics_and_poses(tmp_path):
     poses = ring(5)
     write_images(tmp_path, images_of(5))
     lens = {"k1": 0.1, "k2": 0.2, "k3": 0.01, "p1": 0.3, "p2": 0.4, "camera_model": "OPENCV"}
@@ -29,10 +30,10 @@ def test_nerfstudio_dialect(tmp_path):
     camera = capture.cameras[0]
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (30.0, 31.0, 15.0, 12.5)
     assert (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2) == (0.1, 0.2, 0.01, 0.3, 0.4)
-    assert not capture.own_split
+    assert not capture.predefined_split
 
 
-def test_opengl_identity_looks_along_minus_z(tmp_path):
+def test_opengl_axes_are_converted_to_opencv(tmp_path):
     write_images(tmp_path, images_of(3))
     write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **NERFSTUDIO)
     data = json.loads((tmp_path / "transforms.json").read_text())
@@ -43,7 +44,7 @@ def test_opengl_identity_looks_along_minus_z(tmp_path):
     np.testing.assert_allclose(view.c2w[:3, 1], [0, -1, 0], atol=1e-12)  # down
 
 
-def test_blender_dialect_angle_and_missing_extension(tmp_path):
+def test_blender_angle_of_view_and_missing_extension(tmp_path):
     names = [f"./train/r_{i}" for i in range(3)]
     write_images(tmp_path, [f"{n}.png" for n in names])
     write_transforms(tmp_path / "transforms.json", ring(3), names, camera_angle_x=0.7)
@@ -54,7 +55,7 @@ def test_blender_dialect_angle_and_missing_extension(tmp_path):
     assert (camera.width, camera.height, camera.cx, camera.cy) == (32, 24, 16.0, 12.0)
 
 
-def test_instant_ngp_both_angles(tmp_path):
+def test_instant_ngp_angles_of_view(tmp_path):
     write_images(tmp_path, images_of(3))
     top = {"camera_angle_x": 0.7, "camera_angle_y": 0.6, "aabb_scale": 4, "w": 32, "h": 24}
     write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **top)
@@ -98,7 +99,7 @@ def test_per_frame_intrinsics_and_masks(tmp_path):
     assert scene.views[1].mask_path == tmp_path / "m/1.png"
 
 
-def test_own_split_is_kept_unless_overruled(tmp_path):
+def test_predefined_split_is_kept_unless_holdout_is_given(tmp_path):
     names = images_of(6)
     write_images(tmp_path, names)
     split = {"train_filenames": names[:3], "val_filenames": names[3:4], "test_filenames": names[4:]}
@@ -108,17 +109,17 @@ def test_own_split_is_kept_unless_overruled(tmp_path):
     assert len(read_scene(tmp_path, holdout="0").of_split("heldout")) == 0
 
 
-def test_pictures_in_no_list_are_left_out_with_a_warning(tmp_path):
+def test_unlisted_images_are_left_out_with_a_warning(tmp_path):
     names = images_of(6)
     write_images(tmp_path, names)
     split = {"train_filenames": names[:3], "test_filenames": names[4:]}
     write_transforms(tmp_path / "transforms.json", ring(6), names, **NERFSTUDIO, **split)
     scene = read_scene(tmp_path)
     assert [v.name for v in scene.views] == [n for n in names_of(6) if n != "003.png"]
-    assert any(w.startswith("1 pictures are in none") for w in scene.warnings)
+    assert any(w.startswith("1 images are in none") for w in scene.warnings)
 
 
-def test_applied_transform_is_not_undone_and_points_share_the_frame(tmp_path):
+def test_applied_transform_is_not_undone(tmp_path):
     poses = ring(3)
     write_images(tmp_path, images_of(3))
     write_points(tmp_path / "p.ply", np.array([[1.0, 2.0, 3.0]]))
@@ -130,13 +131,14 @@ def test_applied_transform_is_not_undone_and_points_share_the_frame(tmp_path):
     np.testing.assert_allclose(capture.points, [[1, 2, 3]])
 
 
-def test_file_may_have_any_name(tmp_path):
+def test_file_of_any_name_is_read(tmp_path):
     write_images(tmp_path, images_of(3))
     write_transforms(tmp_path / "mine.json", ring(3), images_of(3), **NERFSTUDIO)
     assert len(read_scene(tmp_path / "mine.json").views) == 3
 
 
-def broken(tmp_path, change):
+def error_after(tmp_path, change):
+    """Message of the error that a change of the file causes."""
     write_images(tmp_path, images_of(4))
     write_transforms(tmp_path / "transforms.json", ring(4), images_of(4), **NERFSTUDIO)
     data = json.loads((tmp_path / "transforms.json").read_text())
@@ -149,11 +151,11 @@ def broken(tmp_path, change):
     return message
 
 
-def test_non_finite_pose(tmp_path):
+def test_non_finite_pose_raises(tmp_path):
     def change(data):
         data["frames"][2]["transform_matrix"][0][3] = float("nan")
 
-    assert "002.png" in broken(tmp_path, change)
+    assert "002.png" in error_after(tmp_path, change)
 
 
 @pytest.mark.parametrize(
@@ -166,22 +168,22 @@ def test_non_finite_pose(tmp_path):
     ],
     ids=["zero", "mirrored", "stretched", "sheared"],
 )
-def test_not_a_rotation(tmp_path, matrix):
+def test_pose_without_rotation_raises(tmp_path, matrix):
     def change(data):
         data["frames"][1]["transform_matrix"] = matrix.tolist()
 
-    assert "001.png" in (message := broken(tmp_path, change)) and "no rotation" in message
+    assert "001.png" in (message := error_after(tmp_path, change)) and "no rotation" in message
 
 
 @pytest.mark.parametrize("matrix", [None, [[1, 2], [3, 4]], "x", [[1, 0, 0], [0, 1]]])
-def test_not_a_matrix(tmp_path, matrix):
+def test_malformed_matrix_raises(tmp_path, matrix):
     def change(data):
         data["frames"][1]["transform_matrix"] = matrix
 
-    assert "not a 4x4 matrix" in broken(tmp_path, change)
+    assert "not a 4x4 matrix" in error_after(tmp_path, change)
 
 
-def test_scaled_and_rounded_rotations_are_mended(tmp_path):
+def test_scaled_and_rounded_rotations_are_orthonormalised(tmp_path):
     poses = ring(3)
     write_images(tmp_path, images_of(3))
     write_transforms(tmp_path / "transforms.json", poses, images_of(3), **NERFSTUDIO)
@@ -197,7 +199,7 @@ def test_scaled_and_rounded_rotations_are_mended(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("top", "words"),
+    ("top", "message"),
     [
         ({"fl_x": 0}, "focal length 0"),
         ({"fl_y": -3}, "focal length -3"),
@@ -211,13 +213,11 @@ def test_scaled_and_rounded_rotations_are_mended(tmp_path):
         ({"frames": [{"transform_matrix": []}]}, "Frame 0 .*no file_path"),
     ],
 )
-def test_bad_values(tmp_path, top, words):
-    import re
-
-    assert re.search(words, broken(tmp_path, lambda data: data.update(top)))
+def test_invalid_values_raise(tmp_path, top, message):
+    assert re.search(message, error_after(tmp_path, lambda data: data.update(top)))
 
 
-def test_not_json(tmp_path):
+def test_invalid_json_raises(tmp_path):
     (tmp_path / "transforms.json").write_text('{"frames": [')
     with pytest.raises(UserError, match=r"transforms\.json is not readable JSON"):
         read_scene(tmp_path)

@@ -1,1 +1,1 @@
-"""The world frame of a capture: up, scale, ground datum, georeference."""
+"""Alignment of a capture to the world frame: up, scale, ground datum and georeference."""

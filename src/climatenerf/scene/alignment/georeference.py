@@ -1,4 +1,4 @@
-"""Scale, heading and place from where photos say that they were taken (GPS)."""
+"""Scale, heading and geographic position of a scene from the GPS positions of its photos."""
 
 import math
 from collections.abc import Mapping
@@ -10,30 +10,30 @@ from jaxtyping import Complex, Float
 from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
 from climatenerf.scene.scene import Scene
 
-FEWEST = 5
-MAX_PAIRS = 2000  # that are tried for a start
-MIN_ERROR = 0.005  # of the scale: the map's and the fit's own
-EXACT = 0.005  # of the extent: residuals below are not looked at for correlation
+MIN_FIXES = 5
+MAX_PAIRS = 2000  # of fixes, tried as initial solutions
+MIN_ERROR = 0.005  # relative, of the scale: error of the arc lengths and of the fit
+EXACT = 0.005  # of the extent: smaller residuals are rounding, not correlated receiver errors
 MIN_INDEPENDENT = 4.0  # fixes
-WORST_SCALE = 0.2  # relative standard error from which GPS says nothing of use
-NAMED = 3  # photos, in a sentence about several
+MAX_SCALE_ERROR = 0.2  # relative standard error above which GPS is not used
+MAX_LISTED = 3  # photos named in a message
 # WGS 84 (EPSG:4326): equatorial radius, m, and first eccentricity squared.
 RADIUS, ECCENTRICITY2 = 6378137.0, 6.69437999014e-3
 
 
 @dataclass(frozen=True)
 class Georeference:
-    """What GPS says of a levelled scene.
+    """Similarity between a scene in the world frame and its GPS positions.
 
     Attributes:
-        scale: metres by GPS in one metre of the scene as it is.
-        scale_error: relative standard error.
-        heading: angle from the scene's x axis to east, rad.
-        shift: east and north of the scene's origin, m, in the frame about `origin`.
-        origin: latitude and longitude, degrees, of the frame's origin.
-        spread: robust standard deviation of a GPS coordinate from its photo's, m.
-        photos: number of photos used.
-        left_out: names of the photos whose places are too far off to be used.
+        scale: Metres according to GPS per metre of the scene.
+        scale_error: Relative standard error of `scale`.
+        heading: Angle from the scene's x axis to east, rad.
+        shift: East and north of the scene's origin, m, relative to `origin`.
+        origin: Latitude and longitude, degrees.
+        spread: Robust standard deviation of a GPS coordinate about the camera position, m.
+        photos: Number of photos used.
+        left_out: Names of the photos excluded as outliers.
     """
 
     scale: float
@@ -47,12 +47,12 @@ class Georeference:
 
 
 @dataclass(frozen=True)
-class Unused:
-    """GPS that tells nothing of a scene.
+class UnusableGps:
+    """GPS positions that do not determine scale and heading.
 
     Attributes:
-        photos: number of photos that know their place.
-        reason: why that is not enough, as a clause.
+        photos: Number of photos with a GPS position.
+        reason: Why they are not sufficient, as a clause.
     """
 
     photos: int
@@ -60,66 +60,83 @@ class Unused:
 
 
 def east_north(
-    places: Float[np.ndarray, "n 2"], origin: Float[np.ndarray, "2"]
+    positions: Float[np.ndarray, "n 2"], origin: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Metres east and north of an origin, for places (latitude, longitude in degrees) near it.
+    """Convert geographic positions to metres east and north of a nearby origin.
 
-    Arcs of the ellipsoid's meridian and parallel at the origin: within 10 km exact to a metre.
+    The conversion uses arcs of the ellipsoid's meridian and parallel at the origin; within 10 km it
+    is exact to a metre.
+
+    Args:
+        positions: Latitude and longitude, degrees.
+        origin: Latitude and longitude, degrees.
     """
     latitude = math.radians(origin[0])
     w = math.sqrt(1 - ECCENTRICITY2 * math.sin(latitude) ** 2)
-    meridian, across = RADIUS * (1 - ECCENTRICITY2) / w**3, RADIUS / w
-    d = np.radians(places - origin)
-    d[:, 1] = (d[:, 1] + np.pi) % (2 * np.pi) - np.pi  # over the date line
-    return np.stack([d[:, 1] * across * math.cos(latitude), d[:, 0] * meridian], axis=-1)
+    meridian_radius, normal_radius = RADIUS * (1 - ECCENTRICITY2) / w**3, RADIUS / w
+    d = np.radians(positions - origin)
+    d[:, 1] = (d[:, 1] + np.pi) % (2 * np.pi) - np.pi  # across the date line
+    east = d[:, 1] * normal_radius * math.cos(latitude)
+    return np.stack([east, d[:, 0] * meridian_radius], axis=-1)
 
 
 def find_georeference(
-    scene: Scene, places: dict[str, tuple[float, float, float]]
-) -> Georeference | Unused:
-    """Fits a level similarity from the scene's camera positions to their GPS places.
+    scene: Scene, positions: Mapping[str, tuple[float, float, float]]
+) -> Georeference | UnusableGps:
+    """Fit a horizontal similarity from the camera positions to their GPS positions.
 
-    Up stays as it is: GPS heights are worse than the vertical lines of a picture. Robust, since a
-    phone's first fixes may be far off.
+    Up stays unchanged, because GPS heights are less accurate than the vertical edges of images. The
+    fit is robust, because the first fixes of a phone may be far off.
 
     Args:
-        scene: levelled.
-        places: latitude, longitude (degrees) and altitude (m) by picture name.
+        scene: Scene aligned to the world frame.
+        positions: Latitude, longitude (degrees) and altitude (m) by image name.
 
     Returns:
-        Why it says nothing where fewer than five photos know their place, they lie too close
-        together or the places are too inexact.
+        `UnusableGps` if there are fewer than `MIN_FIXES` different fixes, they are too close
+        together, or they are too inaccurate.
     """
-    own, where, names = _fixes(scene, places)
+    local, geographic, names = _fixes(scene, positions)
     photos = sum(map(len, names))
-    if len(own) < FEWEST:
-        return Unused(photos, f"it names {len(own)} different places, and {FEWEST} are needed")
-    origin = np.median(where, axis=0)
-    flat = east_north(where, origin)
-    target, source = flat[:, 0] + 1j * flat[:, 1], own[:, 0] + 1j * own[:, 1]
-    turn, shift, weight = _similarity(source, target)
-    sound = weight > 0
-    source, away = source[sound], (target - turn * source - shift)[sound]
+    if len(local) < MIN_FIXES:
+        return UnusableGps(
+            photos, f"it has {len(local)} distinct position(s), and {MIN_FIXES} are needed"
+        )
+    origin = np.median(geographic, axis=0)
+    metric = east_north(geographic, origin)
+    target, source = metric[:, 0] + 1j * metric[:, 1], local[:, 0] + 1j * local[:, 1]
+    factor, shift, weight = _similarity(source, target)
+    inlier = weight > 0
+    source, residual = source[inlier], (target - factor * source - shift)[inlier]
     extent = math.sqrt(float((np.abs(source - source.mean()) ** 2).mean()))
-    # What is left of places that fit all but exactly is rounding, not a receiver's drift.
-    exact = float(np.abs(away).max()) < EXACT * abs(turn) * extent
-    independent = float(len(away)) if exact else _independent(away)
-    # The fit takes 4 of the 2 n degrees of freedom; with two independent fixes none is left.
-    if abs(turn) * extent < 1e-9:
-        return Unused(photos, "the photos lie too close together")
+    # Residuals of nearly exact positions are rounding errors, without the drift of a receiver.
+    exact = float(np.abs(residual).max()) < EXACT * abs(factor) * extent
+    independent = float(len(residual)) if exact else _independent_count(residual)
+    if abs(factor) * extent < 1e-9:
+        return UnusableGps(photos, "the photos are too close together")
+    # The fit has 4 parameters and 2 n observations, so 2 independent fixes leave no residual.
     if independent < MIN_INDEPENDENT:
-        drift = f"its errors drift from photo to photo, which leaves {independent:.1f} fixes"
-        return Unused(photos, f"{drift} where {MIN_INDEPENDENT:g} are needed")
-    spread = math.sqrt(float((np.abs(away) ** 2).mean()) / 2 * independent / (independent - 2))
-    error = spread / (abs(turn) * extent * math.sqrt(independent))
-    if error > WORST_SCALE:
-        apart = f"its places are off by {spread:.1f} m, and the photos lie within about"
-        return Unused(photos, f"{apart} {2 * abs(turn) * extent:.1f} m of each other")
-    left_out = [name for some, kept in zip(names, sound, strict=True) if not kept for name in some]
+        return UnusableGps(
+            photos,
+            f"its errors drift from photo to photo, which leaves {independent:.1f} independent"
+            f" positions where {MIN_INDEPENDENT:g} are needed",
+        )
+    variance = float((np.abs(residual) ** 2).mean()) / 2
+    spread = math.sqrt(variance * independent / (independent - 2))
+    error = spread / (abs(factor) * extent * math.sqrt(independent))
+    if error > MAX_SCALE_ERROR:
+        return UnusableGps(
+            photos,
+            f"its positions are off by {spread:.1f} m, and the photos lie within about"
+            f" {2 * abs(factor) * extent:.1f} m of each other",
+        )
+    left_out = [
+        name for group, used in zip(names, inlier, strict=True) if not used for name in group
+    ]
     return Georeference(
-        scale=float(abs(turn)),
+        scale=float(abs(factor)),
         scale_error=error,
-        heading=float(np.angle(turn)),
+        heading=float(np.angle(factor)),
         shift=(float(shift.real), float(shift.imag)),
         origin=(float(origin[0]), float(origin[1])),
         spread=spread,
@@ -128,81 +145,47 @@ def find_georeference(
     )
 
 
-def gps_warning(found: Georeference | Unused, sources: Mapping[str, str]) -> str | None:
-    """What the user should know of GPS that is not used; None if there is none or all is.
+def gps_warning(found: Georeference | UnusableGps, sources: Mapping[str, str]) -> str | None:
+    """Return a warning about GPS positions that are not used; None if there is nothing to report.
 
     Args:
-        found: what came of it.
-        sources: the user's name of each photo, by picture name.
+        found: Result of `find_georeference`.
+        sources: The user's name of each photo, by image name.
     """
-    if isinstance(found, Unused):
+    if isinstance(found, UnusableGps):
         if not found.photos:
             return None
         return f"GPS of {found.photos} photos is of no use here: {found.reason}."
     if not found.left_out:
         return None
-    named = ", ".join(sources.get(name, name) for name in found.left_out[:NAMED])
-    more = ", ..." if len(found.left_out) > NAMED else ""
+    listed = ", ".join(sources.get(name, name) for name in found.left_out[:MAX_LISTED])
+    more = ", ..." if len(found.left_out) > MAX_LISTED else ""
     return (
         f"GPS of {len(found.left_out)} of {found.photos + len(found.left_out)} photos is far from"
-        f" where the pictures put them and is left out: {named}{more}."
+        f" their camera positions and is left out: {listed}{more}."
     )
 
 
-def _fixes(
-    scene: Scene, places: dict[str, tuple[float, float, float]]
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], list[list[str]]]:
-    """Camera positions, m, latitude and longitude, and the photos of each fix, in views' order.
-
-    A receiver that lags gives one fix to several photos: those are one, at their mean position.
-    """
-    own, where, names = [], [], []
-    for view in scene.views:
-        if view.name not in places:
-            continue
-        position, place = scene.c2w_world(view)[:2, 3], places[view.name][:2]
-        if where and place == where[-1]:
-            own[-1] = own[-1] + position
-            names[-1].append(view.name)
-        else:
-            own.append(position)
-            where.append(place)
-            names.append([view.name])
-    if not own:
-        return np.empty((0, 2)), np.empty((0, 2)), []
-    count = np.array([len(some) for some in names])
-    return np.array(own) / count[:, None], np.array(where), names
-
-
-def _independent(away: Complex[np.ndarray, "n"]) -> float:
-    """How many independent fixes these count for: a receiver's errors change slowly.
-
-    By the correlation r of neighbours, n (1 - r) / (1 + r) (Bartlett 1946), r being corrected for
-    what a short series and the fit take from it.
-    """
-    n = len(away)
-    power = float((np.abs(away) ** 2).sum())
-    if n < FEWEST:
-        return float(n)
-    r = float(np.real(away[1:] * away[:-1].conj()).sum()) / power
-    r = min(max(r + (2 + 4 * r) / n, 0.0), 0.99)
-    return n * (1 - r) / (1 + r)
-
-
 def apply_georeference(scene: Scene, found: Georeference, keep_scale: bool) -> Scene:
-    """The scene with x to the east and y to the north, and GPS's scale unless a better is known."""
+    """Return the scene with x pointing east and y north.
+
+    Args:
+        scene: The scene that was given to `find_georeference`.
+        found: Its result.
+        keep_scale: Keep the scene's scale and only report that of GPS.
+    """
     error = max(found.scale_error, MIN_ERROR)
     if keep_scale:
         out = with_scale_evidence(scene, "gps", found.scale, error)
     else:
         out = rescaled(scene, found.scale, "gps", error)
-    turn = np.eye(4)
+    transform = np.eye(4)
     c, s = math.cos(found.heading), math.sin(found.heading)
-    turn[:2, :2] = [[c, -s], [s, c]]
-    turn[:2, 3] = found.shift
+    transform[:2, :2] = [[c, -s], [s, c]]
+    transform[:2, 3] = found.shift
     return replace(
         out,
-        world_from_input=turn @ out.world_from_input,
+        world_from_input=transform @ out.world_from_input,
         georeference={
             "latitude": found.origin[0],
             "longitude": found.origin[1],
@@ -212,35 +195,85 @@ def apply_georeference(scene: Scene, found: Georeference, keep_scale: bool) -> S
     )
 
 
+def _fixes(
+    scene: Scene, positions: Mapping[str, tuple[float, float, float]]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], list[list[str]]]:
+    """Return camera position (m), latitude and longitude (degrees), and photos of each fix.
+
+    Consecutive photos with the same GPS position share one fix of a slow receiver. Their mean
+    camera position is used.
+    """
+    local, geographic, names = [], [], []
+    for view in scene.views:
+        if view.name not in positions:
+            continue
+        camera, fix = scene.c2w_world(view)[:2, 3], positions[view.name][:2]
+        if geographic and fix == geographic[-1]:
+            local[-1] = local[-1] + camera
+            names[-1].append(view.name)
+        else:
+            local.append(camera)
+            geographic.append(fix)
+            names.append([view.name])
+    if not local:
+        return np.empty((0, 2)), np.empty((0, 2)), []
+    count = np.array([len(group) for group in names])
+    return np.array(local) / count[:, None], np.array(geographic), names
+
+
+def _independent_count(residual: Complex[np.ndarray, "n"]) -> float:
+    """Return the effective number of independent fixes; receiver errors change slowly.
+
+    It is n (1 - r) / (1 + r) for the correlation r of consecutive residuals (Bartlett 1946), with r
+    corrected for the bias of a short series after a fit.
+    """
+    n = len(residual)
+    power = float((np.abs(residual) ** 2).sum())
+    if n < MIN_FIXES:
+        return float(n)
+    r = float(np.real(residual[1:] * residual[:-1].conj()).sum()) / power
+    r = min(max(r + (2 + 4 * r) / n, 0.0), 0.99)
+    return n * (1 - r) / (1 + r)
+
+
 def _similarity(
     source: Complex[np.ndarray, "n"], target: Complex[np.ndarray, "n"]
 ) -> tuple[complex, complex, Float[np.ndarray, "n"]]:
-    """target = turn * source + shift: least median of squares, then weighted least squares.
+    """Fit target = factor * source + shift by least median of squares, then least squares.
 
-    The start is the pair of photos whose similarity leaves the smallest median distance, so up to
-    half of the places may be wrong. Weights are 0 for those.
+    The initial solution is the pair of points whose similarity gives the smallest median distance,
+    so up to half of the targets may be outliers.
+
+    Args:
+        source: Positions as complex numbers.
+        target: Corresponding positions.
+
+    Returns:
+        Factor (scale and rotation), shift, and weights: 0 for outliers, otherwise 1.
     """
     n = len(source)
     i, j = np.triu_indices(n, 1)
-    apart = source[j] - source[i]
-    far = np.flatnonzero(np.abs(apart) > 0.3 * np.abs(apart).max())
-    far = far[:: max(1, len(far) // MAX_PAIRS)]
-    if not len(far):
+    baseline = source[j] - source[i]
+    pairs = np.flatnonzero(np.abs(baseline) > 0.3 * np.abs(baseline).max())
+    pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
+    if not len(pairs):
         return 0j, complex(target.mean()), np.ones(n)
-    turns = (target[j[far]] - target[i[far]]) / apart[far]
-    shifts = target[i[far]] - turns * source[i[far]]
-    away = np.abs(target - turns[:, None] * source - shifts[:, None])
-    best = int(np.argmin(np.median(away, axis=1)))
-    turn, shift = complex(turns[best]), complex(shifts[best])
+    factors = (target[j[pairs]] - target[i[pairs]]) / baseline[pairs]
+    shifts = target[i[pairs]] - factors * source[i[pairs]]
+    distance = np.abs(target - factors[:, None] * source - shifts[:, None])
+    best = int(np.argmin(np.median(distance, axis=1)))
+    factor, shift = complex(factors[best]), complex(shifts[best])
     weight = np.ones(n)
     for _ in range(20):
-        gap = np.abs(target - turn * source - shift)
-        # Of few places the best half fits by chance (Rousseeuw and Leroy 1987).
-        sigma = (1 + 5 / max(n - 2, 1)) * float(np.median(gap)) / 1.1774
-        sigma = max(sigma, 1e-9)  # exact places: 0/0
-        weight = (gap < 4 * sigma).astype(float)
+        distance = np.abs(target - factor * source - shift)
+        # The correction for few points is that of Rousseeuw and Leroy (1987); 1.1774 is the median
+        # of a Rayleigh distribution.
+        sigma = (1 + 5 / max(n - 2, 1)) * float(np.median(distance)) / 1.1774
+        sigma = max(sigma, 1e-9)  # m: exact positions have a median of 0
+        weight = (distance < 4 * sigma).astype(float)
         ms, mt = np.average(source, weights=weight), np.average(target, weights=weight)
         p, q = source - ms, target - mt
-        turn = complex((weight * q * p.conj()).sum() / max((weight * abs(p) ** 2).sum(), 1e-12))
-        shift = complex(mt - turn * ms)
-    return turn, shift, weight
+        # 1e-12: all inliers at one position give 0 / 0.
+        factor = complex((weight * q * p.conj()).sum() / max((weight * abs(p) ** 2).sum(), 1e-12))
+        shift = complex(mt - factor * ms)
+    return factor, shift, weight

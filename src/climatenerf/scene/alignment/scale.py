@@ -1,7 +1,7 @@
-"""Metres: which evidence sets them, what the other evidence says, and where they disagree.
+"""The scale of a scene: the evidence that sets it, the other evidence, and disagreements.
 
-`Scene.scale_report` holds, for each piece of evidence that does not set the scale, `times` (how
-many times as large as it is the scene would be by it) and `error` (relative standard error).
+`Scene.scale_report` holds, for each piece of evidence that does not set the scale, `times` (scale
+according to it, relative to the scale in use) and `error` (relative standard error).
 """
 
 from dataclasses import replace
@@ -12,30 +12,31 @@ from climatenerf.scene.alignment.ground_plane import find_ground
 from climatenerf.scene.images import load_depth
 from climatenerf.scene.scene import Scene
 
-MIN_DEPTHS = 5  # points in a view, and views, that depth files must reach
-MIN_ERROR = 0.01  # of the scale by depth files
-MAX_SPREAD = 0.15  # of log depth over points: metric depth is within a tenth nearly everywhere
-ASSUMED_WARNING = "The scale is assumed"  # how the warning begins
-SIGMAS = 2.0  # between two pieces of evidence, from which the user is warned
+MIN_DEPTHS = 5  # points per view, and views, that a scale from depth files needs
+MIN_DEPTH_ERROR = 0.01  # relative, of a scale from depth files
+MAX_SPREAD = 0.15  # of log depth over points: metric depth is mostly within a tenth
+MIN_HEIGHT_ERROR = 0.05  # relative, of a scale from the camera height
+ASSUMED_WARNING = "The scale is assumed"  # first words of the warning
+SIGMAS = 2.0  # difference between two pieces of evidence that is worth a warning
 
 
 def rescaled(scene: Scene, factor: float, source: str, error: float) -> Scene:
-    """The scene `factor` times as large about its ground datum, by better evidence.
+    """Return the scene enlarged by `factor` about its ground datum, on new evidence.
 
     Args:
-        scene: levelled.
-        factor: new metres in one of the present ones, > 0.
-        source: the evidence's name, for `scale_source`.
-        error: its relative standard error.
+        scene: Scene aligned to the world frame.
+        factor: New metres per present metre, > 0.
+        source: Name of the evidence, for `scale_source`.
+        error: Relative standard error of the evidence.
     """
     report = {k: {**v, "times": v["times"] / factor} for k, v in scene.scale_report.items()}
     report[scene.scale_source] = {"times": 1 / factor, "error": scene.scale_error}
     report.pop(source, None)
-    turn = np.diag([factor, factor, factor, 1.0])
-    turn[2, 3] = (1 - factor) * scene.ground_z
+    similarity = np.diag([factor, factor, factor, 1.0])
+    similarity[2, 3] = (1 - factor) * scene.ground_z
     return replace(
         scene,
-        world_from_input=turn @ scene.world_from_input,
+        world_from_input=similarity @ scene.world_from_input,
         scale_source=source,
         scale_error=error,
         scale_report=report,
@@ -45,66 +46,41 @@ def rescaled(scene: Scene, factor: float, source: str, error: float) -> Scene:
 
 
 def with_scale_evidence(scene: Scene, name: str, times: float, error: float) -> Scene:
-    """The scene with one more piece of evidence that does not set its scale."""
-    witness = {"times": times, "error": error}
-    return replace(scene, scale_report={**scene.scale_report, name: witness})
+    """Return the scene with evidence added to its report, without changing its scale.
+
+    Args:
+        scene: Scene aligned to the world frame.
+        name: Name of the evidence.
+        times: Scale according to the evidence, relative to the scale in use.
+        error: Relative standard error.
+    """
+    entry = {"times": times, "error": error}
+    return replace(scene, scale_report={**scene.scale_report, name: entry})
 
 
 def rescale_by_camera_height(scene: Scene, height: float) -> Scene | None:
-    """The scene in the metres in which its cameras are `height` above the ground below them.
+    """Return the scene scaled so that its cameras are `height` metres above the ground.
 
-    Up, heading and place stay. None where no ground is seen.
+    Up, heading and position stay. None if no ground is found below the cameras.
     """
     points = scene.points_world()
-    eyes = np.stack([scene.c2w_world(view)[:3, 3] for view in scene.views])
-    ground = None if points is None else find_ground(points, eyes)
+    cameras = np.stack([scene.c2w_world(view)[:3, 3] for view in scene.views])
+    ground = None if points is None else find_ground(points, cameras)
     if ground is None:
         return None
-    error = max(0.05, round(ground.spread, 3))
+    error = max(MIN_HEIGHT_ERROR, round(ground.spread, 3))
     return rescaled(scene, height / ground.camera_height, "camera-height", error)
 
 
-def scale_summary(scene: Scene) -> str:
-    """What sets the scale and what the others say, in one clause."""
-    words = [f"scale from {scene.scale_source} (+-{percent(scene.scale_error)})"]
-    for name, said in scene.scale_report.items():
-        words.append(f"{name} says {said['times']:.2f} times that (+-{percent(said['error'])})")
-    return "; ".join(words)
-
-
-def with_capture_flags(scene: Scene) -> Scene:
-    """The scene with the flags named that `capture` knows too where its scale is assumed."""
-    remedy = "; give --camera-height or --known-length."
-    told = [
-        w.partition("; give ")[0] + remedy if w.startswith(ASSUMED_WARNING) else w
-        for w in scene.warnings
-    ]
-    return replace(scene, warnings=tuple(told))
-
-
-def percent(share: float) -> str:
-    """A share as text: 30%, 0.5%."""
-    return f"{share:.0%}" if share >= 0.0095 else f"{share:.1%}"
-
-
-def scale_warnings(scene: Scene) -> list[str]:
-    """Where two pieces of evidence are further apart than their errors allow."""
-    out = []
-    for name, said in scene.scale_report.items():
-        apart, allowed = abs(np.log(said["times"])), SIGMAS * (said["error"] + scene.scale_error)
-        if apart > allowed:
-            out.append(
-                f"{name} makes the scene {said['times']:.2f} times as large as"
-                f" {scene.scale_source} does; check both."
-            )
-    return out
-
-
 def scale_from_depth_files(scene: Scene) -> tuple[float, float] | None:
-    """How many times as large the scene is by its views' depth files, and the relative error.
+    """Return the scale according to the depth files, relative to the scale in use, and its error.
 
-    The median over views of the median ratio of file to sparse points. None where the files do not
-    measure: relative depths have no one ratio.
+    The scale is the median over views of the median ratio of file depth to sparse-point depth; the
+    error is its relative standard error. None if fewer than `MIN_DEPTHS` views have points with
+    depth, or if the ratios vary too much within a view, as those of relative depth do.
+
+    Raises:
+        UserError: A depth file cannot be read.
     """
     points, ratios, spreads = scene.points_world(), [], []
     for view in scene.views:
@@ -123,6 +99,42 @@ def scale_from_depth_files(scene: Scene) -> tuple[float, float] | None:
             spreads.append(float(np.median(np.abs(ratio - np.median(ratio)))))
     if len(ratios) < MIN_DEPTHS or np.median(spreads) > MAX_SPREAD:
         return None
-    middle = float(np.median(ratios))
-    apart = 1.4826 * float(np.median(np.abs(np.array(ratios) - middle)))
-    return float(np.exp(middle)), max(apart / np.sqrt(len(ratios)), MIN_ERROR)
+    median = float(np.median(ratios))
+    # 1.4826: standard deviation of a normal distribution over its median absolute deviation.
+    sigma = 1.4826 * float(np.median(np.abs(np.array(ratios) - median)))
+    return float(np.exp(median)), max(sigma / np.sqrt(len(ratios)), MIN_DEPTH_ERROR)
+
+
+def scale_summary(scene: Scene) -> str:
+    """Return the source of the scale and the scales of the other evidence, in one clause."""
+    clauses = [f"scale from {scene.scale_source} (+-{percent(scene.scale_error)})"]
+    clauses += [
+        f"{name}: {entry['times']:.2f} times that (+-{percent(entry['error'])})"
+        for name, entry in scene.scale_report.items()
+    ]
+    return "; ".join(clauses)
+
+
+def scale_warnings(scene: Scene) -> list[str]:
+    """Return a warning for each piece of evidence that differs by more than the errors allow."""
+    return [
+        f"The scale from {name} is {entry['times']:.2f} times the one from {scene.scale_source};"
+        " check both."
+        for name, entry in scene.scale_report.items()
+        if abs(np.log(entry["times"])) > SIGMAS * (entry["error"] + scene.scale_error)
+    ]
+
+
+def with_capture_flags(scene: Scene) -> Scene:
+    """Return the scene with the warning of an assumed scale naming the flags of `capture`."""
+    remedy = "; give --camera-height or --known-length."
+    warnings = [
+        w.partition("; give ")[0] + remedy if w.startswith(ASSUMED_WARNING) else w
+        for w in scene.warnings
+    ]
+    return replace(scene, warnings=tuple(warnings))
+
+
+def percent(fraction: float) -> str:
+    """Format a fraction as a percentage: 30%, 0.5%."""
+    return f"{fraction:.0%}" if fraction >= 0.0095 else f"{fraction:.1%}"

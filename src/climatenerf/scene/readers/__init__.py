@@ -1,1 +1,1 @@
-"""Readers of captures, one for each format."""
+"""Readers of capture formats, one module per format."""

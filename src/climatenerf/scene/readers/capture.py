@@ -1,4 +1,4 @@
-"""What every reader hands over, and the checks on poses and intrinsics that all of them share."""
+"""The result of every reader, and the checks of poses and intrinsics that all readers share."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from climatenerf.core.errors import UserError
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import View
 
-# No real pose, focal length or size comes near; beyond it squares and products overflow.
-_LARGEST = 1e12
+# No real pose, focal length or size comes near; above it, products of several numbers overflow.
+_MAX_VALUE = 1e12
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture as its files describe it, before pictures are checked and the world is levelled.
+    """A capture as its files describe it, before the images are checked and the world is aligned.
 
     Attributes:
         root: Absolute folder of the capture.
-        source: Name of the reader.
-        cameras: Intrinsics as the files give them.
-        views: All pictures that the poses name, whether the disk has them or not.
+        source: Name of the format.
+        cameras: Intrinsics as stored in the files.
+        views: All images with poses, whether or not the image files exist.
         points: Sparse points in the input frame, or None.
-        own_split: Whether the views' splits are the capture's own.
-        metric: Whether the input frame is known to be in metres with z up.
-        label_space: What the numbers in its label files mean; see `label_spaces.py`.
+        predefined_split: Whether the capture defines the split of its views.
+        metric: Whether the input frame is in metres with z up.
+        label_space: Numbering of the ids in its label files; see `label_spaces.py`.
         warnings: Sentences for the user.
     """
 
@@ -40,21 +40,25 @@ class Capture:
     cameras: tuple[Camera, ...]
     views: tuple[View, ...]
     points: Float[np.ndarray, "n 3"] | None = None
-    own_split: bool = False
+    predefined_split: bool = False
     metric: bool = False
     label_space: str = TRAIN_IDS
     warnings: tuple[str, ...] = ()
 
 
 def checked_camera(camera: Camera, where: str) -> Camera:
-    """The camera itself if its numbers can be used.
+    """Return the camera if its numbers are usable.
+
+    Args:
+        camera: Intrinsics as read.
+        where: File, for the message.
 
     Raises:
         UserError: A size or focal length is not positive, or a number is not finite.
     """
     numbers = (camera.cx, camera.cy, camera.k1, camera.k2, camera.k3, camera.k4)
     numbers += (camera.p1, camera.p2, camera.fx, camera.fy)
-    if not all(math.isfinite(n) and abs(n) < _LARGEST for n in numbers):
+    if not all(math.isfinite(n) and abs(n) < _MAX_VALUE for n in numbers):
         raise UserError(
             f"A camera in {where} has intrinsics that are not finite or far too large; calibrate "
             "again."
@@ -64,7 +68,7 @@ def checked_camera(camera: Camera, where: str) -> Camera:
             f"A camera in {where} has focal length {min(camera.fx, camera.fy):g} pixels; it must "
             "be above 0, so calibrate again or correct the file."
         )
-    if not (0 < camera.width < _LARGEST and 0 < camera.height < _LARGEST):
+    if not (0 < camera.width < _MAX_VALUE and 0 < camera.height < _MAX_VALUE):
         raise UserError(
             f"A camera in {where} has size {camera.width}x{camera.height} pixels; correct the file."
         )
@@ -72,18 +76,18 @@ def checked_camera(camera: Camera, where: str) -> Camera:
 
 
 def checked_pose(matrix: Any, name: str, where: str) -> Float[np.ndarray, "4 4"]:
-    """A 4x4 camera-to-input pose with an orthonormal rotation.
+    """Return a 4x4 camera-to-input pose with an orthonormal rotation.
 
-    A common scale of the three axes and up to 2 % of non-orthonormality (rounded numbers) are
-    taken out; anything else is an error.
+    A common scale of the three axes and up to 2 % of non-orthonormality (rounded digits) are
+    removed; anything else is an error.
 
     Args:
         matrix: 3x4 or 4x4 numbers.
-        name: Name of the picture, for the message.
+        name: Name of the image, for the message.
         where: File, for the message.
 
     Raises:
-        UserError: The pose is not finite or holds no rotation.
+        UserError: The pose is not a finite matrix or contains no rotation.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
@@ -91,17 +95,17 @@ def checked_pose(matrix: Any, name: str, where: str) -> Float[np.ndarray, "4 4"]
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)):
         raise UserError(f"The pose of {name} in {where} is not a 4x4 matrix; correct the file.")
-    if not np.isfinite(pose).all() or np.abs(pose).max() > _LARGEST:
+    if not np.isfinite(pose).all() or np.abs(pose).max() > _MAX_VALUE:
         raise UserError(
-            f"The pose of {name} in {where} is not finite or far too large; remove that picture or "
-            "pose it again."
+            f"The pose of {name} in {where} is not finite or far too large; remove that image or "
+            "compute its pose again."
         )
     u, stretch, vt = np.linalg.svd(pose[:3, :3])
     mean = stretch.mean()
     if mean < 1e-12 or np.abs(stretch / mean - 1).max() > 0.02 or np.linalg.det(u @ vt) < 0:
         raise UserError(
-            f"The pose of {name} in {where} holds no rotation matrix (sheared, mirrored or zero); "
-            "remove that picture or pose it again."
+            f"The pose of {name} in {where} contains no rotation matrix (sheared, mirrored or "
+            "zero); remove that image or compute its pose again."
         )
     out = np.eye(4)
     out[:3, :3] = u @ vt

@@ -1,7 +1,7 @@
 """COLMAP sparse models, text and binary.
 
-Formats as COLMAP's documentation (format.html) gives them: world-to-camera, Hamilton quaternions
-with w first, x right, y down, z forward, top-left pixel centre at (0.5, 0.5).
+The formats follow COLMAP's documentation (format.html): world-to-camera poses, Hamilton quaternions
+with w first, camera axes x right, y down, z forward, centre of the top-left pixel at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 
 class _Image(NamedTuple):
-    """An entry of the images file."""
+    """One entry of the images file."""
 
     name: str
     camera: int
     c2w: Float[np.ndarray, "4 4"]
     points: Int[np.ndarray, " k"]
-    """Ids of the points of its features, -1 where a feature has none."""
+    """Point id of each feature, -1 for a feature without a point."""
 
 
 def model_folders(root: Path) -> list[Path]:
-    """Folders below `root` that hold a sparse model, or `root` itself if it is one."""
+    """Return the folders below `root` that contain a sparse model, or `root` if it is one."""
     if _suffix(root):
         return [root]
     candidates = [root / "sparse", *_subfolders(root / "sparse")]
@@ -67,11 +67,11 @@ def model_folders(root: Path) -> list[Path]:
 
 
 def read_colmap(root: Path) -> Capture:
-    """Read the sub-model with the most pictures below `root`.
+    """Read the sub-model with the most images below `root`.
 
     Args:
         root: Folder with `images/` and `sparse/0/`, `sparse/` or several `sparse/N/`; or a model
-            folder itself, the pictures then being looked for around it.
+            folder, in which case the images are searched in it and in the two folders above.
 
     Raises:
         UserError: A file is damaged, the model is empty, or its camera model is not supported.
@@ -81,7 +81,7 @@ def read_colmap(root: Path) -> Capture:
     missing = {image.camera for image in chosen} - set(by_id)
     if missing:
         raise UserError(
-            f"{model} has a picture with camera {min(missing)}, which its cameras file lacks; "
+            f"{model} has an image with camera {min(missing)}, which its cameras file lacks; "
             "export the model again."
         )
     ids = sorted({image.camera for image in chosen})
@@ -93,7 +93,7 @@ def read_colmap(root: Path) -> Capture:
             path=folder / image.name,
             camera=ids.index(image.camera),
             c2w=image.c2w,
-            seen=_rows(image.points, point_ids),
+            seen=_observed_rows(image.points, point_ids),
         )
         for image in chosen
     )
@@ -108,35 +108,39 @@ def read_colmap(root: Path) -> Capture:
 
 
 def largest_model(root: Path) -> Path:
-    """The folder that `read_colmap` reads.
+    """Return the model folder that `read_colmap` reads.
 
     Raises:
-        UserError: There is none, or it is empty or damaged.
+        UserError: There is no model, or it is empty or damaged.
     """
     return _largest(root)[0]
 
 
 def _largest(root: Path) -> tuple[Path, list[_Image], tuple[str, ...]]:
-    """The model folder with most pictures, its pictures, and a warning if there are others."""
+    """Return the model folder with the most images, its images, and warnings."""
     models = model_folders(root)
     if not models:
-        raise UserError(f"{root} holds no COLMAP model (sparse/0/cameras.bin or .txt).")
+        raise UserError(
+            f"{root} contains no COLMAP model (sparse/0/cameras.bin or .txt); give the folder of a"
+            " reconstruction."
+        )
     poses = [(m, _read_images(m)) for m in models]
-    # max keeps the first of equals, and folders come sorted.
+    # `max` returns the first of equal models, and the folders are sorted.
     model, chosen = max(poses, key=lambda p: len(p[1]))
     if not chosen:
-        raise UserError(f"The COLMAP model {model} has no posed picture; run the mapper again.")
+        raise UserError(f"The COLMAP model {model} has no image with a pose; run the mapper again.")
     if len(models) == 1:
         return model, chosen, ()
     sizes = ", ".join(f"{m.name}: {len(p)}" for m, p in poses)
     warning = (
-        f"COLMAP left {len(models)} separate models (pictures in each: {sizes}); "
+        f"COLMAP produced {len(models)} separate models (images in each: {sizes}); "
         f"{model.name} is used, the others are left out."
     )
     return model, chosen, (warning,)
 
 
 def _suffix(folder: Path) -> str | None:
+    """Return the suffix of the model files in a folder, None if it contains no model."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")):
             return suffix
@@ -151,7 +155,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _image_folder(root: Path, names: list[str]) -> tuple[Path, Path]:
-    """The capture's folder and, in it, the folder that has most of the named pictures."""
+    """Return the capture's folder and the folder in it that has most of the named images."""
     roots = [root, root.parent, root.parent.parent] if _suffix(root) else [root]
     best, best_count = (roots[0], roots[0] / "images"), 0
     for base in roots:
@@ -166,7 +170,14 @@ def _image_folder(root: Path, names: list[str]) -> tuple[Path, Path]:
 def camera_from_params(
     model: str, width: int, height: int, params: list[float], where: str
 ) -> Camera:
-    """A camera from COLMAP's model name and parameter list.
+    """Return a camera from COLMAP's model name and parameter list.
+
+    Args:
+        model: Name such as "OPENCV".
+        width: Image width, pixels.
+        height: Image height, pixels.
+        params: Parameters in COLMAP's order.
+        where: File, for the message.
 
     Raises:
         UserError: The model is unknown or not supported, or has the wrong number of parameters.
@@ -192,8 +203,8 @@ def camera_from_params(
         k.update(zip(("k1", "k2", "p1", "p2", "k3"), params[4:9], strict=False))
     else:
         raise UserError(
-            f"The camera model {model} in {where} is not supported; undistort the pictures "
-            "(colmap image_undistorter) and give the result."
+            f"The camera model {model} in {where} is not supported; undistort the images "
+            "(colmap image_undistorter) and use the result."
         )
     camera = Camera(int(width), int(height), fx, fy, cx, cy, fisheye="FISHEYE" in model)
     return checked_camera(replace(camera, **k), where)
@@ -202,11 +213,13 @@ def camera_from_params(
 def _pose(q: list[float], t: list[float], name: str, where: str) -> Float[np.ndarray, "4 4"]:
     if not np.isfinite(q).all() or not np.isfinite(t).all() or np.abs([*q, *t]).max() > 1e12:
         raise UserError(
-            f"The pose of {name} in {where} is not finite or far too large; remove that picture or "
-            "pose it again."
+            f"The pose of {name} in {where} is not finite or far too large; remove that image or "
+            "compute its pose again."
         )
     if np.linalg.norm(q) < 1e-6:
-        raise UserError(f"The pose of {name} in {where} has a zero quaternion; pose it again.")
+        raise UserError(
+            f"The pose of {name} in {where} has a zero quaternion; compute its pose again."
+        )
     rotation = rotation_matrices(np.array(q))
     c2w = np.eye(4)
     c2w[:3, :3] = rotation.T
@@ -215,38 +228,43 @@ def _pose(q: list[float], t: list[float], name: str, where: str) -> Float[np.nda
 
 
 class _Cursor:
-    """Reads little-endian values off a file, and says which file when it ends too early."""
+    """Reads little-endian values from a file; errors name the file."""
 
     def __init__(self, path: Path):
         self.path = path
         try:
             self.data = path.read_bytes()
         except OSError as error:
-            raise UserError(f"{path} cannot be read ({error.strerror}).") from None
-        self.at = 0
+            raise UserError(
+                f"{path} cannot be read ({error.strerror}); export the COLMAP model again."
+            ) from None
+        self.offset = 0
 
     def damaged(self) -> UserError:
         return UserError(f"{self.path} is truncated or damaged; export the COLMAP model again.")
 
     def take(self, form: str) -> tuple:
+        """Return values in a format of the `struct` module, without its byte order."""
         form = "<" + form
         try:
-            values = struct.unpack_from(form, self.data, self.at)
+            values = struct.unpack_from(form, self.data, self.offset)
         except struct.error:
             raise self.damaged() from None
-        self.at += struct.calcsize(form)
+        self.offset += struct.calcsize(form)
         return values
 
     def skip(self, size: int) -> None:
-        self.at += size
-        if self.at > len(self.data):
+        """Advance by `size` bytes."""
+        self.offset += size
+        if self.offset > len(self.data):
             raise self.damaged()
 
     def name(self) -> str:
-        end = self.data.find(b"\0", self.at)
+        """Return a zero-terminated name."""
+        end = self.data.find(b"\0", self.offset)
         if end < 0:
             raise self.damaged()
-        raw, self.at = self.data[self.at : end], end + 1
+        raw, self.offset = self.data[self.offset : end], end + 1
         try:
             text = raw.decode("utf-8")
         except UnicodeDecodeError:
@@ -269,7 +287,7 @@ def _read_cameras(model: Path) -> dict[int, Camera]:
                 raise cursor.damaged()
             raise UserError(
                 f"The camera model with id {kind} in {path} is not supported; undistort the "
-                "pictures (colmap image_undistorter) and give the result."
+                "images (colmap image_undistorter) and use the result."
             )
         name, count = MODELS[kind]
         params = list(cursor.take(f"{count}d"))
@@ -286,7 +304,7 @@ def _read_images(model: Path) -> list[_Image]:
     for _ in range(cursor.take("Q")[0]):
         values = cursor.take("I7dI")
         name = cursor.name()
-        count, start = cursor.take("Q")[0], cursor.at
+        count, start = cursor.take("Q")[0], cursor.offset
         cursor.skip(24 * count)
         observed = np.frombuffer(cursor.data, _FEATURE, count, start)["point"]
         pose = _pose(list(values[1:5]), list(values[5:8]), name, str(path))
@@ -294,18 +312,20 @@ def _read_images(model: Path) -> list[_Image]:
     return out
 
 
-def _rows(observed: Int[np.ndarray, " k"], ids: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Rows of the points with the observed ids; features without a point have id -1."""
+def _observed_rows(
+    observed: Int[np.ndarray, " k"], ids: Int[np.ndarray, " n"]
+) -> Int[np.ndarray, " m"]:
+    """Return the sorted rows of the points with the observed ids; id -1 has no row."""
     if not len(ids):
         return np.empty(0, np.int64)
     order = np.argsort(ids)
-    place = np.searchsorted(ids, observed, sorter=order).clip(max=len(ids) - 1)
-    row = order[place]
+    position = np.searchsorted(ids, observed, sorter=order).clip(max=len(ids) - 1)
+    row = order[position]
     return np.unique(row[ids[row] == observed])
 
 
 def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Ids and positions of the points."""
+    """Return ids and positions, input frame, of the points with finite positions."""
     path = model / f"points3D{_suffix(model)}"
     if not path.is_file():
         return np.empty(0, np.int64), np.empty((0, 3))
@@ -319,7 +339,7 @@ def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray
     else:
         cursor = _Cursor(path)
         count = cursor.take("Q")[0]
-        if count * 51 > len(cursor.data):
+        if count * 51 > len(cursor.data):  # 51 bytes: a point without its track
             raise cursor.damaged()
         ids, points = np.empty(count, np.int64), np.empty((count, 3))
         for i in range(count):
@@ -331,12 +351,20 @@ def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray
 
 
 def _lines(path: Path) -> list[str]:
-    """Lines without comments; empty ones stay, as they mean pictures without features."""
+    """Return the lines without comments; an empty line means an image without features."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read as text ({error}).") from None
+        raise UserError(
+            f"{path} cannot be read as text ({error}); export the COLMAP model again."
+        ) from None
     return [line.strip() for line in text.splitlines() if not line.startswith("#")]
+
+
+def _line_error(path: Path, line: str) -> UserError:
+    return UserError(
+        f"{path} has an unreadable line: {line[:60]!r}; export the COLMAP model again."
+    )
 
 
 def _cameras_text(path: Path) -> dict[int, Camera]:
@@ -347,7 +375,7 @@ def _cameras_text(path: Path) -> dict[int, Camera]:
             key, width, height = int(words[0]), int(words[2]), int(words[3])
             params = [float(w) for w in words[4:]]
         except (ValueError, IndexError):
-            raise UserError(f"{path} has an unreadable line: {line[:60]!r}.") from None
+            raise _line_error(path, line) from None
         out[key] = camera_from_params(words[1], width, height, params, str(path))
     return out
 
@@ -366,7 +394,7 @@ def _images_text(path: Path) -> list[_Image]:
             camera, name = int(words[8]), words[9]
             observed = np.array([int(w) for w in features.split()[2::3]], np.int64)
         except (ValueError, IndexError, OverflowError):
-            raise UserError(f"{path} has an unreadable line: {line[:60]!r}.") from None
+            raise _line_error(path, line) from None
         pose = _pose(numbers[:4], numbers[4:], name, str(path))
         out.append(_Image(name, camera, pose, observed))
     return out

@@ -1,14 +1,14 @@
-"""Positions of a PLY point cloud: enough to read sparse points and to write them."""
+"""Positions of PLY point clouds: reading and writing of sparse points."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.storage import write_bytes
 
 _TYPES = {
     "char": "i1",
@@ -31,7 +31,7 @@ _TYPES = {
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
-    """Read x, y, z of the vertices of an ASCII or binary PLY file, in the file's units.
+    """Read the vertex positions of an ASCII or binary PLY file, in the units of the file.
 
     Points that are not finite are left out.
 
@@ -41,7 +41,9 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     try:
         raw = path.read_bytes()
     except OSError as error:
-        raise UserError(f"The points {path} cannot be read ({error.strerror}).") from None
+        raise UserError(
+            f"The points {path} cannot be read ({error.strerror}); restore the file."
+        ) from None
     try:
         points = _parse(raw)
     except (ValueError, KeyError, IndexError) as error:
@@ -49,42 +51,6 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
             f"The points {path} are not a readable PLY point cloud ({error}); export them again."
         ) from None
     return points[np.isfinite(points).all(axis=1)]
-
-
-def _parse(raw: bytes) -> np.ndarray:
-    end = raw.find(b"end_header")
-    if not raw.startswith(b"ply") or end < 0:
-        raise ValueError("no PLY header")
-    body = raw.index(b"\n", end) + 1
-    style, count, names, seen_vertex = "", 0, [], False
-    for line in raw[:end].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if words[:1] == ["format"]:
-            style = words[1]
-        elif words[:1] == ["element"]:
-            if words[1] == "vertex":
-                count, seen_vertex = int(words[2]), True
-            elif not seen_vertex:
-                raise ValueError("vertices are not the first element")
-            else:
-                break
-        elif words[:1] == ["property"] and seen_vertex:
-            names.append((words[2], _TYPES[words[1]]))
-    if not {"x", "y", "z"} <= {n for n, _ in names}:
-        raise ValueError("vertices without x, y, z")
-    if style == "ascii":
-        lines = raw[body:].decode("ascii", "replace").splitlines()[:count]
-        table = np.array([[float(w) for w in line.split()[: len(names)]] for line in lines])
-        if len(table) < count:
-            raise ValueError("fewer points than announced")
-        columns = [[n for n, _ in names].index(axis) for axis in "xyz"]
-        return table.reshape(count, len(names))[:, columns]
-    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[style]
-    kind = np.dtype([(n, order + t) for n, t in names])
-    if len(raw) - body < count * kind.itemsize:
-        raise ValueError("fewer points than announced")
-    table = np.frombuffer(raw, kind, count, body)
-    return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=-1)
 
 
 def write_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
@@ -98,13 +64,45 @@ def write_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
         f"element vertex {len(points)}\n"
         "property double x\nproperty double y\nproperty double z\nend_header\n"
     )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(header.encode() + np.ascontiguousarray(points, "<f8").tobytes())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UserError(
-            f"{path} cannot be written ({error.strerror}); free some space or choose another "
-            "folder."
-        ) from None
+    write_bytes(path, header.encode() + np.ascontiguousarray(points, "<f8").tobytes())
+
+
+def _parse(raw: bytes) -> Float[np.ndarray, "n 3"]:
+    end = raw.find(b"end_header")
+    if not raw.startswith(b"ply") or end < 0:
+        raise ValueError("no PLY header")
+    body = raw.index(b"\n", end) + 1
+    encoding, count, properties = _parse_header(raw[:end].decode("ascii", "replace"))
+    names = [name for name, _ in properties]
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError("vertices without x, y, z")
+    if encoding == "ascii":
+        lines = raw[body:].decode("ascii", "replace").splitlines()[:count]
+        table = np.array([[float(w) for w in line.split()[: len(names)]] for line in lines])
+        if len(table) < count:
+            raise ValueError("fewer points than the header declares")
+        return table.reshape(count, len(names))[:, [names.index(axis) for axis in "xyz"]]
+    order = {"binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
+    kind = np.dtype([(name, order + type_) for name, type_ in properties])
+    if len(raw) - body < count * kind.itemsize:
+        raise ValueError("fewer points than the header declares")
+    table = np.frombuffer(raw, kind, count, body)
+    return np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+
+
+def _parse_header(header: str) -> tuple[str, int, list[tuple[str, str]]]:
+    """Return the encoding, the number of vertices, and their properties as (name, NumPy type)."""
+    encoding, count, properties, in_vertex = "", 0, [], False
+    for line in header.splitlines():
+        words = line.split()
+        if words[:1] == ["format"]:
+            encoding = words[1]
+        elif words[:1] == ["element"]:
+            if in_vertex:
+                break
+            if words[1] != "vertex":
+                raise ValueError("vertices are not the first element")
+            count, in_vertex = int(words[2]), True
+        elif words[:1] == ["property"] and in_vertex:
+            properties.append((words[2], _TYPES[words[1]]))
+    return encoding, count, properties

@@ -1,10 +1,10 @@
-"""The layout of NSVF, which Tanks and Temples scenes for radiance fields come in.
+"""The NSVF layout, in which Tanks and Temples scenes for radiance fields are distributed.
 
 `pose/STEM.txt` is the camera-to-world pose of `rgb/STEM.png` (or `images/`), 4x4, with OpenCV axes
-(+x right, +y down, +z forward), in units of no known length. Stems that begin with `0_` are for
-training, `1_` and `2_` for testing. `intrinsics.txt` is one pinhole camera for all: a 4x4 matrix,
-on four lines or one, or else its first number is the focal length and the principal point is the
-pictures' centre. `bbox.txt`, `near_and_far.txt` and `camera_path/` are not needed.
+(x right, y down, z forward), in an unknown unit of length. The prefix `0_` of a stem marks training
+images, `1_` and `2_` mark test images. `intrinsics.txt` is one pinhole camera for all images. It is
+a 4x4 matrix, on four lines or one; otherwise its first number is the focal length and the principal
+point is the image centre. `bbox.txt`, `near_and_far.txt` and `camera_path/` are not used.
 """
 
 from __future__ import annotations
@@ -15,47 +15,47 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.scene.images import picture_header
+from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
-from climatenerf.scene.readers.text import numbers, text_lines
+from climatenerf.scene.readers.text import parse_numbers, text_lines
 from climatenerf.scene.scene import View
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-_HELDOUT = ("1_", "2_")
+_TEST_PREFIXES = ("1_", "2_")
 
 
 def is_tanks_temples(root: Path) -> bool:
-    """Whether `root` has poses in this layout."""
+    """Return whether `root` has poses in this layout."""
     return any((root / "pose").glob("*.txt"))
 
 
 def read_tanks_temples(root: Path) -> Capture:
-    """Read `pose/*.txt`, `intrinsics.txt` and the pictures' size.
+    """Read `pose/*.txt`, `intrinsics.txt` and the size of the images.
 
-    Pictures for testing are held out; where none are, the split is not the capture's own.
+    Test images are held out. A capture without test images has no predefined split.
 
     Raises:
-        UserError: A file is missing or damaged, or no pose has a picture.
+        UserError: A file is missing or damaged, or no pose has an image.
     """
     folder = next((f for f in (root / "rgb", root / "images") if f.is_dir()), None)
     if folder is None:
-        raise UserError(f"{root} has poses but neither rgb/ nor images/; add the pictures.")
+        raise UserError(f"{root} has poses but neither rgb/ nor images/; add the images.")
     files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix in _SUFFIXES}
     poses = {p.stem: p for p in sorted((root / "pose").glob("*.txt"))}
     posed = [files[stem] for stem in poses if stem in files]
     if not posed:
         raise UserError(
-            f"No picture in {folder} has the name of a pose in {root / 'pose'}, such as"
-            f" {next(iter(poses))}.png; name them alike."
+            f"No image in {folder} has the name of a pose in {root / 'pose'}; rename the images,"
+            f" such as {next(iter(poses))}.png."
         )
-    header = picture_header(posed[0])
+    header = read_header(posed[0])
     views = tuple(
         View(
-            name=(picture := files.get(stem, folder / f"{stem}.png")).name,
-            path=picture,
+            name=(image := files.get(stem, folder / f"{stem}.png")).name,
+            path=image,
             camera=0,
-            c2w=_pose(path, picture.name),
-            split="heldout" if stem.startswith(_HELDOUT) else "train",
+            c2w=_pose(path, image.name),
+            split="heldout" if stem.startswith(_TEST_PREFIXES) else "train",
         )
         for stem, path in poses.items()
     )
@@ -65,9 +65,9 @@ def read_tanks_temples(root: Path) -> Capture:
         source="tanks-temples",
         cameras=(_camera(root / "intrinsics.txt", header.width, header.height),),
         views=views,
-        own_split=any(v.split == "heldout" for v in views),
+        predefined_split=any(v.split == "heldout" for v in views),
         warnings=(
-            (f"{len(unposed)} pictures have no pose (first: {unposed[0]}); they are left out.",)
+            (f"{len(unposed)} images have no pose (first: {unposed[0]}); they are left out.",)
             if unposed
             else ()
         ),
@@ -75,7 +75,7 @@ def read_tanks_temples(root: Path) -> Capture:
 
 
 def _pose(path: Path, name: str) -> np.ndarray:
-    values = [value for line in text_lines(path) for value in numbers(line, path)]
+    values = [value for line in text_lines(path) for value in parse_numbers(line, path)]
     if len(values) not in (12, 16):
         raise UserError(
             f"{path} has {len(values)} numbers instead of the 16 of a 4x4 pose; export it again."
@@ -84,11 +84,11 @@ def _pose(path: Path, name: str) -> np.ndarray:
 
 
 def _camera(path: Path, width: int, height: int) -> Camera:
-    lines = [numbers(line, path) for line in text_lines(path)]
+    lines = [parse_numbers(line, path) for line in text_lines(path)]
     values = [value for line in lines for value in line]
     if not values:
-        raise UserError(f"{path} is empty; it must hold the 4x4 intrinsics.")
-    # A matrix begins with fx and no skew; the other kind with f alone or f, cx, cy.
+        raise UserError(f"{path} is empty; write the 4x4 intrinsics to it.")
+    # A matrix begins with fx and zero skew; the short form with f alone or f, cx, cy.
     if len(values) == 16 or (len(lines[0]) == 4 and values[1] == 0):
         if len(values) not in (12, 16):
             raise UserError(
@@ -96,7 +96,7 @@ def _camera(path: Path, width: int, height: int) -> Camera:
                 " again."
             )
         if abs(values[1]) > 1e-3 * abs(values[0]):
-            raise UserError(f"{path} has skew, which is not supported; undistort the pictures.")
+            raise UserError(f"{path} has skew, which is not supported; undistort the images.")
         fx, fy, cx, cy = values[0], values[5], values[2], values[6]
     else:
         fx = fy = values[0]
@@ -104,7 +104,7 @@ def _camera(path: Path, width: int, height: int) -> Camera:
     camera = checked_camera(Camera(width, height, fx, fy, cx, cy), str(path))
     if not (0 < cx < width and 0 < cy < height):
         raise UserError(
-            f"{path} has its principal point at ({cx:g}, {cy:g}), outside of the {width}x{height}"
-            " pictures, so it is for another size; use the pictures that it was made for."
+            f"{path} has its principal point at ({cx:g}, {cy:g}), outside the {width}x{height}"
+            " images, so it belongs to another image size; use the images that it was made for."
         )
     return camera

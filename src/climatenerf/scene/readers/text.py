@@ -1,4 +1,4 @@
-"""Text files of numbers, as data sets keep poses and calibrations in."""
+"""Parsing of text files that hold numbers, such as poses and calibrations."""
 
 from __future__ import annotations
 
@@ -12,22 +12,26 @@ from climatenerf.core.errors import UserError
 
 
 def text_lines(path: Path) -> list[str]:
-    """The lines of a text file that are not empty.
+    """Return the non-empty lines of a text file, stripped.
 
     Raises:
-        UserError: The file is missing or no text.
+        UserError: The file is missing or not text.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise UserError(f"{path} is missing; get it from where the capture came from.") from None
+        raise UserError(f"{path} is missing; restore it from the source of the capture.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read as text ({error}); replace it.") from None
     return [line.strip() for line in text.splitlines() if line.strip()]
 
 
-def numbers(line: str, path: Path) -> list[float]:
-    """The numbers of a line with spaces between; `path` is named in the message.
+def parse_numbers(line: str, path: Path) -> list[float]:
+    """Return the whitespace-separated numbers of a line.
+
+    Args:
+        line: The text.
+        path: File, for the message.
 
     Raises:
         UserError: A word is not a number.
@@ -36,49 +40,57 @@ def numbers(line: str, path: Path) -> list[float]:
         return [float(word) for word in line.split()]
     except ValueError:
         raise UserError(
-            f"{path} has a line that is not numbers only: {line[:60]!r}; correct it."
+            f"{path} has a line that contains more than numbers: {line[:60]!r}; correct it."
         ) from None
 
 
 def keyed_lines(path: Path) -> dict[str, str]:
-    """What follows each `KEY:` of a file of such lines.
+    """Return the text after each `KEY:` of a file with one key per line.
 
     Raises:
-        UserError: The file is missing or no text.
+        UserError: The file is missing or not text.
     """
     pairs = [line.partition(":") for line in text_lines(path)]
     return {key.strip(): rest for key, _, rest in pairs}
 
 
-def matrix_of(
+def parse_array(
     texts: Mapping[str, str], key: str, shape: tuple[int, ...], path: Path
 ) -> Float[np.ndarray, "*shape"]:
-    """The numbers of one key in the given shape; `path` is named in the message.
+    """Return the numbers of one key of `keyed_lines` in the given shape.
+
+    Args:
+        texts: Text by key.
+        key: Which entry to parse.
+        shape: Shape of the result.
+        path: File, for the message.
 
     Raises:
-        UserError: The key is absent, or its numbers are too few, too many or not finite.
+        UserError: The key is absent, or its numbers do not fit the shape or are not finite.
     """
     if key not in texts:
-        raise UserError(f"{path} has no {key}; get the file again.")
-    values = np.array(numbers(texts[key], path))
+        raise UserError(f"{path} has no {key}; download the file again.")
+    values = np.array(parse_numbers(texts[key], path))
     if values.size != np.prod(shape) or not np.isfinite(values).all():
-        raise UserError(f"{key} in {path} is not {np.prod(shape)} finite numbers; get it again.")
+        raise UserError(
+            f"{key} in {path} is not {np.prod(shape)} finite numbers; download the file again."
+        )
     return values.reshape(shape)
 
 
 def frame_rows(path: Path, count: int) -> dict[int, list[float]]:
-    """`count` numbers by frame, of lines that begin with the frame.
+    """Return `count` numbers by frame, from lines of a frame number followed by the numbers.
 
     Raises:
-        UserError: The file is missing, or a line has another number of numbers.
+        UserError: The file is missing, or a line has the wrong number of numbers.
     """
     out: dict[int, list[float]] = {}
     for line in text_lines(path):
-        values = numbers(line, path)
+        values = parse_numbers(line, path)
         if len(values) != count + 1 or not np.isfinite(values[0]):
             raise UserError(
                 f"{path} has a line of {len(values)} numbers instead of a frame and {count}:"
-                f" {line[:40]!r}; get the file again."
+                f" {line[:40]!r}; download the file again."
             )
         out[int(values[0])] = values[1:]
     return out

@@ -1,33 +1,34 @@
 """`transforms.json` of nerfstudio, instant-ngp and the Blender scenes.
 
-Poses are camera-to-world with OpenGL axes (+x right, +y up, +z backward); columns 1 and 2 are
-negated on reading. The file's own frame is the input frame: nerfstudio's `applied_transform` is
-part of it and is not undone, instant-ngp's `scale` and `offset` belong to its viewer and are not
-applied.
+Poses are camera-to-world with OpenGL axes (x right, y up, z backward); columns 1 and 2 are negated
+on reading to give OpenCV axes. The frame of the file is the input frame. It already includes
+nerfstudio's `applied_transform`, which is not undone. instant-ngp's `scale` and `offset` concern
+its viewer and are not applied.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.scene.images import picture_header
+from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.ply import read_points
 from climatenerf.scene.scene import View
 
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
-_PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+_PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
 
 
 def transforms_files(root: Path) -> list[Path]:
-    """The file or files below `root` that describe the capture; `root` may be the file itself."""
+    """Return the files that describe the capture in folder `root`, or `root` if it is the file."""
     if root.is_file():
         siblings = [root.parent / n for n in SPLIT_FILES]
         return [s for s in siblings if s.is_file()] if root.name in SPLIT_FILES else [root]
@@ -39,32 +40,32 @@ def transforms_files(root: Path) -> list[Path]:
 def read_transforms(root: Path) -> Capture:
     """Read `transforms.json`, or the three `transforms_{train,val,test}.json` of Blender scenes.
 
-    The capture's own split is kept: `{train,val,test}_filenames`, or the three files. Of the
-    latter, pictures for testing are held out (validation ones only where no test file exists).
+    A predefined split is kept: `{train,val,test}_filenames`, or the three files. Of the three
+    files, test images are held out; validation images are used only if there is no test file.
 
     Raises:
-        UserError: A file is damaged or describes a camera or pose that cannot be used.
+        UserError: A file is damaged, or contains a camera or pose that is not supported.
     """
     files = transforms_files(root)
     if not files:
-        raise UserError(f"{root} holds no transforms.json.")
+        raise UserError(f"{root} contains no transforms.json; give the folder of a capture.")
     base = files[0].parent
     by_name = {f.name: f for f in files}
     if SPLIT_FILES[0] in by_name and SPLIT_FILES[2] in by_name:
         by_name.pop(SPLIT_FILES[1], None)
     cameras: dict[Camera, int] = {}
     views: list[View] = []
-    points, own_split, unlisted = None, False, 0
+    points, predefined_split, unlisted = None, False, 0
     for name, path in by_name.items():
         data = _load(path)
-        train, heldout = _own_split(data)
-        own_split |= bool(train or heldout) or name in SPLIT_FILES
+        train, heldout = _listed_split(data)
+        predefined_split |= bool(train or heldout) or name in SPLIT_FILES
         for frame in data["frames"]:
             view = _view(frame, data, base, path, cameras)
-            key = _plain(frame["file_path"])
-            out = key in heldout or name in SPLIT_FILES[1:]
-            if not train or key in train or out:
-                views.append(replace(view, split="heldout" if out else "train"))
+            key = _normalised(frame["file_path"])
+            held_out = key in heldout or name in SPLIT_FILES[1:]
+            if not train or key in train or held_out:
+                views.append(replace(view, split="heldout" if held_out else "train"))
             else:
                 unlisted += 1
         cloud = data.get("ply_file_path")
@@ -73,7 +74,7 @@ def read_transforms(root: Path) -> Capture:
     if unlisted and not views:
         raise UserError(
             f"The lists of {files[0].name} (train_filenames, ...) name none of its frames; correct"
-            " them, or remove them to have every 8th picture held out."
+            " them, or remove them to hold out every 8th image."
         )
     return Capture(
         root=base,
@@ -81,9 +82,9 @@ def read_transforms(root: Path) -> Capture:
         cameras=tuple(cameras),
         views=tuple(views),
         points=points if points is not None and len(points) else None,
-        own_split=own_split,
+        predefined_split=predefined_split,
         warnings=(
-            (f"{unlisted} pictures are in none of the lists of {files[0].name} and are left out.",)
+            (f"{unlisted} images are in none of the lists of {files[0].name}; they are left out.",)
             if unlisted
             else ()
         ),
@@ -100,45 +101,46 @@ def _load(path: Path) -> dict[str, Any]:
         raise UserError(f"{path} has no list of frames; export it again.")
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise UserError(f"Frame {i} of {path} names no file_path; export it again.")
+            raise UserError(f"Frame {i} of {path} has no file_path; export it again.")
     return data
 
 
-def _plain(file_path: str) -> str:
+def _normalised(file_path: str) -> str:
     return file_path.replace("\\", "/").removeprefix("./")
 
 
-def _own_split(data: dict[str, Any]) -> tuple[set[str], set[str]]:
+def _listed_split(data: dict[str, Any]) -> tuple[set[str], set[str]]:
+    """Return the file paths listed for training and those listed for validation or testing."""
     names = {k: data.get(f"{k}_filenames") for k in ("train", "val", "test")}
     names = {k: v if isinstance(v, list) else [] for k, v in names.items()}
-    plain = {k: {_plain(str(n)) for n in v} for k, v in names.items()}
-    return plain["train"], (plain["val"] | plain["test"])
+    paths = {k: {_normalised(str(n)) for n in v} for k, v in names.items()}
+    return paths["train"], (paths["val"] | paths["test"])
 
 
 def _view(
     frame: dict[str, Any],
     data: dict[str, Any],
     base: Path,
-    where: Path,
+    file: Path,
     cameras: dict[Camera, int],
 ) -> View:
-    plain = _plain(frame["file_path"])
-    path = base / plain
+    relative = _normalised(frame["file_path"])
+    path = base / relative
     if not path.is_file() and path.suffix.lower() not in (s.lower() for s in _IMAGE_SUFFIXES):
         found = [p for s in _IMAGE_SUFFIXES if (p := Path(f"{path}{s}")).is_file()]
         path = found[0] if found else Path(f"{path}.png")
-    name = plain.removeprefix("images/")
+    name = relative.removeprefix("images/")
     name = name if Path(name).suffix == path.suffix else name + path.suffix
-    pose = checked_pose(frame.get("transform_matrix"), name, str(where))
+    pose = checked_pose(frame.get("transform_matrix"), name, str(file))
     pose[:3, 1:3] *= -1
     mask = frame.get("mask_path")
-    camera = _camera(frame, data, path, str(where))
+    camera = _camera(frame, data, path, str(file))
     return View(
         name=name,
         path=path,
         camera=cameras.setdefault(camera, len(cameras)),
         c2w=pose,
-        mask_path=base / _plain(mask) if isinstance(mask, str) else None,
+        mask_path=base / _normalised(mask) if isinstance(mask, str) else None,
     )
 
 
@@ -152,43 +154,23 @@ def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str)
 
     model = str(frame.get("camera_model", data.get("camera_model", "OPENCV")))
     fisheye = model == "OPENCV_FISHEYE" or bool(frame.get("is_fisheye", data.get("is_fisheye")))
-    if model not in (*_PLAIN_MODELS, "OPENCV_FISHEYE"):
+    if model not in (*_PERSPECTIVE_MODELS, "OPENCV_FISHEYE"):
         raise UserError(
-            f"The camera model {model} in {where} is not supported; undistort the pictures "
-            "(nerfstudio or colmap image_undistorter) and give the result."
+            f"The camera model {model} in {where} is not supported; undistort the images "
+            "(nerfstudio or colmap image_undistorter) and use the result."
         )
     width, height = number("w"), number("h")
     if width is None or height is None:
-        # A picture that is missing gets a placeholder; it is left out later anyway.
-        header = picture_header(path) if path.is_file() else None
+        # A missing image gets a placeholder size; it is left out later.
+        header = read_header(path) if path.is_file() else None
         width, height = (header.width, header.height) if header else (1.0, 1.0)
-    fx, fy = number("fl_x"), number("fl_y")
-    if fx is None:
-        angle = number("camera_angle_x")
-        if angle is None and fy is None:
-            raise UserError(
-                f"{where} has neither fl_x nor camera_angle_x, so the focal length is unknown; "
-                "add one of them."
-            )
-        if angle is None:
-            fx = fy
-        else:
-            _check_angle(angle, where)
-            fx = 0.5 * width / math.tan(0.5 * angle)
-    if fy is None:
-        angle = number("camera_angle_y")
-        if angle is None or number("fl_x") is not None:
-            fy = fx
-        else:
-            _check_angle(angle, where)
-            fy = 0.5 * height / math.tan(0.5 * angle)
+    fx, fy = _focal_lengths(number, width, height, where)
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")
     if not fisheye and number("k4", 0.0):
         raise UserError(
             f"{where} has k4 without a fisheye camera_model, which OpenCV's perspective model "
-            "lacks; undistort the pictures or name OPENCV_FISHEYE."
+            "lacks; undistort the images or set camera_model to OPENCV_FISHEYE."
         )
-    assert fx is not None and fy is not None
     camera = Camera(
         width=int(width) if math.isfinite(width) else 0,
         height=int(height) if math.isfinite(height) else 0,
@@ -202,9 +184,29 @@ def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str)
     return checked_camera(camera, where)
 
 
-def _check_angle(angle: float, where: str) -> None:
+def _focal_lengths(
+    number: Callable[[str], float | None], width: float, height: float, where: str
+) -> tuple[float, float]:
+    """Return fx and fy, pixels, from `fl_x` and `fl_y` or from the angles of view."""
+    fx, fy = number("fl_x"), number("fl_y")
+    if fx is None and (angle := number("camera_angle_x")) is not None:
+        fx = _focal_from_angle(width, angle, where)
+        if fy is None and (angle := number("camera_angle_y")) is not None:
+            fy = _focal_from_angle(height, angle, where)
+    if fx is not None:
+        return fx, fx if fy is None else fy
+    if fy is None:
+        raise UserError(
+            f"{where} has neither fl_x nor camera_angle_x, so the focal length is unknown; "
+            "add one of them."
+        )
+    return fy, fy
+
+
+def _focal_from_angle(size: float, angle: float, where: str) -> float:
     if not 0 < angle < math.pi:
         raise UserError(
             f"The camera angle {angle:g} in {where} is not between 0 and pi radians, so the focal "
             "length would be 0; correct the file."
         )
+    return 0.5 * size / math.tan(0.5 * angle)
