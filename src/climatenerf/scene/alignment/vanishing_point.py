@@ -111,27 +111,38 @@ def _vertical_direction(camera: Camera, guess: np.ndarray) -> Float[np.ndarray, 
 
 
 def _regions(
-    ys: Int[np.ndarray, " n"], xs: Int[np.ndarray, " n"], kind: Int[np.ndarray, " n"], shape
+    ys: Int[np.ndarray, " n"],
+    xs: Int[np.ndarray, " n"],
+    kind: Int[np.ndarray, " n"],
+    shape: tuple[int, ...],
 ) -> Int[np.ndarray, " n"]:
-    """Label connected components (8 neighbours) of pixels of equal kind, numbered from 0."""
+    """Label connected components (8 neighbours) of pixels of equal kind.
+
+    Args:
+        ys: Pixel rows.
+        xs: Pixel columns.
+        kind: Direction bin of each pixel.
+        shape: Height and width of the image.
+
+    Returns:
+        Component of each pixel, numbered from 0 in the order of their first pixels.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(ys)
+    if not count:
+        return np.empty(0, np.int64)
     index = np.full((shape[0] + 2, shape[1] + 2), -1, dtype=np.int64)
-    index[ys + 1, xs + 1] = np.arange(len(ys))
-    pairs = []
+    index[ys + 1, xs + 1] = np.arange(count)
+    edges = []
     for dy, dx in ((0, 1), (1, -1), (1, 0), (1, 1)):
-        other = index[ys + 1 + dy, xs + 1 + dx]
-        linked = (other >= 0) & (kind[other] == kind)
-        pairs.append(np.stack([np.nonzero(linked)[0], other[linked]]))
-    a, b = np.concatenate(pairs, axis=1)
-    label = np.arange(len(ys))
-    while True:
-        # Hook the larger root under the smaller one, then flatten all trees.
-        low, high = np.minimum(label[a], label[b]), np.maximum(label[a], label[b])
-        if (low == high).all():
-            break
-        np.minimum.at(label, high, low)
-        while (label[label] != label).any():
-            label = label[label]
-    return np.unique(label, return_inverse=True)[1]
+        neighbour = index[ys + 1 + dy, xs + 1 + dx]
+        linked = (neighbour >= 0) & (kind[neighbour] == kind)
+        edges.append(np.stack([np.nonzero(linked)[0], neighbour[linked]]))
+    a, b = np.concatenate(edges, axis=1)
+    graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
 
 
 def _fit_segments(
