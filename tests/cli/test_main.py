@@ -54,7 +54,7 @@ def test_help_lists_every_verb_and_imports_nothing_heavy():
     assert f"climatenerf {climatenerf.__version__}\n" in done.stdout
 
 
-def test_a_reader_that_leaves_early_is_no_error():
+def test_a_closed_pipe_is_no_error():
     words = [sys.executable, "-m", "climatenerf", "--help"]
     buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     pipe = subprocess.PIPE
@@ -66,7 +66,7 @@ def test_a_reader_that_leaves_early_is_no_error():
     assert process.wait(timeout=60) == 0
 
 
-def test_no_verb_and_wrong_verbs(capsys):
+def test_missing_and_unknown_verbs_are_refused(capsys):
     assert cli.main([]) == 2
     assert "usage:" in capsys.readouterr().out
     assert cli.main(["rendr"]) == 2
@@ -125,7 +125,7 @@ def run(options):
         time.sleep(0.5)
         print("READY", flush=True)
         time.sleep(60)
-# Whoever began the tests may have asked for these to be ignored.
+# The parent process may ignore these signals.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 module = types.ModuleType("a_verb")
@@ -137,7 +137,7 @@ sys.exit(cli.main(["fit"]))
 
 
 def stopped_in_a_terminal(how):
-    """What a terminal shows of a verb that a signal ends, and the exit status."""
+    """Return the terminal output of a verb that a signal ends, and its exit status."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-c", IN_A_TERMINAL],
@@ -148,7 +148,7 @@ def stopped_in_a_terminal(how):
     while True:
         try:
             more = os.read(ours, 4096)
-        except OSError:  # Linux's way to say that the other side is closed
+        except OSError:  # on Linux: the other side is closed
             break
         if b"READY" in more and b"READY" not in shown:
             process.send_signal(how)
@@ -162,7 +162,7 @@ def stopped_in_a_terminal(how):
 @pytest.mark.parametrize(
     ("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
-def test_a_signal_leaves_the_terminal_as_it_was(how, status):
+def test_a_signal_restores_the_terminal(how, status):
     shown, left = stopped_in_a_terminal(how)
     assert left == status and "Traceback" not in shown
     assert "climatenerf: interrupted" in shown
@@ -170,7 +170,7 @@ def test_a_signal_leaves_the_terminal_as_it_was(how, status):
     assert shown.rfind("\x1b[?25h") > shown.rfind("\x1b[?25l"), "and it comes back"
 
 
-def test_signals_are_as_before_after_a_verb_and_an_ignored_one_stays_so(verb):
+def test_signal_handlers_are_restored_and_ignored_signals_stay_ignored(verb):
     seen = []
     verb.run = lambda options: seen.append([signal.getsignal(n) for n in numbers])
     numbers = (signal.SIGTERM, signal.SIGHUP)
@@ -185,7 +185,7 @@ def test_signals_are_as_before_after_a_verb_and_an_ignored_one_stays_so(verb):
             signal.signal(number, handler)
 
 
-def test_a_defect_is_not_hidden(verb):
+def test_unexpected_exceptions_propagate(verb):
     verb.run = failing(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         cli.main(["fit", "--scene", "a"])

@@ -40,7 +40,7 @@ def test_plain_lines_every_ten_seconds_with_eta(clock, capsys):
     ]
 
 
-def test_preparing_says_nothing_of_the_pace(clock, capsys):
+def test_preparation_does_not_count_in_the_eta(clock, capsys):
     with progress.Bar("fit", total=100) as bar:
         clock.now += 30  # compiling
         bar.prepared(70)  # continued
@@ -52,7 +52,7 @@ def test_preparing_says_nothing_of_the_pace(clock, capsys):
     assert capsys.readouterr().err.splitlines()[-1] == "fit: 72 %  0:31 in all"
 
 
-def test_quiet_is_silent(clock, capsys):
+def test_quiet_prints_nothing(clock, capsys):
     with progress.Bar("fit", total=2, quiet=True) as bar:
         clock.now += 60
         bar.advance()
@@ -76,6 +76,28 @@ def test_terminal_shows_a_bar_with_its_columns(monkeypatch, width):
     assert "40%" in text and "step [12]" in text
     assert re.search(r"ETA +(--|\d\d?):", text), "not squeezed out by the columns"
     assert "preview saved [here]" in text
+
+
+def test_stages_have_a_bar_each_and_end_before_the_next(clock, capsys):
+    with progress.StageBars("flood: ") as bars:
+        bars("light", 0.0)
+        bars("frames", 0.5)  # half of them were rendered before
+        clock.now += 20
+        bars("frames", 0.75)
+        bars("frames", 1.0)
+    assert capsys.readouterr().err.splitlines() == [
+        "flood: light: 100 %  0:00 in all",
+        "flood: frames: 75 %  ETA 0:20",
+        "flood: frames: 100 %  0:20 in all",
+    ]
+
+
+def test_an_interrupted_stage_shows_how_far_it_was(clock, capsys):
+    with pytest.raises(KeyboardInterrupt), progress.StageBars() as bars:
+        bars("frames", 0.0)
+        bars("frames", 0.25)
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == "frames: 25 %  0:00 in all\n"
 
 
 def test_track_counts(capsys):

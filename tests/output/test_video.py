@@ -40,7 +40,7 @@ def test_movie_shows_the_frames_in_their_colours(tmp_path, size):
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_failed_block_leaves_the_old_movie(tmp_path):
+def test_a_failed_block_leaves_the_earlier_movie(tmp_path):
     path = tmp_path / "a.mp4"
     path.write_bytes(b"old")
     with pytest.raises(KeyboardInterrupt), MovieWriter(path, (64, 48), 12) as movie:
@@ -51,7 +51,7 @@ def test_failed_block_leaves_the_old_movie(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
 
 
-def test_missing_ffmpeg_lets_the_frames_be_saved(tmp_path, monkeypatch):
+def test_frames_are_saved_without_ffmpeg(tmp_path, monkeypatch):
     def nowhere():
         raise RuntimeError("No ffmpeg exe could be found.")
 
@@ -73,7 +73,7 @@ def test_missing_ffmpeg_lets_the_frames_be_saved(tmp_path, monkeypatch):
     "program", ["import sys; sys.exit('Unknown encoder libx264')", "import time; time.sleep(0.1)"]
 )
 def test_ffmpeg_that_fails_is_one_sentence(tmp_path, monkeypatch, program):
-    # The first stands for an ffmpeg that stops at once, the second for one that writes nothing.
+    # The first acts like an ffmpeg that exits at once, the second like one that writes nothing.
     fake = tmp_path / "ffmpeg"
     fake.write_text(f"#!{sys.executable}\n{program}\n")
     fake.chmod(0o755)
@@ -88,7 +88,7 @@ def test_ffmpeg_that_fails_is_one_sentence(tmp_path, monkeypatch, program):
         pass
 
 
-def test_unwritable_place(tmp_path):
+def test_an_unwritable_path_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with (
         pytest.raises(UserError, match="not a folder"),
@@ -106,7 +106,7 @@ def test_wrong_frames_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["flood 0.5 m", "überflutet 0.5 m"])
-def test_png_says_that_it_is_simulated(tmp_path, text):
+def test_a_png_is_marked_as_simulated(tmp_path, text):
     frame = next(frames(1, 9, 7))
     write_png(tmp_path / "a.png", frame, text)
     with Image.open(tmp_path / "a.png") as image:
