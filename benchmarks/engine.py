@@ -118,7 +118,7 @@ def plain_pytorch() -> Iterator[None]:
     outputs = mock.patch.multiple(
         activations,
         radiance=activations.plain_radiance,
-        thinned_density=activations.plain_thinned_density,
+        density_from_raw=activations.plain_density_from_raw,
     )
     of_directions = mock.patch.object(directions, "harmonics", directions.spherical_harmonics)
     with encodings, networks, marches, sums, outputs, of_directions:

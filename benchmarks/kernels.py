@@ -137,7 +137,7 @@ def jobs(n: int, fast: bool) -> dict[str, Callable[[], object]]:
 
     def slopes(field: Field, q: torch.Tensor) -> torch.Tensor:
         if fast:
-            return marching.density_slopes(q, field._net())
+            return marching.density_slopes(q, field.density_net)
         layers = [(w.detach(), b.detach()) for w, b in geometry]
         grid = field.geometry_grid.detach()
         return reference.density_slopes(q, grid, field.geometry_resolutions, layers)

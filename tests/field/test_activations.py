@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from climatenerf.field.activations import (
+    density_from_raw,
+    plain_density_from_raw,
     plain_radiance,
-    plain_thinned_density,
     radiance,
-    thinned_density,
 )
 from climatenerf.field.spherical_harmonics import harmonics, spherical_harmonics
 from climatenerf.ops.cpu import activations as cpu_pointwise
@@ -48,14 +48,14 @@ def test_radiance_rises_and_is_black_far_down():
     assert float(radiance(torch.tensor([[0.5, 0.5, 0.5]]))[0, 0]) == pytest.approx(1.0, abs=1e-2)
 
 
-def test_thinned_density_is_the_twins():
+def test_density_from_raw_is_the_twins():
     generator = torch.Generator().manual_seed(0)
     u = torch.rand(4000, 3, generator=generator)
     u[:100] = 0.5 + 0.2 * (u[:100] - 0.5)  # in the core, where nothing is thinned
     raw = torch.linspace(-60, 20, 4000)[torch.randperm(4000, generator=generator)]
     ours, twin = raw.clone().requires_grad_(), raw.double().requires_grad_()
-    found = thinned_density(ours, u)
-    expected = plain_thinned_density(twin, u.double())
+    found = density_from_raw(ours, u)
+    expected = plain_density_from_raw(twin, u.double())
     # At the outermost shell 2 - |u| has few digits left in 32 bits.
     assert torch.allclose(found.double(), expected, rtol=4e-3)
     inner = (4 * u - 2).norm(dim=-1) < 1.9
@@ -69,7 +69,7 @@ def test_thinned_density_is_the_twins():
 def test_positions_that_learn_keep_their_gradient():
     u = torch.full((3, 3), 0.75, requires_grad=True)
     raw = torch.zeros(3, requires_grad=True)
-    thinned_density(raw, u).sum().backward()
+    density_from_raw(raw, u).sum().backward()
     assert u.grad is not None and (u.grad < 0).all(), "thinner outwards"
 
 
@@ -102,4 +102,4 @@ def test_what_is_no_number_stays_none():
     raw = torch.linspace(-2, 2, 300).view(100, 3).clone()
     raw[7, 1] = raw[50] = torch.nan
     assert torch.equal(radiance(raw).isnan(), raw.isnan())
-    assert torch.equal(thinned_density(raw[:, 1], torch.rand(100, 3)).isnan(), raw[:, 1].isnan())
+    assert torch.equal(density_from_raw(raw[:, 1], torch.rand(100, 3)).isnan(), raw[:, 1].isnan())

@@ -33,11 +33,11 @@ def test_a_loaded_field_renders_bit_identically(tmp_path, refined):
         field.occupancy.update(field.grid_density, 1.0, 0.9, torch.Generator().manual_seed(0))
         field.occupancy.refine()
     field.occupancy.seen[0, 3:9, 2:8, 4:7] = 1
-    field.thin = 0.04
+    field.pruning_threshold = 0.04
     save_field(field, tmp_path)
     loaded = load_field(tmp_path)
     assert (loaded.size, loaded.unit, loaded.near) == (field.size, field.unit, field.near)
-    assert loaded.thin == field.thin
+    assert loaded.pruning_threshold == field.pruning_threshold
     assert loaded.state_dict().keys() == field.state_dict().keys()
     for name, tensor in field.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor), name
@@ -62,7 +62,7 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
     def earlier(about, arrays):
         about["schema_version"] = 1
         about["size"] = {k: v for k, v in about["size"].items() if "surface" not in k}
-        del about["thin"]
+        del about["pruning_threshold"]
         for name in [name for name in arrays if name.startswith(("surface_", "learned"))]:
             del arrays[name]
 
@@ -72,7 +72,20 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
     assert torch.equal(loaded.density(x), field.density(x))
     assert torch.equal(loaded.colour(x, d), field.colour(x, d))
     assert not loaded.knows_normals and not loaded.knows_classes
-    assert loaded.thin == MIN_TAU
+    assert loaded.pruning_threshold == MIN_TAU
+
+
+def test_a_field_of_the_second_version_keeps_its_pruning_threshold(tmp_path):
+    field = random_field()
+    field.pruning_threshold = 0.04
+    save_field(field, tmp_path)
+
+    def earlier(about, _):
+        about["schema_version"] = 2
+        about["thin"] = about.pop("pruning_threshold")
+
+    rewritten(tmp_path, earlier)
+    assert load_field(tmp_path).pruning_threshold == 0.04
 
 
 def test_a_folder_without_a_field(tmp_path):
@@ -116,8 +129,8 @@ def without(name):
         lambda about, arrays: arrays.update(centre=np.zeros(4, np.float32)),
         lambda about, _: about.update(unit="wide"),
         lambda about, _: about.update(unit=0.0),
-        lambda about, _: about.update(thin="a hair"),
-        lambda about, _: about.update(thin=float("nan")),
+        lambda about, _: about.update(pruning_threshold="a hair"),
+        lambda about, _: about.update(pruning_threshold=float("nan")),
         lambda about, arrays: arrays["centre"].fill(np.nan),
     ],
 )

@@ -13,7 +13,7 @@ def ends(n, t_max=1e9):
 def test_density_is_zero_where_unoccupied_and_the_networks_elsewhere():
     field = random_field()
     x = points(field, 4000)
-    occupied = field.occupancy_at(field.to_grid(x)).bool()
+    occupied = field.occupancy.occupied_at(field.to_grid(x)).bool()
     density = field.density(x)
     assert 0.1 < occupied.float().mean() < 0.5
     assert (density[~occupied] == 0).all()
@@ -158,11 +158,13 @@ def test_marching_leaves_out_what_is_thin_and_nothing_else():
     o, d = points(field, n, spread=0.5), directions(n)
     everything = field.march(o, d, *ends(n), stop=1e-38)
     tau = everything.sigma * everything.dt
-    field.thin = float(tau.median())
+    field.pruning_threshold = float(tau.median())
     some = field.march(o, d, *ends(n), stop=1e-38)
-    least, most = (int((tau > share * field.thin).sum()) for share in (1 + 1e-5, 1 - 1e-5))
+    least, most = (
+        int((tau > factor * field.pruning_threshold).sum()) for factor in (1 + 1e-5, 1 - 1e-5)
+    )
     assert 0.3 * len(tau) < least <= some.t.numel() <= most
-    assert (some.sigma * some.dt).min() > (1 - 1e-5) * field.thin
+    assert (some.sigma * some.dt).min() > (1 - 1e-5) * field.pruning_threshold
 
 
 def test_rays_of_snow_and_sun_meet_what_cameras_do():
@@ -171,7 +173,7 @@ def test_rays_of_snow_and_sun_meet_what_cameras_do():
     with torch.no_grad():
         field.geometry_net[2].zero_()
         field.geometry_net[3].fill_(2.3)  # 10 a grid unit
-    field.thin = 0.1
+    field.pruning_threshold = 0.1
     o, d = field.centre[None], torch.tensor([[0.0, 0.0, 1.0]])
     left = {}
     for name, own, start in (
@@ -184,7 +186,7 @@ def test_rays_of_snow_and_sun_meet_what_cameras_do():
         weights, rest = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
         left[name] = float(rest)
     assert left["camera"] < 1e-3 and left["snow"] < 1e-3 and left["beside"] == 1
-    assert field.thin == 0.1, "the field itself is as it was"
+    assert field.pruning_threshold == 0.1, "the field itself is as it was"
 
 
 def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
@@ -193,7 +195,7 @@ def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
         field.geometry_net[3].add_(4.0)  # dense enough for rays to end within the core
     o, d = points(field, 400, spread=0.2), directions(400)
     towards = d * torch.tensor([1.0, 1.0, 0.2])
-    field.mark_seen(o, torch.nn.functional.normalize(towards, dim=-1))
+    field.sampler.mark_seen(o, torch.nn.functional.normalize(towards, dim=-1))
     trusted = field.observed_only()
     for (name, mine), (_, shared) in zip(
         field.named_parameters(), trusted.named_parameters(), strict=True
@@ -211,7 +213,7 @@ def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
         grown[cascade, ranges[0], ranges[1], ranges[2]] = True
     assert torch.equal(kept, grown)
     x = points(field, 3000)
-    cells, inside = field._cells(field.to_grid(x))
+    cells, inside = field.occupancy.cell_index(field.to_grid(x))
     there = kept.view(-1)[cells] & inside
     density = trusted.density(x)
     assert torch.equal(density[there], field.density(x)[there])
@@ -226,7 +228,7 @@ def test_a_seen_cell_is_one_that_a_ray_ends_in():
     with torch.no_grad():
         field.geometry_net[3].add_(4.0)  # opaque everywhere: rays end at once
     o = field.centre[None] + torch.tensor([[0.3, 0.1, -0.2]])
-    field.mark_seen(o, directions(1))
+    field.sampler.mark_seen(o, directions(1))
     where = field.occupancy.seen.view(-1).nonzero()[:, 0]
     centre, _ = field.occupancy.cell_centres(where)
     assert 1 <= where.numel() <= 4

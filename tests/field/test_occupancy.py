@@ -2,7 +2,7 @@ import pytest
 import torch
 from support.random_field import random_field
 
-from climatenerf.field.occupancy import OPACITY, Occupancy
+from climatenerf.field.occupancy import MAX_THRESHOLD, Occupancy
 
 
 def ball(q, radius=0.5, density=200.0):
@@ -36,11 +36,13 @@ def test_cells_and_their_centres_agree_with_the_field():
     own = (centre.abs().amax(-1) > 2.0 ** (cascade - 1)) | (cascade == 0)
     offset = (torch.rand(centre.shape) - 0.5) * 0.99 * size[:, None]
     for q in (centre, centre + offset):
-        found, inside = field._cells(q)
+        found, inside = field.occupancy.cell_index(q)
         assert inside.all()
         assert torch.equal(found[own], cells[own])
         assert (found[~own] // occupancy.side**3 < cascade[~own]).all()
-    _, inside = field._cells(torch.tensor([[4.01, 0.0, 0.0], [0.0, -9.0, 0.0], [0.0, 0.0, 3.99]]))
+    _, inside = field.occupancy.cell_index(
+        torch.tensor([[4.01, 0.0, 0.0], [0.0, -9.0, 0.0], [0.0, 0.0, 3.99]])
+    )
     assert inside.tolist() == [False, False, True]
 
 
@@ -92,7 +94,7 @@ def test_matter_that_has_gone_is_forgotten_and_new_matter_found():
 
 def test_threshold_is_the_light_absorbed_by_crossing_a_cell():
     size = 2.0 / 16
-    for depth, expected in ((OPACITY * 0.9, 0), (OPACITY * 1.1, 1)):
+    for depth, expected in ((MAX_THRESHOLD * 0.9, 0), (MAX_THRESHOLD * 1.1, 1)):
         # One dense corner in each cascade lifts the mean above the fixed threshold.
         def density(q, depth=depth):
             cascade = (q.abs().amax(-1) > 1).float()
@@ -165,9 +167,9 @@ def test_density_met_by_rays_is_remembered():
     d = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
     samples = field.march(o, d, torch.zeros(200), torch.full((200,), 1e9))
     which = samples.t > 1.0
-    field.keep_occupied(o, d, samples, which.nonzero()[:, 0])
+    field.sampler.record_density(o, d, samples, which.nonzero()[:, 0])
     ray = samples.ray_index()
-    cells, _ = field._cells(field.to_grid(o[ray] + samples.t[:, None] * d[ray]))
+    cells, _ = field.occupancy.cell_index(field.to_grid(o[ray] + samples.t[:, None] * d[ray]))
     known = field.occupancy.density.view(-1)
     assert (known[cells[which]] >= samples.sigma[which] * field.unit * 0.999).all()
     untouched = torch.ones(known.shape[0], dtype=torch.bool)
@@ -180,9 +182,9 @@ def test_known_cells_found_at_once_are_occupied_ones_from_everywhere(share):
     occupancy = Occupancy(2, 16)
     generator = torch.Generator().manual_seed(0)
     occupancy.occupied = (torch.rand(2, 16, 16, 16, generator=generator) < share).to(torch.uint8)
-    drawn = occupancy._spread(4000, generator)
-    found = occupancy._known_at_once(drawn, 1000)
-    exact = occupancy._known(drawn, 1000)
+    drawn = occupancy._stratified(4000, generator)
+    found = occupancy._occupied_of_static(drawn, 1000)
+    exact = occupancy._occupied_of(drawn, 1000)
     held = occupancy.occupied.view(-1)
     assert found.shape == (1000,) and torch.isin(found, drawn).all()
     assert (held[found] > 0).float().mean() > (0.99 if share == 0.5 else 0.05)

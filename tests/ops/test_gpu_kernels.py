@@ -300,7 +300,7 @@ def test_marching(generator, monkeypatch, skip, share, thin):
 def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least, thin):
     """One launch against marching, encoding, networks and compositing on the CPU."""
     field, n = random_field(), 20
-    field.thin = 2 * thin  # a bed asks for its own
+    field.pruning_threshold = 2 * thin  # a bed asks for its own
     o = field.centre + 0.7 * field.unit * random(generator, n, 3)
     d = torch.nn.functional.normalize(random(generator, n, 3), dim=-1)
     o[0] = field.centre + 40 * field.unit  # outside all cells, looking away

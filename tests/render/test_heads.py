@@ -54,7 +54,7 @@ def test_even_density_has_no_direction_and_no_bad_gradient():
     q = positions(20, reach=0.5)
     assert (field.density_normal(q) == 0).all()
     field.requires_grad_(True)
-    field.sloped_normal(q, torch.full((20,), 1e-2)).sum().backward()
+    field.finite_difference_normal(q, torch.full((20,), 1e-2)).sum().backward()
     assert torch.isfinite(field.geometry_grid.grad).all()
 
 
@@ -63,16 +63,16 @@ def test_sloped_normals_approach_the_analytic_ones_and_move_the_density():
     field, q = random_field(full=True), positions(reach=0.8)
     analytic = field.density_normal(q)
     with torch.no_grad():
-        near = field.sloped_normal(q, torch.full((400,), 2e-3))
-        far = field.sloped_normal(q, torch.full((400,), 0.3))
+        near = field.finite_difference_normal(q, torch.full((400,), 2e-3))
+        far = field.finite_difference_normal(q, torch.full((400,), 0.3))
     agree = (analytic * near).sum(-1)
     assert agree.median() > 0.999 and agree.mean() > (analytic * far).sum(-1).mean() + 0.1
     outside = 3.0 * torch.nn.functional.normalize(q, dim=-1)
     with torch.no_grad():
-        slope = field.sloped_normal(outside, torch.full((400,), 2e-3))
+        slope = field.finite_difference_normal(outside, torch.full((400,), 2e-3))
     assert (slope * field.density_normal(outside)).sum(-1).median() > 0.999
     field.requires_grad_(True)
-    field.sloped_normal(q, torch.full((400,), 1e-2))[:, 0].sum().backward()
+    field.finite_difference_normal(q, torch.full((400,), 1e-2))[:, 0].sum().backward()
     assert (field.geometry_grid.grad != 0).any()
 
 

@@ -14,8 +14,8 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json, read_safetensors, write_json, write_safetensors
 from climatenerf.evaluation.metrics import psnr_cc
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.hash_field import Field
 from climatenerf.field.presets import PRESETS
+from climatenerf.field.sampler import Sampler
 from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.volume import render_view
 from climatenerf.scene import load_scene
@@ -52,8 +52,8 @@ def tiny(monkeypatch):
     """Small sizes; a field of a few steps is thick haze, in which full pictures take seconds."""
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
-    mark_seen = Field.mark_seen
-    monkeypatch.setattr(Field, "mark_seen", lambda self, o, d: mark_seen(self, o[:50], d[:50]))
+    mark_seen = Sampler.mark_seen
+    monkeypatch.setattr(Sampler, "mark_seen", lambda self, o, d: mark_seen(self, o[:50], d[:50]))
 
 
 def nothing(*_):
@@ -255,11 +255,11 @@ def stop_half_way(fitting, run):
 
 def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
     fitting = begin(scene, steps=40)
-    fitting.field.thin = 0.004
+    fitting.field.pruning_threshold = 0.004
     stop_half_way(fitting, tmp_path)
     again = begin(scene, steps=40)
     restore(again, tmp_path)
-    assert again.field.thin == fitting.field.thin
+    assert again.field.pruning_threshold == fitting.field.pruning_threshold
     assert_same(fitting, again)
     fitting.run(nothing)
     again.run(nothing)
@@ -283,11 +283,11 @@ def labelled(fitting):
 def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
     """Masks, relative depth's sums and the cells that the sky bars are in the checkpoint."""
     fitting = labelled(begin(scene, steps=40))
-    assert fitting.field.occupancy.barred.any()
+    assert fitting.field.occupancy.forced_empty.any()
     stop_half_way(fitting, tmp_path)
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
-    assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
+    assert torch.equal(again.field.occupancy.forced_empty, fitting.field.occupancy.forced_empty)
     assert again.field.knows_classes and again.classed_at == fitting.classed_at < 0.5
     fitting.run(nothing)
     again.run(nothing)
@@ -405,7 +405,7 @@ def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     again = begin(scene, steps=4)
     restore(again, tmp_path / "run")
     assert torch.equal(again.carving.protected, fitting.carving.protected)
-    assert torch.equal(again.field.occupancy.barred, fitting.field.occupancy.barred)
+    assert torch.equal(again.field.occupancy.forced_empty, fitting.field.occupancy.forced_empty)
 
 
 def test_a_resumed_fit_draws_the_ground_in_the_units_of_the_run(scene, tmp_path, monkeypatch):

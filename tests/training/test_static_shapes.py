@@ -114,7 +114,10 @@ def test_a_step_in_fixed_rooms_waits_for_nothing(scene, batch_of, monkeypatch):
     fitting = begun(scene, True)
     for _ in range(4):
         fitting.step(batch_of(fitting))
-    fitting.reached, fitting.field.thin = 0.6, 0.002  # ever denser samples count as empty
+    fitting.reached, fitting.field.pruning_threshold = (
+        0.6,
+        0.002,
+    )  # ever denser samples count as empty
     sending = fitting.rooms.next_step
     fitting.rooms.next_step = lambda: None
     with monkeypatch.context() as patch:
@@ -122,7 +125,7 @@ def test_a_step_in_fixed_rooms_waits_for_nothing(scene, batch_of, monkeypatch):
             patch.setattr(torch.Tensor, way, None)
         with Watch() as watch:
             fitting.step(batch_of(fitting))
-            fitting.field.occupancy._known_at_once(torch.arange(4000), 1000)
+            fitting.field.occupancy._occupied_of_static(torch.arange(4000), 1000)
     assert not watch.met, watch.met
     assert any(name.startswith("thinner") for name in fitting.rooms.noted)
     fitting.rooms.next_step = sending
@@ -171,11 +174,11 @@ def test_samples_that_find_no_room_are_left_out(scene):
     start, end = torch.full((300,), fitting.field.near), torch.full((300,), 1e9)
     whole = fitting.field.march(batch.rays_o, batch.rays_d, start, end)
     n = int(whole.offsets[-1])
-    wide = fitting.field.march(batch.rays_o, batch.rays_d, start, end, room=n + 50)
+    wide = fitting.field.march(batch.rays_o, batch.rays_d, start, end, capacity=n + 50)
     assert torch.equal(wide.offsets, whole.offsets) and torch.equal(wide.t[:n], whole.t)
     assert not wide.t[n:].any() and not wide.dt[n:].any() and not wide.sigma[n:].any()
     assert torch.equal(wide.ray_index()[:n], whole.ray_index()) and wide.ray_index()[-1] == 299
-    narrow = fitting.field.march(batch.rays_o, batch.rays_d, start, end, room=n // 2)
+    narrow = fitting.field.march(batch.rays_o, batch.rays_d, start, end, capacity=n // 2)
     m = n // 2 - 1
     assert torch.equal(narrow.offsets, whole.offsets.clamp_max(m)) and narrow.dt[-1] == 0
     assert torch.equal(narrow.t[:m], whole.t[:m]) and torch.equal(narrow.sigma[:m], whole.sigma[:m])

@@ -137,8 +137,8 @@ def test_space_outside_every_picture_stays_empty(scene):
     occupancy = fitting.field.occupancy
     ring = torch.tensor([[0.0, 0.0, 8.0], [0.0, 0.0, 0.5]])  # above all cameras; on the box
     for again in range(2):
-        cells, inside = fitting.field._cells(fitting.field.to_grid(ring))
-        assert inside.all() and occupancy.barred.view(-1)[cells].tolist() == [True, False]
+        cells, inside = fitting.field.occupancy.cell_index(fitting.field.to_grid(ring))
+        assert inside.all() and occupancy.forced_empty.view(-1)[cells].tolist() == [True, False]
         occupancy.update(fitting.field.grid_density, 1.0, 0.9, fitting.generator)
         assert occupancy.occupied.view(-1)[cells][0] == 0
         if not again:
@@ -211,11 +211,11 @@ def test_thin_matter_counts_as_empty_once_light_ends_on_dense(scene, steps):
         tau = torch.where(surface, tau + 0.5, tau)
         for step in range(steps):
             fitting.steps = step
-            met = tau[tau > field.thin]
+            met = tau[tau > field.pruning_threshold]
             fitting.thin_out(met, torch.ones_like(met))
             if step < fit.THIN_FROM * steps:
-                assert field.thin == MIN_TAU
-        ends[kind] = field.thin
+                assert field.pruning_threshold == MIN_TAU
+        ends[kind] = field.pruning_threshold
     assert ends["surfaces"] == pytest.approx(fitting.settings.pruning_threshold)
     assert ends["haze"] < 0.5 * fitting.settings.pruning_threshold
 

@@ -97,7 +97,7 @@ def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
     fitting.pixels.sky_hull = VisualHull()
     assert asked() == [1, 2]
     x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
-    cell, _ = fitting.field._cells(fitting.field.to_grid(x[None]))
+    cell, _ = fitting.field.occupancy.cell_index(fitting.field.to_grid(x[None]))
     fitting.carving.protected.view(-1)[cell] = True  # a sparse point lies by the last
     assert asked() == [1]
 
@@ -284,8 +284,8 @@ def test_the_sky_goes_on_where_no_photo_looked(scene, label, monkeypatch):
 
 def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
     full = with_labels(scene, np.asarray)
-    assert full.field.occupancy.barred.any() and full.knows_sky
-    assert not with_labels(scene, np.asarray, free_space=False).field.occupancy.barred.any()
+    assert full.field.occupancy.forced_empty.any() and full.knows_sky
+    assert not with_labels(scene, np.asarray, free_space=False).field.occupancy.forced_empty.any()
     bare = with_labels(scene, np.asarray, sky_labels=False)
     assert not bare.knows_sky and bare.pixels.sky_hull is None
     assert not (bare.pixels.label == SKY).any() and (full.pixels.label == SKY).any()

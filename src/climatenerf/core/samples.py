@@ -6,21 +6,23 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-MIN_WEIGHT = 1e-4  # samples that weigh less are given no colour
-MIN_TAU = 1e-3  # optical depth of samples that count as empty; later in a fit `Field.thin`
+MIN_WEIGHT = 1e-4
+"""Rendering weight below which the colour of a sample is not evaluated."""
+MIN_TAU = 1e-3
+"""Initial pruning threshold: optical depth below which a sample counts as empty."""
 
 
 @dataclass
 class Samples:
     """Samples of n rays, packed by ray, front to back.
 
-    Lists may be longer than that takes: what follows is all zeros, and counts as the last ray's.
+    Lists of fixed capacity are padded with zeros, which count as samples of the last ray.
     """
 
     offsets: Int[Tensor, "rays+1"]
-    """Samples of ray r are offsets[r]:offsets[r + 1]."""
+    """The samples of ray r are offsets[r]:offsets[r + 1]."""
     t: Float[Tensor, "s"]
-    """Ray length of the sample's middle, m."""
+    """Ray length at the middle of the sample, m."""
     dt: Float[Tensor, "s"]
     """Extent along the ray, m."""
     sigma: Float[Tensor, "s"]
@@ -29,8 +31,9 @@ class Samples:
     """The primitive that each sample belongs to, for fields made of primitives."""
 
     def ray_index(self) -> Int[Tensor, "s"]:
-        """The ray each sample belongs to."""
-        # A step at each ray's beginning; none is waited for, as counts of repetitions would be.
+        """Return the index of the ray that each sample belongs to."""
+        # A cumulative sum of ones at the rays' first samples: `repeat_interleave` would
+        # synchronise with the GPU because its output size depends on the data.
         steps = torch.zeros(self.t.shape[0] + 1, dtype=torch.long, device=self.offsets.device)
         begins = self.offsets[1:-1]
         steps.index_add_(0, begins, torch.ones_like(begins))
@@ -38,5 +41,5 @@ class Samples:
 
 
 def offsets_of(ray: Int[Tensor, "s"], rays: int) -> Int[Tensor, "rays+1"]:
-    """Where each ray's samples begin in a packed list whose samples' rays are `ray`, ascending."""
+    """Return the offsets of a packed list from the ray index of each sample, ascending."""
     return torch.searchsorted(ray, torch.arange(rays + 1, device=ray.device))

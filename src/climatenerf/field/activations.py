@@ -1,6 +1,7 @@
-"""What the networks' outputs mean: radiance, and density.
+"""Activations of the networks' outputs: radiance and density.
 
-Plain PyTorch says what it is; on a CPU, in 32 bits, the same in one pass through memory.
+The `plain_` functions are the specification, in PyTorch. float32 tensors on a CPU go to kernels
+that compute the same in one pass through memory.
 """
 
 import torch
@@ -9,53 +10,54 @@ from torch import Tensor
 
 from climatenerf.core.colour import decode_srgb
 from climatenerf.core.vectors import length
-from climatenerf.ops.cpu import activations as cpu_pointwise
+from climatenerf.ops.cpu import activations as cpu
 from climatenerf.ops.cpu.activations import BLACK, LARGEST_RAW, MIN_SLOPE, SHARPNESS
 
 
 def radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """See `plain_radiance`."""
-    if _is_plain(raw):  # in rows, as networks leave it
+    """Return `plain_radiance`, faster for float32 on a CPU."""
+    if _on_cpu(raw):  # feature-major, as the networks return it
         return _Radiance.apply(raw.T.contiguous()).T
     return plain_radiance(raw)
 
 
 def plain_radiance(raw: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Network output to linear radiance: a display value >= 0 and unbounded, decoded.
+    """Return the linear radiance of network outputs.
 
-    Softplus with sharpness 8 is nearly the identity from 0.3 up.
+    Softplus of raw + 0.5 gives a display value >= 0 without an upper bound, which is decoded. With
+    sharpness 8 it is nearly the identity from 0.3 up.
     """
     return decode_srgb(_Brightness.apply(raw + 0.5))
 
 
-def thinned_density(raw: Float[Tensor, "n"], u: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """See `plain_thinned_density`."""
-    if _is_plain(raw, u) and not u.requires_grad:
-        return _ThinnedDensity.apply(raw.contiguous(), u.contiguous())
-    return plain_thinned_density(raw, u)
+def density_from_raw(raw: Float[Tensor, "n"], u: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Return `plain_density_from_raw`, faster for float32 on a CPU."""
+    if _on_cpu(raw, u) and not u.requires_grad:
+        return _Density.apply(raw.contiguous(), u.contiguous())
+    return plain_density_from_raw(raw, u)
 
 
-def plain_thinned_density(raw: Float[Tensor, "n"], u: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Density (1/grid unit) at unit-cube coordinates from its logarithm per contracted length.
+def plain_density_from_raw(raw: Float[Tensor, "n"], u: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Return the density (1/grid unit) at unit-cube u from its logarithm per contracted length.
 
-    It is thinned by 1/|q|^2 outside the core (see `reference.density`), from the contracted radius
-    2 - 1/|q|.
+    Outside the core it is divided by |q|^2 (see `reference.density`), which follows from the
+    contracted radius 2 - 1/|q|.
     """
-    # 1e-4: the outermost shell, where rounding could make it negative.
+    # 1e-4: in the outermost shell rounding could make it negative.
     shell = (2.0 - length(4.0 * u - 2.0)).clamp(1e-4, 1.0)
     return raw.clamp_max(LARGEST_RAW).exp() * shell.square()
 
 
-def _is_plain(*tensors: Tensor) -> bool:
+def _on_cpu(*tensors: Tensor) -> bool:
     return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
 
 
 class _Brightness(torch.autograd.Function):
-    """Softplus out of whose flat part there is a way back.
+    """Softplus with a minimum slope for gradients that brighten.
 
-    Where it is black its slope vanishes. Adam makes steps of full length of vanishing gradients, so
-    colours that darken for a while would sink ever deeper and never return: a fit in which the sky
-    shone through the haze stayed black for good.
+    Near black the slope of a softplus vanishes. Adam takes full steps even for vanishing gradients,
+    so that colours which darken for a while would sink ever deeper and never recover: one fit in
+    which the sky shone through haze stayed black for good.
     """
 
     @staticmethod
@@ -67,7 +69,7 @@ class _Brightness(torch.autograd.Function):
     def backward(ctx, grad):
         (x,) = ctx.saved_tensors
         slope = torch.sigmoid(SHARPNESS * x)
-        # Steps go against the gradient: negative ones brighten.
+        # The optimiser steps against the gradient: negative gradients brighten.
         return grad * torch.where(grad < 0, slope.clamp_min(MIN_SLOPE), slope * (x > BLACK))
 
 
@@ -75,7 +77,7 @@ class _Radiance(torch.autograd.Function):
     @staticmethod
     def forward(ctx, rows):
         out = torch.empty_like(rows)
-        cpu_pointwise.radiance_forward(*_flat(rows, out))
+        cpu.radiance_forward(*_flat(rows, out))
         ctx.save_for_backward(rows, out)
         return out
 
@@ -83,15 +85,15 @@ class _Radiance(torch.autograd.Function):
     def backward(ctx, grad):
         rows, out = ctx.saved_tensors
         grad_rows = torch.empty_like(rows)
-        cpu_pointwise.radiance_backward(*_flat(rows, out, grad.contiguous(), grad_rows))
+        cpu.radiance_backward(*_flat(rows, out, grad.contiguous(), grad_rows))
         return grad_rows
 
 
-class _ThinnedDensity(torch.autograd.Function):
+class _Density(torch.autograd.Function):
     @staticmethod
     def forward(ctx, raw, u):
         out = torch.empty_like(raw)
-        cpu_pointwise.density_forward(raw.numpy(), u.numpy(), out.numpy())
+        cpu.density_forward(raw.numpy(), u.numpy(), out.numpy())
         ctx.save_for_backward(raw, out)
         return out
 
@@ -99,10 +101,10 @@ class _ThinnedDensity(torch.autograd.Function):
     def backward(ctx, grad):
         raw, out = ctx.saved_tensors
         grad_raw = torch.empty_like(raw)
-        cpu_pointwise.density_backward(*_flat(raw, out, grad.contiguous(), grad_raw))
+        cpu.density_backward(*_flat(raw, out, grad.contiguous(), grad_raw))
         return grad_raw, None
 
 
 def _flat(*tensors: Tensor) -> list:
-    """The numbers of tensors that lie in order."""
+    """Return contiguous tensors as flat arrays that share their memory."""
     return [each.detach().view(-1).numpy() for each in tensors]

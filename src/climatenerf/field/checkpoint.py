@@ -14,28 +14,28 @@ from climatenerf.field.hash_field import Field
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 FILE_NAME = "field.safetensors"
 
 
 def save_field(field: Field, run: Path) -> None:
-    """Writes the field into a run folder, atomically."""
+    """Write the field into a run folder, atomically."""
     about = {
         "schema_version": SCHEMA_VERSION,
         "size": dataclasses.asdict(field.size),
         "unit": field.unit,
         "near": field.near,
-        "thin": field.thin,
+        "pruning_threshold": field.pruning_threshold,
     }
     tensors = {k: v.detach().contiguous() for k, v in field.state_dict().items()}
     write_safetensors(run / FILE_NAME, tensors, {"climatenerf": json.dumps(about)})
 
 
 def load_field(run: Path) -> Field:
-    """Reads the field of a run folder.
+    """Read the field of a run folder.
 
     Raises:
-        UserError: there is none, it is damaged, or a newer version wrote it.
+        UserError: there is none, it is damaged, or a newer version of the program wrote it.
     """
     path = run / FILE_NAME
     if not run.exists():
@@ -50,17 +50,18 @@ def load_field(run: Path) -> Field:
         about = json.loads(metadata["climatenerf"])
         check_schema(about["schema_version"], SCHEMA_VERSION, f"the field in {run}")
         size = FieldSize(**about["size"])
-        thin = about.get("thin", MIN_TAU)  # earlier runs ended with what fits begin with
-        numbers = [about["unit"], about["near"], thin, *arrays["centre"].tolist()]
-        if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0 or thin < 0:
+        # Version 2 named the threshold "thin"; before that a run kept the initial one.
+        threshold = about.get("pruning_threshold", about.get("thin", MIN_TAU))
+        numbers = [about["unit"], about["near"], threshold, *arrays["centre"].tolist()]
+        if not np.isfinite(np.array(numbers, float)).all() or not numbers[0] > 0 or threshold < 0:
             raise ValueError("a length is not a finite number above 0, or a bound is below it")
         field = Field(
             size, arrays["embeddings"].shape[0], np.zeros(3), about["unit"], about["near"]
         )
-        field.thin = float(thin)
+        field.pruning_threshold = float(threshold)
         field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
         tensors = {k: to_device(v) for k, v in arrays.items()}
-        if about["schema_version"] == 1:  # without normals and classes: nothing is learned of them
+        if about["schema_version"] == 1:  # without a surface head: keep the untrained one
             fresh = field.state_dict()
             tensors |= {k: fresh[k] for k in fresh if k.startswith(("surface_", "learned"))}
         field.load_state_dict(tensors)

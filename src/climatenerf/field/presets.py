@@ -14,11 +14,11 @@ class FieldSize:
     geometry_hidden: int = 32
     appearance_levels: int = 12
     appearance_log2_rows: int = 19
-    """Fewer have less to paint with: foliage stays blurred (docs/adr/0011)."""
+    """With fewer rows foliage stays blurred (docs/adr/0011)."""
     appearance_finest: int = 4096
     colour_hidden: int = 64
     surface_levels: int = 8
-    """Levels of the grid of normals and classes; 0: they read the appearance grid."""
+    """Levels of the grid of normals and classes; 0: their network reads the appearance grid."""
     surface_log2_rows: int = 15
     surface_finest: int = 512
     surface_hidden: int = 32
@@ -38,7 +38,7 @@ class FieldSize:
 
 PRESETS = {
     "cpu": FieldSize(),
-    # Tables that a GPU's memory and bandwidth carry easily; of its scores nothing is known yet.
+    # Table sizes that suit a GPU's memory and bandwidth; not evaluated on benchmarks yet.
     "gpu": FieldSize(
         geometry_levels=12,
         geometry_log2_rows=19,

@@ -4,22 +4,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.ops.cpu import activations as cpu_pointwise
+from climatenerf.ops.cpu import activations as cpu
 
 
 def harmonics(d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 16"]:
-    """See `spherical_harmonics`, which it is but where PyTorch need not know of it."""
+    """Return `spherical_harmonics`, from a kernel for float32 on a CPU without gradients."""
     if d.requires_grad or d.device.type != "cpu" or d.dtype != torch.float32:
         return spherical_harmonics(d)
     out = d.new_empty(16, d.shape[0])
-    cpu_pointwise.harmonics(d.contiguous().numpy(), out.numpy())
+    cpu.harmonics(d.contiguous().numpy(), out.numpy())
     return out.T
 
 
 def spherical_harmonics(d: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 16"]:
-    """The 16 real spherical harmonics of degrees 0 to 3, orthonormal over the sphere.
+    """Return the 16 real spherical harmonics of degrees 0 to 3, orthonormal over the sphere.
 
-    In memory each lies in a row, as encodings leave their features.
+    The memory layout is feature-major, as that of the encodings' features.
     """
     x, y, z = d.unbind(-1)
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z

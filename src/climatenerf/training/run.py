@@ -262,7 +262,7 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
         rays = (batch.rays_o, batch.rays_d, batch.image)
         with torch.no_grad():  # no corrections leave rays as they are
             rays_o, rays_d = fitting.poses.rays(*rays, fitting.field.unit)
-        fitting.field.mark_seen(rays_o, rays_d)
+        fitting.field.sampler.mark_seen(rays_o, rays_d)
     save_field(fitting.field, run)
     state = {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
     for index, moments in fitting.net_adam.state_dict()["state"].items():
@@ -270,7 +270,7 @@ def checkpoint(fitting: Fitting, run: Path) -> None:
     for name, module in (("masks", fitting.masks), ("poses", fitting.poses)):
         state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
     state["relative"] = fitting.relative.sums
-    state["barred"] = torch.from_numpy(np.packbits(to_numpy(fitting.field.occupancy.barred)))
+    state["barred"] = torch.from_numpy(np.packbits(to_numpy(fitting.field.occupancy.forced_empty)))
     state["generator"] = fitting.generator.get_state()
     numbers = [fitting.steps, fitting.samples, fitting.rays]
     state["counters"] = torch.tensor(numbers)
@@ -343,7 +343,11 @@ def restore(fitting: Fitting, run: Path) -> None:
         fitting.field.load_state_dict(field.state_dict())
     fitting.field.learned |= learned
     fitting.learns_classes = fitting.field.knows_classes
-    fitting.field.unit, fitting.field.near, fitting.field.thin = field.unit, field.near, field.thin
+    fitting.field.unit, fitting.field.near, fitting.field.pruning_threshold = (
+        field.unit,
+        field.near,
+        field.pruning_threshold,
+    )
     arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
     try:
         _restore_state(fitting, arrays)
@@ -372,7 +376,7 @@ def _restore_state(fitting: Fitting, arrays: dict) -> None:
         own = {k: v for k, v in state.items() if k.startswith(f"{name}.")}
         module.load_state_dict({k.removeprefix(f"{name}."): v for k, v in own.items()})
     fitting.relative.sums.copy_(state["relative"])
-    barred = fitting.field.occupancy.barred
+    barred = fitting.field.occupancy.forced_empty
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
     barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
     fitting.carving.fit_ground()  # in the units of the run

@@ -216,7 +216,7 @@ class Fitting:
         tau = samples.sigma * samples.dt
         before, _ = compositing.render_weights(tau, samples.offsets)
         heavy = self.rooms.chosen("heavy", before > SEEN_WEIGHT)
-        field.keep_occupied(rays_o, rays_d, samples, heavy)
+        field.sampler.record_density(rays_o, rays_d, samples, heavy)
         self.thin_out(tau, before)
         kept, chance = choose(before, samples.dt > 0, self.rooms, self.generator)
         u = self.positions(batch, samples, kept)
@@ -426,7 +426,10 @@ class Fitting:
             loss = loss + weigh.classes * losses.class_loss(logits, target, target != UNKNOWN)
         if weigh.normal_consistency and q is not None:
             step = BEND_STEP * samples.dt[index[some]] / self.field.unit
-            bent, shown = self.field.sloped_normal(q, step), unit(raw[:, :3].detach(), 1e-6)
+            bent, shown = (
+                self.field.finite_difference_normal(q, step),
+                unit(raw[:, :3].detach(), 1e-6),
+            )
             loss = loss + weigh.normal_consistency * losses.normal_loss(own, bent, shown, n)
         return loss
 
@@ -451,7 +454,7 @@ class Fitting:
             self.step_scale,
             uniform(self.generator, n),
             stop=1e-4,
-            room=room,
+            capacity=room,
         )
         self.rooms.took(name, samples.offsets[-1])
         return samples
@@ -484,13 +487,13 @@ class Fitting:
         """
         grown = min(1.0, max(0.0, (self.stage - THIN_FROM) / (FINE_AT - THIN_FROM)))
         goal = MIN_TAU * (self.settings.pruning_threshold / MIN_TAU) ** grown
-        denser = 2 * self.field.thin
-        if goal <= self.field.thin:
+        denser = 2 * self.field.pruning_threshold
+        if goal <= self.field.pruning_threshold:
             return
         share = (weights * (tau < denser)).sum() / weights.sum()  # no light at all: NaN, not less
         name = f"thinner by {round(math.log2(denser / MIN_TAU))}"  # not those of a lower bound
         if self.rooms.late(name, share, math.inf) < THIN_SHARE:
-            self.field.thin = min(goal, denser)
+            self.field.pruning_threshold = min(goal, denser)
 
     def radiance(
         self,

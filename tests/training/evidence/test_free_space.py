@@ -76,7 +76,7 @@ def test_cells_above_the_ground_are_forced_empty_except_the_tower():
     x, size, forced = (
         centre * field.unit + field.centre,
         size * field.unit,
-        occupancy.barred.view(-1),
+        occupancy.forced_empty.view(-1),
     )
     ring = x[:, :2].norm(dim=-1)
     assert found.ground is not None
@@ -85,7 +85,7 @@ def test_cells_above_the_ground_are_forced_empty_except_the_tower():
     assert forced[air & (x[:, 2] > clear)].float().mean() > 0.3
     without_ground = free_space(
         losses=type(FitSettings().losses)(ground_height=0.0)
-    ).field.occupancy.barred.view(-1)
+    ).field.occupancy.forced_empty.view(-1)
     assert not (forced & ~without_ground)[air & (x[:, 2] < clear - 0.02)].any()
     assert (forced & ~without_ground)[air].any()
     touches = in_matter(x) & (x[:, 2] > -size / 2) & (ring < 5)
@@ -99,15 +99,15 @@ def test_cells_of_sparse_points_are_protected_from_wrong_labels():
         return [np.where(m == 2, 10, m).astype(np.uint8) for m in maps]
 
     found = free_space(err, losses=type(FitSettings().losses)(ground_height=0.0))
-    field, forced = found.field, found.field.occupancy.barred.view(-1)
+    field, forced = found.field, found.field.occupancy.forced_empty.view(-1)
     assert found.sparse is not None
     ends = field.to_grid(found.sparse.points)
     on_tower = ends[found.sparse.points[:, 2] > 0.2]
     assert len(on_tower) > 10
-    cells, _ = field._cells(on_tower)
+    cells, _ = field.occupancy.cell_index(on_tower)
     assert not forced[cells].any(), "cells of points"
     side = 2.0 / field.occupancy.side  # of the cells of the first cascade
-    beside, _ = field._cells(on_tower - torch.tensor([0.9 * side, 0.0, 0.0]))
+    beside, _ = field.occupancy.cell_index(on_tower - torch.tensor([0.9 * side, 0.0, 0.0]))
     assert not forced[beside].any(), "and their neighbours"
     found.sparse = None
     found.force_empty()
@@ -128,7 +128,7 @@ def test_space_much_nearer_to_a_camera_than_its_points_is_empty():
     clearance = [0.8 * float(each.quantile(0.02)) if len(each) >= 20 else 0.0 for each in nearest]
     within = (distance < torch.tensor(clearance)[:, None]).any(0)
     assert within[before].all() and distance[enough].amin(0)[before].max() > 0.7 * max(clearance)
-    spared = ~occupancy.barred.view(-1)[before]
+    spared = ~occupancy.forced_empty.view(-1)[before]
     apart = torch.cdist(x[before][spared], found.sparse.points).amin(-1)
     assert spared.float().mean() < 0.5 and (apart < 3 * size.min() * field.unit).all(), (
         "near points"
@@ -272,9 +272,11 @@ def test_ground_points_off_the_fitted_height_are_steps_and_exempt(monkeypatch):
     height, valid = found.ground.height_above(q)
     off = height.abs() > found.ground.tolerance
     assert valid.all() and 0.02 < off.float().mean() < 0.2
-    cells, _ = found.field._cells(q[off])
+    cells, _ = found.field.occupancy.cell_index(q[off])
     assert found.obstacle.view(-1)[cells].all() and found.near_step.view(-1)[cells].all()
-    assert not found.near_step.view(-1)[found.field._cells(q[height.abs() < 0.01])[0]].all()
+    assert not found.near_step.view(-1)[
+        found.field.occupancy.cell_index(q[height.abs() < 0.01])[0]
+    ].all()
 
 
 def test_samples_off_the_ground_get_the_depth_of_the_ground():
@@ -332,7 +334,7 @@ def test_the_margin_is_penalised_where_the_field_classifies_ground(monkeypatch):
         penalised_samples(found, x, d, t, use_classes=True),
     )
     by_class = x[:, 1] > edge
-    exempt = found.obstacle.view(-1)[field._cells(field.to_grid(x))[0]]
+    exempt = found.obstacle.view(-1)[field.occupancy.cell_index(field.to_grid(x))[0]]
     assert (by_class & exempt).any() and not before[exempt].any()
     assert later[by_class].all() and torch.equal(later[~by_class], before[~by_class])
     found.step_points = found.obstacle_points = field.to_grid(x[by_class])

@@ -17,6 +17,7 @@ from torch import Tensor
 from climatenerf.core.classes import GROUND, SOLID
 from climatenerf.core.device import to_device
 from climatenerf.field.hash_field import Field
+from climatenerf.field.occupancy import dilated
 from climatenerf.ops import reference
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.frusta import intersects_frustum, within_camera_range
@@ -110,9 +111,9 @@ class FreeSpace:
             empty |= self.too_near_camera(x, radius)
         if hull is not None:
             empty |= hull.consensus(x, radius)
-        forced = occupancy.barred.view(-1)
+        forced = occupancy.forced_empty.view(-1)
         forced[cells[empty]] = True
-        forced[_dilate(self.protected).view(-1)] = False
+        forced[dilated(self.protected).view(-1)] = False
         if self.ground is not None:
             rows = self.ground.is_above_crests(centre, size * (3**0.5 / 2)).nonzero()[:, 0]
             rows = rows[self.in_ground_hull(centre[rows], radius[rows])]
@@ -162,8 +163,8 @@ class FreeSpace:
         while self.obstacle_hull.shape[1] < self.field.occupancy.side:
             for axis in (1, 2, 3):
                 self.obstacle_hull = self.obstacle_hull.repeat_interleave(2, dim=axis)
-        self.obstacle = _dilate(self.cells_containing(self.obstacle_points) | self.obstacle_hull)
-        self.near_step = _dilate(self.cells_containing(self.step_points))
+        self.obstacle = dilated(self.cells_containing(self.obstacle_points) | self.obstacle_hull)
+        self.near_step = dilated(self.cells_containing(self.step_points))
 
     def find_obstacles(self) -> Bool[Tensor, "cascades side side side"]:
         """Return the cells near the ground height in which most views see an obstacle."""
@@ -181,7 +182,7 @@ class FreeSpace:
     def cells_containing(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
         """Return the occupancy's cells that contain positions q (grid units)."""
         marked = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
-        cells, inside = self.field._cells(q)
+        cells, inside = self.field.occupancy.cell_index(q)
         marked.view(-1)[cells[inside]] = True
         return marked
 
@@ -194,7 +195,7 @@ class FreeSpace:
         if hull is None or not self.enabled:
             return torch.ones(x.shape[0], dtype=torch.bool)
         empty = hull.consensus(x, torch.zeros(x.shape[0]))
-        cells, _ = self.field._cells(self.field.to_grid(x))
+        cells, _ = self.field.occupancy.cell_index(self.field.to_grid(x))
         return empty & ~self.protected.view(-1)[cells]
 
     def in_ground_hull(
@@ -243,7 +244,7 @@ class FreeSpace:
         approach = (height - height_ahead) / STEP
         excess = height.sign() * (height.abs() - self.ground.tolerance).clamp_min(0.0)
         off = rooms.chosen("far", valid & (approach > MIN_APPROACH) & (excess != 0))
-        cells, _ = self.field._cells(q[off])
+        cells, _ = self.field.occupancy.cell_index(q[off])
         penalised = torch.zeros(off.shape[0], dtype=torch.bool)
         if use_classes:
             penalised = self.classified_as_ground(q[off]) & ~self.near_step.view(-1)[cells]
@@ -263,10 +264,3 @@ class FreeSpace:
 def is_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Return which merged classes are ground."""
     return torch.stack([label == kind for kind in GROUND]).any(0)
-
-
-def _dilate(
-    cells: Bool[Tensor, "cascades side side side"],
-) -> Bool[Tensor, "cascades side side side"]:
-    """Return the cells and their 26 neighbours."""
-    return torch.nn.functional.max_pool3d(cells[:, None].float(), 3, 1, padding=1)[:, 0] > 0
