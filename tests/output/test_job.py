@@ -243,6 +243,26 @@ def test_an_unfinished_render_is_never_touched_by_another(tmp_path):
     assert files_of(tmp_path) == before
 
 
+def test_a_slow_process_does_not_write_into_the_render_that_followed(tmp_path):
+    slow, following = make_job(2), make_job(2, visibility=9.0)
+
+    def source():
+        def frame(index, preview):
+            if index == 1:  # two others finish this render, and the next one, while it works
+                render(slow, tmp_path)
+                render(following, tmp_path)
+            return noise_of(slow)(index, preview)
+
+        return frame
+
+    with pytest.raises(UserError, match="has replaced this one"):
+        render_frames(slow, tmp_path, source, range(2))
+    after = files_of(tmp_path)
+    render(following, tmp_path / "expected")
+    expected = files_of(tmp_path / "expected")
+    assert after == expected
+
+
 def test_a_render_of_a_version_without_records_is_replaced(tmp_path):
     job = make_job(2)
     (tmp_path / "frames").mkdir()

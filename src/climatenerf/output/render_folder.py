@@ -223,6 +223,12 @@ def commit_frame(
         if frame_record(out, index, keys[1]) is not None:
             return
         folder = working_folder(out, keys[0])
+        held = held_render(folder)
+        if held is None or held["render"] != keys[0]:
+            raise UserError(
+                f"another render has replaced this one in {out} meanwhile; choose another folder"
+                " with -o"
+            )
         for name in files:
             move(scratch / name, folder / name)
         complete = {**record, "key": keys[1], "files": files}
