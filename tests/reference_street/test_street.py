@@ -1,4 +1,4 @@
-"""The embedded street: its geometry, its poses and the pictures that ship with the package."""
+"""The embedded street: geometry, poses, and the pictures that the package contains."""
 
 import subprocess
 import sys
@@ -38,11 +38,11 @@ def scene():
     return read_scene(ASSETS)
 
 
-def test_builds_without_mitsuba():
+def test_the_geometry_builds_without_mitsuba():
     code = (
         "import sys; sys.modules['mitsuba'] = None\n"
-        "import tools.reference_street.layout, street.textures, street.sky, street.render\n"
-        "print(float(street.layout.ground_height(0.0, 0.0)))"
+        "from tools.reference_street import layout, render, sky, textures\n"
+        "print(float(layout.ground_height(0.0, 0.0)))"
     )
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
@@ -53,7 +53,7 @@ def test_ground_is_continuous_and_has_a_kerb():
     step = 0.001
     for y in (-37.0, -4.3, 12.0):
         x = np.arange(-40, 40, step)
-        # The steepest part is the kerb face, 12 cm up over 2 cm.
+        # The steepest part is the kerb face, which rises 12 cm over 2 cm.
         assert np.abs(np.diff(ground_height(x, np.full_like(x, y)))).max() < 6.5 * step
     for x in (-20.0, 0.0, 3.07, 150.0):
         y = np.arange(-250, 250, 0.01)
@@ -65,17 +65,17 @@ def test_ground_is_continuous_and_has_a_kerb():
     assert (np.diff(road_profile(walk)) > 0).all()
 
 
-def test_flood_of_half_a_metre_has_a_shoreline_in_sight():
+def test_a_flood_of_half_a_metre_has_visible_shorelines():
     level = ground_datum()[0] + 0.5
     positions = np.array([pose[:3, 3] for _, pose in camera_poses()])
-    assert positions[:, 2].min() > level + 0.3  # no camera drowns
+    assert positions[:, 2].min() > level + 0.3  # no camera is under water
     assert ground_height(0.0, 0.0) < level - 0.3
-    assert ground_height(0.0, 20.0) > level  # the road runs out of the water ahead
-    assert ground_height(14.0, 0.0) > level  # and so do the lawns
+    assert ground_height(0.0, 20.0) > level  # the road leaves the water ahead
+    assert ground_height(14.0, 0.0) > level  # so do the lawns
     assert ground_height(-16.0, 0.0) > level
 
 
-def test_meshes_are_sound(meshes):
+def test_meshes_are_valid(meshes):
     assert len({m.name for m in meshes}) == len(meshes)
     labels = {m.label for m in meshes}
     assert {"road", "building", "vegetation", "terrain", "vehicle", "object"} == labels
@@ -87,7 +87,7 @@ def test_meshes_are_sound(meshes):
         assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices), mesh.name
 
 
-def test_ground_meshes_lie_on_the_height_function(meshes):
+def test_ground_meshes_follow_the_height_function(meshes):
     ground = ("road", "gutter", "kerb", "pavement", "lawn+1", "lawn-1", "meadow")
     by_name = {m.name: m for m in meshes}
     for name in ground:
@@ -97,10 +97,10 @@ def test_ground_meshes_lie_on_the_height_function(meshes):
         centre = v[mesh.faces].mean(1)
         near = np.hypot(centre[:, 0], centre[:, 1]) < 24  # the detailed part
         gap = np.abs(centre[:, 2] - ground_height(centre[:, 0], centre[:, 1]))[near]
-        assert gap.size == 0 or gap.max() < 0.015, name  # triangles follow it closely
+        assert gap.size == 0 or gap.max() < 0.015, name  # between the vertices
 
 
-def test_things_stand_on_the_ground(meshes):
+def test_objects_stand_on_the_ground(meshes):
     by_name = {m.name: m for m in meshes}
     wheels = by_name["car-wheels"].vertices
     gap = wheels[:, 2] - ground_height(wheels[:, 0], wheels[:, 1])
@@ -110,7 +110,7 @@ def test_things_stand_on_the_ground(meshes):
         assert (v[:, 2] - ground_height(v[:, 0], v[:, 1])).min() < 0.0, name
 
 
-def test_cameras(meshes):
+def test_camera_poses_are_valid_and_clear_of_objects(meshes):
     poses = camera_poses()
     names = [name for name, _ in poses]
     assert len(names) == 64 and names == sorted(set(names))
@@ -120,7 +120,7 @@ def test_cameras(meshes):
         turn @ turn.transpose(0, 2, 1), np.eye(3)[None].repeat(64, 0), atol=1e-12
     )
     np.testing.assert_allclose(np.linalg.det(turn), 1.0)
-    assert (turn[:, 2, 1] < -0.9).all()  # the picture's down is the world's down
+    assert (turn[:, 2, 1] < -0.9).all()  # image down is world down
     x, y, z = stack[:, :3, 3].T
     height = z - ground_height(x, y)
     np.testing.assert_allclose(height[:50], EYE, atol=1e-9)
@@ -131,7 +131,7 @@ def test_cameras(meshes):
         assert np.linalg.norm(near - pose[:3, 3], axis=-1).min() > 0.35
 
 
-def test_sun_is_broad_and_where_it_is_said_to_be():
+def test_the_sun_has_its_documented_direction_and_width():
     sky = environment(128)
     assert np.isfinite(sky).all() and (sky > 0).all()
     row, column = np.argwhere(sky.sum(-1) > 0.9 * sky.sum(-1).max()).mean(0)
@@ -141,15 +141,15 @@ def test_sun_is_broad_and_where_it_is_said_to_be():
     assert np.linalg.norm(direction(SUN_AZIMUTH, SUN_ELEVATION)) == pytest.approx(1.0)
 
 
-def test_textures_repeat_exactly():
+def test_textures_are_reproducible():
     for name in ("asphalt", "brick", "car-body"):
         picture = make(name)
         assert picture.dtype == np.uint8 and picture.shape[2] == 3
         np.testing.assert_array_equal(picture, make(name))
-        assert picture.std() > 8  # visible detail, not a flat colour
+        assert picture.std() > 8  # visible detail
 
 
-def test_embedded_scene_reads(scene):
+def test_the_embedded_scene_is_readable(scene):
     assert len(scene.views) == 64
     assert [v.name for v in scene.of_split("heldout")] == [v.name for v in scene.views[::8]]
     np.testing.assert_array_equal(scene.world_from_input, np.eye(4))
@@ -168,29 +168,29 @@ def test_embedded_scene_reads(scene):
             assert image.size == (camera.width, camera.height)
 
 
-def test_embedded_scene_is_small_and_clean():
+def test_the_embedded_scene_is_small_and_without_local_paths():
     files = [f for f in ASSETS.rglob("*") if f.is_file()]
     assert sum(f.stat().st_size for f in files) <= 4_000_000
     assert {f.suffix for f in files} <= {".jpg", ".json", ".npz", ".ply", ".png"}
     text = (ASSETS / "scene.json").read_text(encoding="utf-8")
-    assert str(ROOT) not in text and '"/' not in text  # no path of the machine it was made on
+    assert str(ROOT) not in text and '"/' not in text
 
 
-def test_labels_tell_sky_from_all_else(scene):
-    shares = []
+def test_labels_mark_the_sky_alone(scene):
+    fractions = []
     for view in scene.views:
         label = load_labels(view, scene, 1)
         camera = scene.cameras[view.camera]
         assert label is not None and label.shape == (camera.height, camera.width), view.name
         assert set(np.unique(label)) <= {10, 255}, view.name
         sky = label == 10
-        shares.append(sky.mean())
+        fractions.append(sky.mean())
         down = (camera.directions() @ scene.c2w_world(view)[:3, :3].T)[..., 2] < 0
-        assert not (sky & down).any(), view.name  # the valley's hills hide the horizon
+        assert not (sky & down).any(), view.name  # hills hide the horizon
         photo = load_image(view, scene).astype(float)
         if sky.sum() > 200:
             assert photo[sky][:, 2].mean() > 180, view.name
-    assert 0.05 < np.mean(shares) < 0.5
+    assert 0.05 < np.mean(fractions) < 0.5
 
 
 def test_sparse_points_lie_on_surfaces(scene):
@@ -198,11 +198,11 @@ def test_sparse_points_lie_on_surfaces(scene):
     assert points is not None and len(points) > 1500
     below = ground_height(points[:, 0], points[:, 1]) - points[:, 2]
     assert below.max() < 0.1
-    assert (np.abs(below) < 0.02).mean() > 0.3  # much of what a street's photos show is ground
+    assert (np.abs(below) < 0.02).mean() > 0.3  # photos of a street show much ground
 
 
 def test_pictures_agree_with_the_poses(scene):
-    """The red car roof and the bright sky are where the poses put them."""
+    """The red car roof and the bright sky project to where the pictures show them."""
     roof = np.array([CAR_AT[0], CAR_AT[1] - 0.7, ground_height(*CAR_AT) + 1.43])
     checked = 0
     for view in scene.views[50:]:
@@ -219,7 +219,7 @@ def test_pictures_agree_with_the_poses(scene):
     for view in scene.views:
         picture = load_image(view, scene).astype(float)
         assert 45 < np.median(picture) < 190, view.name  # well exposed
-        # The bright place of the sky is white in the views towards it, as in any photo.
+        # The brightest part of the sky is clipped in the views towards it, as in photos.
         assert (picture >= 255).all(-1).mean() < 0.25, view.name
         if view.name in ("0016.jpg", "0017.jpg", "0022.jpg", "0038.jpg"):  # open sky above
             top, bottom = picture[:12].mean((0, 1)), picture[-12:].mean((0, 1))
@@ -227,7 +227,7 @@ def test_pictures_agree_with_the_poses(scene):
 
 
 @pytest.mark.slow
-def test_a_fresh_render_equals_the_stored_picture(scene, tmp_path):
+def test_a_new_render_matches_the_stored_picture(scene, tmp_path):
     pytest.importorskip("mitsuba")
     from tools.reference_street.render import EXPOSURE, encode, load, render_view
 
