@@ -1,6 +1,6 @@
 # Two commands from a fresh checkout, with Python 3.11 or newer and no compiler:
 #
-#   make demo    set up, fit the street that comes along, render its movies
+#   make demo    set up, fit the embedded street, render its movies
 #   make test    set up, run the tests
 #
 # Everything is installed into .venv inside the checkout.
@@ -9,8 +9,8 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 
-# Which torch to install. On Linux the package index's own torch brings gigabytes of CUDA libraries;
-# without an NVIDIA card the small CPU build does, from PyTorch's public index:
+# Which torch to install. On Linux the default torch includes gigabytes of CUDA libraries. Without an
+# NVIDIA card, the small CPU build from PyTorch's public index is enough:
 #   make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
 TORCH       ?= torch==2.13.0
 TORCH_INDEX ?=

@@ -1,4 +1,4 @@
-"""climatenerf: photos of a real place in; smog, flood and snow on that place out.
+"""climatenerf: render a real place from photos in physically based smog, flood and snow.
 
 The public names are listed by `dir(climatenerf)` and described in `climatenerf.api`. Importing this
 package loads neither torch nor numba; each name is imported when it is first used.

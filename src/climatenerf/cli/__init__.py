@@ -144,7 +144,7 @@ def usage() -> str:
         [
             "usage: climatenerf VERB [options]",
             "",
-            "Photos of a real place in; the same place in smog, flooded and under snow out.",
+            "Render a real place from photos in physically based smog, flood and snow.",
             "",
             *lines,
             "",

@@ -68,11 +68,11 @@ class Fit:
     """Meaning of the numbers in label files: cityscapes-train-ids, cityscapes-ids or seven.
     Default: what the capture states."""
     labels: str | None = None
-    """Class labels: none, heuristic (sky and ground without a network), or a network's
-    name or folder. Default: the capture's label files, else heuristic if it surely shows sky."""
+    """Class labels: none, heuristic (sky and ground without a network), or a network's name or
+    folder. Default: the capture's label files, else heuristic if the photos clearly show sky."""
     mono_depth: str | None = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
-    capture's depth_relative files, else its depth files; none leaves both alone."""
+    capture's depth_relative files, else its depth files; none ignores both."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed, in larger
     steps; the present GPU kernels were tested without a GPU."""
