@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from support.toy_device import TOY, kernels_for_toys
-from support.toy_photos import BENT, pattern, photos
+from support.toy_photos import DISTORTED, pattern, photos
 from support.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
@@ -133,7 +133,7 @@ def test_photos_are_matched_alike_on_both():
     grey, found, empty = pattern(), [], []
     for device in (contextlib.nullcontext(), on_toy()):
         with device:
-            pixels = photos(BENT, lambda i, t, x: grey(x))
+            pixels = photos(DISTORTED, lambda i, t, x: grey(x))
             matched = plane_sweep_depth(pixels, None, (1.5, 4.0), 0)
             assert matched is not None
             field = Field(TINY, 5, np.array([0.0, 3.0, 0.0]), 3.0, 0.1)

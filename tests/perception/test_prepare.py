@@ -92,13 +92,13 @@ def test_changed_photos_are_processed_again(capture):
 
 def test_files_of_the_user_are_kept(capture):
     (capture / "labels").mkdir()
-    own = capture / "labels" / "003.png"
-    Image.new("L", (32, 24), 2).save(own)
+    user_file = capture / "labels" / "003.png"
+    Image.new("L", (32, 24), 2).save(user_file)
     scene, callbacks = labelled(capture, None)
     assert callbacks.processed == [] and sum(v.label_path is not None for v in scene.views) == 1
     scene, callbacks = labelled(capture, "heuristic")
     assert len(callbacks.processed) == 8 and "Keeping and using 1 files" in callbacks.lines[0]
-    assert (np.asarray(Image.open(own)) == 2).all()
+    assert (np.asarray(Image.open(user_file)) == 2).all()
     painted = capture / "labels" / "005.png"
     Image.new("L", (32, 24), 7).save(painted)  # replaces a generated file
     photo(99).save(capture / "images" / "005.png")

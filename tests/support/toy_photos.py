@@ -1,16 +1,16 @@
-"""Photos of a patterned wall, the plane y = 4 + .3 x, from cameras in a row."""
+"""Photos of a textured wall, the plane y = 4 + 0.3 x (m), from cameras in a row."""
 
 import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.training.dataset import TrainingPixels
 
-PLAIN = Camera(96, 72, 90.0, 90.0, 48.0, 36.0)
-BENT = Camera(96, 72, 90.0, 90.0, 47.0, 36.5, k1=-0.12, k2=0.02, p1=1e-3)
+PINHOLE = Camera(96, 72, 90.0, 90.0, 48.0, 36.0)
+DISTORTED = Camera(96, 72, 90.0, 90.0, 47.0, 36.5, k1=-0.12, k2=0.02, p1=1e-3)
 
 
 def pattern(seed=0):
-    """Smooth grey values of places on a plane, [0,1], that repeat nowhere."""
+    """Return a smooth, non-repeating texture: grey values in [0,1] of plane coordinates."""
     random = np.random.default_rng(seed)
     wave = random.normal(size=(60, 2)) * random.uniform(2.0, 14.0, (60, 1))
     turn, size = random.uniform(0, 2 * np.pi, 60), 1 / np.linalg.norm(wave, axis=-1) ** 0.5
@@ -32,7 +32,7 @@ def rows_of_cameras(count=5):
 
 
 def wall(camera, pose, tilt=0.3):
-    """Ray length of each pixel to the plane y = 4 + tilt x, and where on it the ray ends."""
+    """Return each pixel's ray length (m) to the plane y = 4 + tilt x, and its (x, z) there."""
     d = camera.directions().astype(float) @ pose[:3, :3].T
     eye = pose[:3, 3]
     t = (4.0 + tilt * eye[0] - eye[1]) / (d[..., 1] - tilt * d[..., 0])
@@ -40,10 +40,11 @@ def wall(camera, pose, tilt=0.3):
     return t, x[..., [0, 2]]
 
 
-def photos(camera, look, c2w=None, labels=None, masks=None, exposure=lambda i: 1.0):
+def photos(camera, texture, c2w=None, labels=None, masks=None, exposure=lambda i: 1.0):
+    """Return training pixels; `texture(i, t, x)` maps ray lengths and plane coordinates to grey."""
     c2w = rows_of_cameras() if c2w is None else c2w
     images = []
     for i, pose in enumerate(c2w):
-        grey = look(i, *wall(camera, pose)) * exposure(i)
+        grey = texture(i, *wall(camera, pose)) * exposure(i)
         images.append(np.repeat((255 * grey + 0.5).astype(np.uint8)[..., None], 3, -1))
     return TrainingPixels([camera], [0] * len(c2w), c2w, images, labels, masks)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from support.tower import poses
-from support.toy_photos import BENT, PLAIN, pattern, photos, rows_of_cameras, wall
+from support.toy_photos import DISTORTED, PINHOLE, pattern, photos, rows_of_cameras, wall
 
 from climatenerf.core.cameras import Camera
 from climatenerf.evaluation.reference import read_reference
@@ -35,7 +35,7 @@ def errors(pixels, found):
     return np.abs(found.depth.numpy() / t - 1)
 
 
-@pytest.mark.parametrize("camera", [PLAIN, BENT])
+@pytest.mark.parametrize("camera", [PINHOLE, DISTORTED])
 def test_depth_of_a_textured_wall(camera):
     grey = pattern()
     pixels = photos(camera, lambda i, t, x: grey(x), exposure=lambda i: (1.0, 0.5, 0.8)[i % 3])
@@ -50,22 +50,22 @@ def test_depth_of_a_textured_wall(camera):
 
 
 def test_no_depth_without_texture_overlap_or_neighbours():
-    blank = photos(PLAIN, lambda i, t, x: np.full(t.shape, 0.5))
+    blank = photos(PINHOLE, lambda i, t, x: np.full(t.shape, 0.5))
     assert plane_sweep_depth(blank, None, DEFAULT_RANGE, 0) is None
     other = [pattern(seed) for seed in range(5)]
-    unrelated = photos(PLAIN, lambda i, t, x: other[i](x))
+    unrelated = photos(PINHOLE, lambda i, t, x: other[i](x))
     found = plane_sweep_depth(unrelated, None, DEFAULT_RANGE, 0)
     assert found is None or len(found.depth) < 0.03 * WINDOWS
-    one = photos(PLAIN, lambda i, t, x: other[0](x), c2w=rows_of_cameras(1))
+    one = photos(PINHOLE, lambda i, t, x: other[0](x), c2w=rows_of_cameras(1))
     assert plane_sweep_depth(one, None, DEFAULT_RANGE, 0) is None
 
 
 def test_ambiguous_stripes_are_rejected():
-    stripes = photos(PLAIN, lambda i, t, x: 0.5 + 0.4 * np.sin(2 * np.pi * x[..., 0] / 0.25))
+    stripes = photos(PINHOLE, lambda i, t, x: 0.5 + 0.4 * np.sin(2 * np.pi * x[..., 0] / 0.25))
     found = plane_sweep_depth(stripes, None, DEFAULT_RANGE, 0)
     if found is not None:  # near the sides most depths project outside the neighbours
-        place = stripes.place_towards(found.image, found.rays_d)
-        assert ((place[:, 0] > 0.3) & (place[:, 0] < 0.7)).sum() < 0.01 * WINDOWS
+        uv = stripes.place_towards(found.image, found.rays_d)
+        assert ((uv[:, 0] > 0.3) & (uv[:, 0] < 0.7)).sum() < 0.01 * WINDOWS
 
 
 def test_sky_and_masked_pixels_are_skipped():
@@ -74,11 +74,11 @@ def test_sky_and_masked_pixels_are_skipped():
     masks = [np.ones((72, 96), bool) for _ in range(5)]
     for label, mask in zip(labels, masks, strict=True):
         label[:24], mask[:, :48] = 10, False
-    pixels = photos(PLAIN, lambda i, t, x: grey(x), labels=labels, masks=masks)
+    pixels = photos(PINHOLE, lambda i, t, x: grey(x), labels=labels, masks=masks)
     found = plane_sweep_depth(pixels, None, DEFAULT_RANGE, 0)
     assert found is not None
-    place = pixels.place_towards(found.image, found.rays_d)
-    assert place[:, 0].min() > 0.5 and place[:, 1].min() > 1 / 3
+    uv = pixels.place_towards(found.image, found.rays_d)
+    assert uv[:, 0].min() > 0.5 and uv[:, 1].min() > 1 / 3
     assert len(found.depth) > 0.05 * WINDOWS
     pictures = build_pictures(pixels, np.full((5, 9), 1.5), np.full((5, 9), 4.0))
     grey_levels = pictures.grey.reshape(5, 72, 96)
@@ -117,9 +117,9 @@ def different_cameras():
     images = []
     for i, pose in enumerate(c2w):
         pose[:3, :3] = pose[:3, :3] @ turned(0.1 * (i - 2), 0.15 * (-1) ** i)
-        level = grey(wall((PLAIN, small)[i % 2], pose)[1])
-        images.append(np.repeat((255 * level + 0.5).astype(np.uint8)[..., None], 3, -1))
-    return TrainingPixels([PLAIN, small], [0, 1, 0, 1, 0], c2w, images), c2w
+        levels = grey(wall((PINHOLE, small)[i % 2], pose)[1])
+        images.append(np.repeat((255 * levels + 0.5).astype(np.uint8)[..., None], 3, -1))
+    return TrainingPixels([PINHOLE, small], [0, 1, 0, 1, 0], c2w, images), c2w
 
 
 def turned(pitch, roll):
@@ -162,11 +162,11 @@ def test_correlation_matches_the_reference():
 
 
 def test_each_tile_has_its_own_depth_range():
-    pixels = photos(PLAIN, lambda i, t, x: np.full(t.shape, 0.5))
-    place = np.array(
+    pixels = photos(PINHOLE, lambda i, t, x: np.full(t.shape, 0.5))
+    pixel = np.array(
         [(16.0, 12.0)] * 30 + [(80.0, 12.0)] * 30 + [(48.0, 60.0)] * 5 + [(0.0, 0.0)] * 30
     )
-    local = np.concatenate([(place - (48, 36)) / 90, np.ones((95, 1))], -1)
+    local = np.concatenate([(pixel - (48, 36)) / 90, np.ones((95, 1))], -1)
     local[-30:] = (9.0, 0.0, -1.0)  # behind the camera: in no tile, although nearest
     depth = np.repeat([2.0, 8.0, 1.0, 1.0], [30, 30, 5, 30])
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
@@ -196,12 +196,12 @@ def test_neighbours_have_similar_axes_and_triangulation_angles():
     turned[:3, 0], turned[:3, 2] = -turned[:3, 0], -turned[:3, 2]
     c2w = np.concatenate([c2w, turned[None]])
     middle = np.full((10, 9), 4.0)
-    found = select_neighbours(c2w, [PLAIN] * 10, middle)
+    found = select_neighbours(c2w, [PINHOLE] * 10, middle)
     assert (found[9] == -1).all(), "it looks in the opposite direction"
     assert sorted(found[4, 4]) == [2, 3, 5, 6], "4 and 8 degrees to each side"
-    assert (select_neighbours(c2w[:1], [PLAIN], middle[:1]) == -1).all()
+    assert (select_neighbours(c2w[:1], [PINHOLE], middle[:1]) == -1).all()
     middle[4, 4] = 8.0
-    wider = select_neighbours(c2w, [PLAIN] * 10, middle)
+    wider = select_neighbours(c2w, [PINHOLE] * 10, middle)
     assert sorted(wider[4, 4]) == [1, 2, 6, 7], "distant points need a wider baseline"
     assert (wider[4, 3] == found[4, 3]).all() and (found[4, 3] != found[4, 5]).any()
 
@@ -227,9 +227,9 @@ def test_depth_of_the_reference_street(monkeypatch):
     for i, view in enumerate(scene.of_split("heldout")):
         truth = next(truth for truth in truths if truth.name == Path(view.name).name)
         of_view = found.select(found.image == i)
-        place = pixels.place_towards(of_view.image, of_view.rays_d).numpy()
+        uv = pixels.place_towards(of_view.image, of_view.rays_d).numpy()
         height, width = truth.depth.shape
-        true = truth.depth[(place[:, 1] * height).astype(int), (place[:, 0] * width).astype(int)]
+        true = truth.depth[(uv[:, 1] * height).astype(int), (uv[:, 0] * width).astype(int)]
         off.append(np.abs(of_view.depth.numpy() / true - 1))
     off = np.concatenate(off)
     assert len(off) > 100

@@ -90,7 +90,7 @@ class FreeSpace:
         return unique * SAME_POINT, votes > 0.5 * views
 
     def force_empty(self, everywhere: bool = True) -> None:
-        """Force cells of the occupancy empty; a forced cell stays so.
+        """Force cells of the occupancy empty, for good unless a sparse point protects them.
 
         Args:
             everywhere: Test all cells; else only the occupied ones, which is faster.

@@ -2,8 +2,8 @@
 
 Distant lawns and roads look alike at any height: at grazing angles an error of some decimetres
 hardly moves a pixel, but snow, water and smog make it visible. Sparse points are few but accurate,
-and ground bends little between them. The fitted height therefore says where rays labelled ground
-should end.
+and ground bends little between them. The fitted height therefore determines where rays labelled
+ground should end.
 """
 
 from dataclasses import dataclass
