@@ -21,19 +21,19 @@ from climatenerf.cli.render import parse_size
 from climatenerf.field.checkpoint import load_field
 from climatenerf.paths.camera_path import CameraPath, camera_path
 from climatenerf.render.frame import render_frame
-from climatenerf.render.session import prepare
+from climatenerf.render.session import RenderSession
 from climatenerf.scene import load_scene
-from climatenerf.weather.description import KeyframedWeather
-from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import World
 
 
 def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:
     """Level over the datum at which about `wanted` of the frame shows water, by its depth layer."""
     camera, c2w = path.cameras[0].resized(120, 68), path.c2w[0]
-    stage = prepare(field, scene, KeyframedWeather(Weather(), {}), c2w[None, :3, 3], np.zeros(1),
-                    lambda *_: None)  # fmt: skip
-    _, layers = render_frame(stage.at(0.0), camera, c2w)
+    _, layers = render_frame(World(field), camera, c2w)
     direction = camera.directions() @ c2w[:3, :3].T
     eye = c2w[2, 3]
     # A pixel is wet once the level is above its surface, or above the horizon's foot for sky.
@@ -61,10 +61,9 @@ def frames(
     rows: dict[str, dict] = {}
     for name, weather in ((name, weathers[name]) for name in wanted):
         start = time.perf_counter()
-        stage = prepare(field, scene, KeyframedWeather(weather, {}), path.c2w[:, :3, 3],
-                        np.zeros(1), lambda *_: None)  # fmt: skip
+        session = RenderSession(field, scene, weather, path.c2w[:, :3, 3])
         prepared = time.perf_counter() - start
-        world = stage.at(0.0)
+        world = session.world(0.0)
         _, layers = render_frame(world, path.cameras[0], path.c2w[0])
         seconds = common.measure(
             lambda world=world: render_frame(world, path.cameras[0], path.c2w[0]),

@@ -24,7 +24,7 @@ from PIL import Image
 from climatenerf.core.storage import read_safetensors
 from climatenerf.field.checkpoint import load_field
 from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
-from climatenerf.render.frame import render_frame
+from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_image
 from climatenerf.studies.ablation import depth_picture, normal_picture
@@ -71,7 +71,8 @@ def surfaces(run: Path, columns: int) -> Rows:
         camera = scene.cameras[view.camera]
         small = camera.resized(320, round(camera.height * 320 / camera.width))
         world = World(field)
-        picture, layers = render_frame(world, small, scene.c2w_world(view), 2, True, True)
+        options = FrameOptions(supersample=2, normals=True, labels=True)
+        picture, layers = render_frame(world, small, scene.c2w_world(view), options)
         photo = Image.fromarray(load_image(view, scene)).resize((small.width, small.height))
         shown = [np.asarray(photo), picture, depth_picture(layers["depth"])]
         shown += [normal_picture(layers["normal"])]

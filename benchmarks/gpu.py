@@ -31,8 +31,9 @@ from climatenerf.cli.render import parse_size
 from climatenerf.core.device import on
 from climatenerf.core.errors import UserError
 from climatenerf.field.checkpoint import load_field
+from climatenerf.field.compositing import RENDER_STEP, rays_at_once
 from climatenerf.paths.camera_path import camera_path
-from climatenerf.render.volume import RENDER_STEP, camera_rays, rays_at_once
+from climatenerf.render.volume import camera_rays
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings, settings_of

@@ -131,11 +131,12 @@ def test_the_water_mirrors_the_place(fitted, monkeypatch):
     import torch
 
     from climatenerf.field.checkpoint import load_field
+    from climatenerf.field.compositing import RENDER_STEP
     from climatenerf.paths.camera_path import camera_path
     from climatenerf.render import integrator as tracing
     from climatenerf.render.integrator import trace
-    from climatenerf.render.session import prepare
-    from climatenerf.render.volume import RENDER_STEP, camera_rays
+    from climatenerf.render.session import RenderSession
+    from climatenerf.render.volume import camera_rays
     from climatenerf.scene import load_scene
     from climatenerf.weather.description import weather_from_table
 
@@ -146,10 +147,10 @@ def test_the_water_mirrors_the_place(fitted, monkeypatch):
     path = camera_path("still", scene, 1, (160, 90))
     table = {"flood": {"level": CAPTURES[name]["level"], "wind-speed": "0 m/s"}}
     places, times = path.c2w[:, :3, 3], np.zeros(1)
-    world = prepare(field, scene, weather_from_table(table), places, times, lambda *_: None).at(0.0)
-    assert world.water is not None
-    level = world.water.level
-    mirror = dataclasses.replace(world, water=dataclasses.replace(world.water, mirror_only=True))
+    world = RenderSession(field, scene, weather_from_table(table), places, times).world(0.0)
+    (water,) = world.surfaces
+    level = water.level
+    mirror = dataclasses.replace(world, surfaces=(dataclasses.replace(water, mirror_only=True),))
     o, d = camera_rays(path.cameras[0], path.c2w[0])
     angle = torch.full((len(o),), 1 / 160)
     seen = trace(mirror, o, d, angle)

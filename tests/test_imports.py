@@ -13,7 +13,7 @@ SLOW = {"torch", "numba", "mitsuba", "scipy"}
     [
         "climatenerf",
         "climatenerf.scene",
-        "climatenerf.weather.parameters climatenerf.weather.units climatenerf.weather.description",
+        "climatenerf.weather.registry climatenerf.weather.units climatenerf.weather.description",
         "climatenerf.cli.fit climatenerf.cli.render climatenerf.cli.demo",
         "climatenerf.core.storage climatenerf.field.presets climatenerf.evaluation.metrics",
     ],

@@ -18,8 +18,8 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
 from climatenerf.field.presets import PRESETS
-from climatenerf.render.frame import render_frame
-from climatenerf.render.session import prepare
+from climatenerf.render.frame import FrameOptions, render_frame
+from climatenerf.render.session import RenderSession
 from climatenerf.scene import load_image
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.free_space import FreeSpace
@@ -156,11 +156,10 @@ def test_a_frame_in_all_weathers_is_the_same_on_both(runs):
             field = load_field(folder / "cpu")
             field.occupancy.seen.fill_(1)
             weather = weather_from_table(WEATHER)
-            stage = prepare(
-                field, scene, weather, pose[None, :3, 3], np.array([0.0]), lambda *_: None
-            )
+            session = RenderSession(field, scene, weather, pose[None, :3, 3])
             small = CAMERA.resized(16, 12)
-            frames.append(render_frame(stage.at(0.0), small, pose, 2, normals=True, labels=True))
+            options = FrameOptions(2, normals=True, labels=True)
+            frames.append(render_frame(session.world(0.0), small, pose, options))
     (ours, layers), (theirs, others) = frames
     assert ours.std() > 5 and np.array_equal(ours, theirs)
     assert {"mask_water", "mask_snow", "mask_smog", "normal"} <= set(layers)

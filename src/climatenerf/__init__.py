@@ -14,11 +14,12 @@ _PUBLIC = {
     "load_run": "climatenerf.api",
     "render_movie": "climatenerf.api",
     "evaluate": "climatenerf.api",
-    "Weather": "climatenerf.weather.parameters",
-    "Smog": "climatenerf.weather.parameters",
-    "Flood": "climatenerf.weather.parameters",
-    "Snow": "climatenerf.weather.parameters",
-    "Sun": "climatenerf.weather.parameters",
+    "RenderSession": "climatenerf.render.session",
+    "Weather": "climatenerf.weather.weather",
+    "Smog": "climatenerf.weather.smog.parameters",
+    "Flood": "climatenerf.weather.flood.parameters",
+    "Snow": "climatenerf.weather.snow.parameters",
+    "Sun": "climatenerf.weather.light.parameters",
 }
 
 

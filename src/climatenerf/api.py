@@ -25,7 +25,9 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, read_weather
-from climatenerf.weather.parameters import Weather
+from climatenerf.weather.effect import Effect
+from climatenerf.weather.registry import check_effects, installed_effects, layer_table
+from climatenerf.weather.weather import Weather
 
 if TYPE_CHECKING:
     from climatenerf.field.hash_field import Field
@@ -209,6 +211,7 @@ def render_movie(
     preview: bool = False,
     progress: Progress | None = None,
     note: Callable[[str], None] | None = None,
+    effects: Sequence[Effect] | None = None,
 ) -> Path:
     """Render a run in a weather: PNG frames, a movie, a JSON sidecar, measured layers.
 
@@ -233,6 +236,7 @@ def render_movie(
         preview: show the frame at work in `preview.png`.
         progress: called with "light", "snowfall", "frames" and "movie".
         note: called with sentences about what was assumed or left out.
+        effects: the effects that the weather has sections for; None takes the installed ones.
 
     Returns:
         The movie; with `part` the folder of the frames.
@@ -242,20 +246,21 @@ def render_movie(
             something else.
     """
     from climatenerf.output import job as jobs
-    from climatenerf.output.layers import LAYERS
     from climatenerf.paths.camera_path import camera_path
 
     run = run if isinstance(run, Run) else load_run(run)
     out, say = Path(out), note or (lambda sentence: None)
-    unknown = set(layers) - {"all", *LAYERS}
+    used = installed_effects() if effects is None else check_effects(tuple(effects))
+    table = layer_table(used)
+    unknown = set(layers) - {"all", *table}
     if unknown:
-        raise UserError(f"there is no layer {min(unknown)!r}; use all or {', '.join(LAYERS)}")
+        raise UserError(f"there is no layer {min(unknown)!r}; use all or {', '.join(table)}")
     if part is not None and join_only:
         raise UserError("a part is rendered or the frames are joined; ask for one of them")
     if part is not None and not 1 <= part[0] <= part[1]:
         raise UserError(f"part {part[0]} of {part[1]} does not exist; parts count from 1")
     view = jobs.appearance_index(appearance, run.scene)
-    wanted = tuple(LAYERS) if "all" in layers else tuple(layers)
+    wanted = tuple(table) if "all" in layers else tuple(layers)
     if "label" in wanted and not run.field.knows_classes:
         if "label" in layers:
             raise UserError(
@@ -271,11 +276,12 @@ def render_movie(
         run.folder,
         cameras,
         cameras.fps or fps,
-        _keyframed(weather),
+        _keyframed(weather, used),
         supersample=supersample,
         layers=wanted,
         formats=formats,
         appearance=view,
+        effects=used,
     )
 
     def prepare() -> "jobs.FrameSource":
@@ -318,10 +324,14 @@ def evaluate(run: Run | PathText, *, progress: Progress | None = None) -> dict[s
     )
 
 
-def _keyframed(weather: Weather | KeyframedWeather | PathText | None) -> KeyframedWeather:
-    """Return any description of weather as weather over time."""
+def _keyframed(
+    weather: Weather | KeyframedWeather | PathText | None, effects: Sequence[Effect]
+) -> KeyframedWeather:
+    """Return any description of weather as weather over time, with a section for each effect."""
     if weather is None:
-        weather = Weather()
+        weather = Weather(effects=effects)
     if isinstance(weather, Weather):
-        return KeyframedWeather(weather, {})
-    return weather if isinstance(weather, KeyframedWeather) else read_weather(Path(weather))
+        weather = KeyframedWeather(weather, {})
+    if not isinstance(weather, KeyframedWeather):
+        return read_weather(Path(weather), effects)
+    return replace(weather, base=weather.base.with_sections(effects))

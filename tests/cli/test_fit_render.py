@@ -17,7 +17,6 @@ from PIL import Image
 
 from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
-from climatenerf.cli.render import LAYER_NAMES
 from climatenerf.core.storage import read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.field.presets import PRESETS
@@ -26,6 +25,7 @@ from climatenerf.output.video import write_png
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import read_rgb
 from climatenerf.training.settings import PAPER, Losses
+from climatenerf.weather.registry import layer_table
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
 SMALL = ["--size", "96x54", "--frames", "2"]
@@ -378,7 +378,7 @@ def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypa
     assert sidecar["weather"]["snow"]["depth"] == "0.15 m"
     assert sidecar["units"]["length"] == "m" and "scale" in sidecar and "versions" in sidecar
     assert len(sidecar["frames"]) == 2 and sidecar["appearance_of_training_view"] is None
-    known = set(LAYER_NAMES) - {"label"}  # the embedded street's labels know the sky alone
+    known = set(layer_table()) - {"label"}  # the embedded street's labels know the sky alone
     for frame in sidecar["frames"]:
         assert (frame["camera"]["width"], frame["camera"]["height"]) == (96, 54)
         assert np.array(frame["c2w_world"]).shape == (4, 4)

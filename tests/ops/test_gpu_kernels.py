@@ -16,7 +16,8 @@ from support.random_field import random_field
 
 from climatenerf.field import hash_field as field_module
 from climatenerf.field.activations import plain_radiance
-from climatenerf.field.protocol import FUSED
+from climatenerf.field.capabilities import FUSED
+from climatenerf.field.compositing import composited
 from climatenerf.ops import (
     compositing,
     dispatch,
@@ -28,7 +29,6 @@ from climatenerf.ops import (
     visual_hull,
 )
 from climatenerf.render import volume as view_module
-from climatenerf.render.volume import composited
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 os.environ["TRITON_INTERPRET"] = str(int(DEVICE == "cpu"))  # it is read where a kernel is defined

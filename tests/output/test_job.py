@@ -23,7 +23,8 @@ from climatenerf.output import job as jobs
 from climatenerf.output import render_folder
 from climatenerf.output.job import frames_of_part, join, render_frames, render_movie
 from climatenerf.weather.description import KeyframedWeather
-from climatenerf.weather.parameters import Snow, Weather
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather
 
 
 def render(job, out, **options):

@@ -7,6 +7,7 @@ from PIL import Image
 
 from climatenerf.core.errors import UserError
 from climatenerf.output import layers
+from climatenerf.weather.registry import layer_table
 
 RNG = np.random.default_rng(0)
 H, W = 6, 8
@@ -42,7 +43,7 @@ def test_png_is_within_half_a_step_and_marked(tmp_path):
     given = sample_layers()
     files = layers.save_layers(tmp_path, "0000", given, ("npz", "png"))
     for name, values in given.items():
-        layer = layers.LAYERS[name]
+        layer = layer_table()[name]
         with Image.open(tmp_path / files[name][1]) as image:
             assert "simulated" in image.info["simulated"]
             levels = np.asarray(image)
@@ -60,13 +61,15 @@ def test_png_is_within_half_a_step_and_marked(tmp_path):
 
 def test_png_limits():
     depth = np.array([[0.0001, 70.0, np.inf, np.nan, 0.0, -1.0]])
-    assert layers.png_values("depth", depth).tolist() == [[1, 65535, 0, 0, 0, 0]]
-    assert layers.png_values("mask_water", np.array([[-0.1, 0.5, 2.0]])).tolist() == [[0, 128, 255]]
+    assert layers.png_values(layer_table()["depth"], depth).tolist() == [[1, 65535, 0, 0, 0, 0]]
+    assert layers.png_values(
+        layer_table()["mask_water"], np.array([[-0.1, 0.5, 2.0]])
+    ).tolist() == [[0, 128, 255]]
 
 
 def test_wrong_layers_are_refused(tmp_path):
     for bad in ({"colour": np.zeros((H, W))}, {"depth": np.zeros((H, W, 3))}):
-        with pytest.raises(ValueError, match="see LAYERS"):
+        with pytest.raises(ValueError, match="see layer_table"):
             layers.save_layers(tmp_path, "0", bad)
 
 

@@ -100,7 +100,7 @@ def test_snow_is_reproducible_by_its_seed(yard):
 
 def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path):
     from climatenerf.weather.flood.waves import at_time, heights, make_waves, slopes
-    from climatenerf.weather.parameters import Flood
+    from climatenerf.weather.flood.parameters import Flood
 
     water.wavy(5.0, 1.0, tmp_path)
     raw = (tmp_path / "water.ply").read_bytes()

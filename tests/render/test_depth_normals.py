@@ -4,7 +4,7 @@ from support.analytic_fields import AnalyticField, Box, HalfSpace
 
 from climatenerf.core.cameras import Camera
 from climatenerf.render.depth_normals import plane_normals
-from climatenerf.render.frame import render_frame
+from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.weather.world import World
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 40.0, 30.0)
@@ -70,7 +70,7 @@ def test_the_layer_against_a_scene_in_closed_form(supersample):
     c2w = np.eye(4)
     c2w[:3, :3] = np.stack([[1, 0, 0], [0, 0, -1], [0, 1, 0]], -1)
     c2w[:3, 3] = (0.0, -3.0, 1.5)
-    _, layers = render_frame(World(field), CAMERA, c2w, supersample, normals=True)
+    _, layers = render_frame(World(field), CAMERA, c2w, FrameOptions(supersample, normals=True))
     d = CAMERA.directions() @ c2w[:3, :3].T
     hit = c2w[:3, 3] + np.where(np.isfinite(layers["depth"]), layers["depth"], 0)[..., None] * d
     ground = np.isfinite(layers["depth"]) & (np.abs(hit[..., 2]) < 0.02)

@@ -14,11 +14,14 @@ from climatenerf.core.samples import MIN_TAU, Samples
 from climatenerf.render import integrator as trace_module
 from climatenerf.render.frame import render_frame
 from climatenerf.render.integrator import trace
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.flood.surface import Water
 from climatenerf.weather.flood.waves import at_time, make_waves
-from climatenerf.weather.parameters import Flood, Smog, Snow
 from climatenerf.weather.smog.medium import medium
+from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.snow.layer import bake_snow
-from climatenerf.weather.world import Water, World
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.world import World
 
 WIDE = ((-3000.0, -3000.0, -20.0), (3000.0, 3000.0, 30.0))
 CAMERA = Camera(96, 54, 60.0, 60.0, 48.0, 27.0)
@@ -58,6 +61,11 @@ def flooded(level=0.3, **changes):
     return Water(flood, level, waves, torch.full((3,), math.pi * 0.6))
 
 
+def values(seen, name):
+    """A part of a render's output, or one of its layers."""
+    return seen.layers[name] if name in seen.layers else getattr(seen, name)
+
+
 def frame(world, eye=(0.0, -3.0, 1.6), direction=(0.0, 1.0, -0.2), camera=CAMERA):
     return render_frame(world, camera, looking(direction, eye))
 
@@ -74,7 +82,7 @@ def linear(world, direction=(0.0, 1.0, -0.2), eye=(0.0, -3.0, 1.6)):
 
 def test_smog_contrast_falls_with_depth_at_the_rate_asked_for():
     air = medium(Smog(visibility=30.0), 0.0)
-    dry, hazy = linear(World(street())), linear(World(street(), air=air))
+    dry, hazy = linear(World(street())), linear(World(street(), media=(air,)))
     colour = torch.tensor(air.colour)
     solid = torch.isfinite(dry.depth)
     for c in range(3):
@@ -87,7 +95,7 @@ def test_smog_contrast_falls_with_depth_at_the_rate_asked_for():
 
 
 def test_an_endless_smog_swallows_the_sky_and_layers_say_so():
-    seen = linear(World(street(), air=medium(Smog(visibility=30.0), 0.0)))
+    seen = linear(World(street(), media=(medium(Smog(visibility=30.0), 0.0),)))
     sky = torch.isinf(seen.depth)
     assert sky.any()
     assert torch.allclose(seen.rgb[sky], torch.tensor(medium(Smog(sigma=1.0), 0.0).colour))
@@ -108,9 +116,9 @@ def test_white_furnace():
     d[:, 2] = -d[:, 2].abs() - 0.02
     d = torch.nn.functional.normalize(d, dim=-1)
     o = torch.tensor([0.0, 0.0, 1.6]).expand_as(d).contiguous()
-    seen = trace(World(white, water=water), o, d, torch.full((3000,), 2e-3))
+    seen = trace(World(white, surfaces=(water,)), o, d, torch.full((3000,), 2e-3))
     assert (seen.rgb - 1).abs().max() < 1e-3
-    assert seen.mask_water.min() > 0.999
+    assert seen.layers["mask_water"].min() > 0.999
 
 
 def test_a_perfect_mirror_shows_what_a_mirrored_camera_sees():
@@ -118,13 +126,13 @@ def test_a_perfect_mirror_shows_what_a_mirrored_camera_sees():
     level = 0.3
     still = flooded(level, wind_speed=0.0)
     water = dataclasses.replace(still, mirror_only=True)
-    world = World(street(), water=water)
+    world = World(street(), surfaces=(water,))
     seen = linear(world)
     from climatenerf.render.volume import camera_rays
 
     o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
     t = (level - o[:, 2]) / d[:, 2]
-    wet = (d[:, 2] < 0) & (seen.mask_water > 0.999)
+    wet = (d[:, 2] < 0) & (seen.layers["mask_water"] > 0.999)
     assert wet.float().mean() > 0.1
     mirrored_o, mirrored_d = o.clone(), d.clone()
     mirrored_o[:, 2] = 2 * level - o[:, 2]
@@ -145,7 +153,7 @@ def test_fresnel_governs_how_much_the_sky_shows():
     angles = torch.deg2rad(torch.tensor([0.0, 30.0, 60.0, 75.0, 80.0, 85.0]))
     d = torch.stack([torch.zeros(6), angles.sin(), -angles.cos()], dim=-1)
     o = torch.tensor([0.0, 0.0, 1.6]).expand(6, 3).contiguous()
-    seen = trace(World(black, water=water), o, d, torch.full((6,), 1e-3))
+    seen = trace(World(black, surfaces=(water,)), o, d, torch.full((6,), 1e-3))
     expected = torch.tensor([0.0204, 0.0214, 0.0597, 0.212, 0.348, 0.584])
     assert torch.allclose(seen.rgb[:, 0], expected, rtol=0.01)
 
@@ -162,7 +170,7 @@ def test_attenuation_per_channel_is_recovered_from_the_picture():
         flood = Flood(level=0.0, wind_speed=0.0, attenuation=betas, colour=(0.0,) * 3)
         water = Water(flood, 0.0, at_time(make_waves(flood, 0), 0.0), torch.ones(3))
         o, d = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-        values.append(trace(World(field, water=water), o, d, torch.full((1,), 1e-3)).rgb[0])
+        values.append(trace(World(field, surfaces=(water,)), o, d, torch.full((1,), 1e-3)).rgb[0])
     path = 0.5 * (1 + 1 / 0.83)
     found = -(values[1] / values[0]).log() / path
     assert torch.allclose(found, torch.tensor(betas), rtol=0.01)
@@ -182,7 +190,7 @@ def test_snell_apparent_depth_near_the_nadir():
         torch.stack([slant, torch.zeros_like(slant), -torch.ones_like(slant)], dim=-1), dim=-1
     )
     o = torch.tensor([0.0, 0.0, 1.0]).expand_as(d).contiguous()
-    green = trace(World(bed, water=water), o, d, torch.full((4001,), 1e-5)).rgb[:, 1]
+    green = trace(World(bed, surfaces=(water,)), o, d, torch.full((4001,), 1e-5)).rgb[:, 1]
     edge = slant[(green[1:] - green[:-1]).abs().argmax()]
     apparent = 0.1 / float(edge) - 1.0
     assert abs(apparent / (depth / 1.333) - 1) < 0.01
@@ -199,14 +207,14 @@ def test_a_bed_s_rays_leave_out_next_to_nothing(monkeypatch):
     monkeypatch.setattr(AnalyticField, "march", noting)
     linear(World(street()))
     assert set(asked) == {None}
-    linear(World(street(), water=flooded()))
+    linear(World(street(), surfaces=(flooded(),)))
     assert set(asked) == {None, MIN_TAU}
 
 
 def test_flooded_pixels_are_nested_as_the_level_rises():
     before = torch.zeros(CAMERA.width * CAMERA.height)
     for level in (0.05, 0.2, 0.35, 0.6):
-        share = linear(World(street(), water=flooded(level))).mask_water
+        share = linear(World(street(), surfaces=(flooded(level),))).layers["mask_water"]
         assert (share >= before - 1e-4).all()
         assert share.mean() > before.mean()
         before = share
@@ -214,29 +222,29 @@ def test_flooded_pixels_are_nested_as_the_level_rises():
 
 def test_water_depth_layer_against_the_true_ground():
     level = 0.3
-    seen = linear(World(street(), water=flooded(level)))
+    seen = linear(World(street(), surfaces=(flooded(level),)))
     dry = linear(World(street()))
-    wet = (seen.mask_water > 0.999) & torch.isfinite(dry.depth)
+    wet = (seen.layers["mask_water"] > 0.999) & torch.isfinite(dry.depth)
     from climatenerf.render.volume import camera_rays
 
     o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
     bed = o[:, 2] + dry.depth * d[:, 2]
-    assert (seen.water_depth[wet] - (level - bed[wet])).abs().max() < 0.01
-    assert (seen.water_depth[seen.mask_water < 1e-4] == 0).all()
+    assert (seen.layers["water_depth"][wet] - (level - bed[wet])).abs().max() < 0.01
+    assert (seen.layers["water_depth"][seen.layers["mask_water"] < 1e-4] == 0).all()
 
 
 def test_the_waterline_is_soft_and_lies_where_water_meets_ground():
     level = 0.3
-    seen = linear(World(street(), water=flooded(level)))
+    seen = linear(World(street(), surfaces=(flooded(level),)))
     dry = linear(World(street()))
     from climatenerf.render.volume import camera_rays
 
     o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
     ground = o[:, 2] + dry.depth * d[:, 2]
     solid = torch.isfinite(dry.depth)
-    assert (seen.mask_water[solid & (ground < level - 0.1)] > 0.95).all()
-    assert (seen.mask_water[solid & (ground > level + 0.1)] < 0.05).all()
-    assert ((seen.mask_water > 0.05) & (seen.mask_water < 0.95)).any()
+    assert (seen.layers["mask_water"][solid & (ground < level - 0.1)] > 0.95).all()
+    assert (seen.layers["mask_water"][solid & (ground > level + 0.1)] < 0.05).all()
+    assert ((seen.layers["mask_water"] > 0.05) & (seen.layers["mask_water"] < 0.95)).any()
 
 
 def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it():
@@ -244,7 +252,7 @@ def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it
     water = flooded(1.5, wind_speed=0.0, attenuation=(0.0,) * 3)
     o = torch.tensor([[0.0, -3.0, 1.0], [0.0, -3.0, 1.0]])
     d = torch.nn.functional.normalize(torch.tensor([[0.0, 0.0, 1.0], [0.0, -1.0, 0.3]]), dim=-1)
-    seen = trace(World(field, water=water), o, d, torch.full((2,), 1e-3))
+    seen = trace(World(field, surfaces=(water,)), o, d, torch.full((2,), 1e-3))
     zenith = field.sky(torch.tensor([[0.0, 0.0, 1.0]]))[0]
     assert torch.allclose(seen.rgb[0], zenith * (1 - 0.0204), atol=0.03)
     assert torch.isfinite(seen.rgb).all()
@@ -263,7 +271,7 @@ def snowed(depth, field=None):
 
 def test_weather_that_does_nothing_is_bit_identical():
     clean, layers = frame(World(street()))
-    same, same_layers = frame(World(street(), air=medium(Smog(), 0.0), matter=None, water=None))
+    same, same_layers = frame(World(street()))
     assert np.array_equal(clean, same)
     for key in layers:
         assert np.array_equal(layers[key], same_layers[key])
@@ -276,11 +284,11 @@ def test_weather_in_the_limit_changes_no_pixel_by_more_than_one_step(what):
     )
     small = dataclasses.replace(flat, box=((-30, -30, -5), (30, 30, 10)))
     if what == "smog":
-        world = World(small, air=medium(Smog(visibility=1e6), 0.0))
+        world = World(small, media=(medium(Smog(visibility=1e6), 0.0),))
     elif what == "flood":
-        world = World(small, water=flooded(-0.01))
+        world = World(small, surfaces=(flooded(-0.01),))
     else:
-        world = World(small, matter=snowed(1e-4, small))
+        world = World(small, matters=(snowed(1e-4, small),))
     clean, layers = frame(World(small))
     other, _ = frame(world)
     # Not the sky: an endless smog swallows it at any visibility, and the ground here ends at 30 m.
@@ -293,16 +301,16 @@ def test_all_weathers_at_once_compose():
     level = 0.3
     snow = snowed(0.15)
     air = medium(Smog(visibility=60.0), 0.0)
-    world = World(street(), None, air, snow.above(level), flooded(level))
+    world = World(street(), None, (air,), (snow.above(level),), (flooded(level),))
     seen = linear(world)
-    assert seen.mask_water.max() > 0.99 and seen.mask_snow.max() > 0.99
-    assert (seen.snow_thickness[seen.mask_water > 0.99] == 0).all()
-    shown = (seen.mask_snow > 0.9) & (seen.snow_thickness > 0)
-    assert 0.05 < seen.snow_thickness[shown].mean() < 0.25
+    assert seen.layers["mask_water"].max() > 0.99 and seen.layers["mask_snow"].max() > 0.99
+    assert (seen.layers["snow_thickness"][seen.layers["mask_water"] > 0.99] == 0).all()
+    shown = (seen.layers["mask_snow"] > 0.9) & (seen.layers["snow_thickness"] > 0)
+    assert 0.05 < seen.layers["snow_thickness"][shown].mean() < 0.25
     assert torch.isfinite(seen.rgb).all()
     # The snow of the bank shows in the water: reflections see the other weathers.
-    without = linear(dataclasses.replace(world, matter=None))
-    wet = seen.mask_water > 0.999
+    without = linear(dataclasses.replace(world, matters=()))
+    wet = seen.layers["mask_water"] > 0.999
     assert (seen.rgb[wet] - without.rgb[wet]).abs().max() > 0.02
 
 
@@ -318,9 +326,9 @@ def test_snow_shows_its_depth_in_the_picture(tilt):
     foot[:, 2] = foot[:, 1] * math.tan(angle)
     o = torch.tensor([0.0, -1.5, 2.5]).expand(400, 3).contiguous()
     d = torch.nn.functional.normalize(foot - o, dim=-1)
-    seen = trace(World(field, matter=snow), o, d, torch.full((400,), 2e-3))
-    assert seen.mask_snow.min() > 0.99
-    assert (seen.snow_thickness - 0.15).abs().max() < 0.15 * 0.1
+    seen = trace(World(field, matters=(snow,)), o, d, torch.full((400,), 2e-3))
+    assert seen.layers["mask_snow"].min() > 0.99
+    assert (seen.layers["snow_thickness"] - 0.15).abs().max() < 0.15 * 0.1
     # And the layer's depth is to the snow, not to the ground.
     height = (o + seen.depth[:, None] * d)[:, 2] - (o + seen.depth[:, None] * d)[:, 1] * math.tan(
         angle
@@ -330,23 +338,23 @@ def test_snow_shows_its_depth_in_the_picture(tilt):
 
 def test_snow_is_not_looked_for_behind_what_is_opaque(monkeypatch):
     """Fewer samples, the same picture but for rounding; and what is before a wall all shows."""
-    world = World(street(), matter=snowed(0.2))
+    world = World(street(), matters=(snowed(0.2),))
     few = linear(world)
     wanted = []
-    march = type(world.matter).march
+    march = type(world.matters[0]).march
 
     def noted(self, rays_o, rays_d, t_min, t_max):
         wanted.append(t_max)
         return march(self, rays_o, rays_d, t_min, t_max)
 
-    monkeypatch.setattr(type(world.matter), "march", noted)
+    monkeypatch.setattr(type(world.matters[0]), "march", noted)
     linear(world)
     assert 0.1 < torch.isfinite(torch.cat(wanted)).float().mean() < 0.9
     monkeypatch.setattr(trace_module, "HIDDEN", 0.0)
     every = linear(world)
     for name in ("rgb", "mask_snow", "snow_thickness"):
-        assert (getattr(few, name) - getattr(every, name)).abs().max() < 2e-3, name
-    assert few.mask_snow.max() > 0.99
+        assert (values(few, name) - values(every, name)).abs().max() < 2e-3, name
+    assert few.layers["mask_snow"].max() > 0.99
 
 
 def test_no_snow_shows_under_a_roof_or_on_a_steep_slope():
@@ -357,12 +365,12 @@ def test_no_snow_shows_under_a_roof_or_on_a_steep_slope():
     generator = torch.Generator().manual_seed(1)
     foot = torch.cat([torch.rand(300, 2, generator=generator) * 3 - 1.5, torch.zeros(300, 1)], -1)
     d = torch.nn.functional.normalize(foot - o, dim=-1)
-    world = World(field, matter=snow)
+    world = World(field, matters=(snow,))
     under = trace(world, o, d, torch.full((300,), 2e-3))
-    assert under.mask_snow.max() < 0.01 and under.snow_thickness.max() == 0
+    assert under.layers["mask_snow"].max() < 0.01 and under.layers["snow_thickness"].max() == 0
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(300, 3).contiguous()
     above = trace(world, foot + torch.tensor([0.0, 0.0, 3.5]), down, torch.full((300,), 2e-3))
-    assert above.mask_snow.min() > 0.99, "the roof itself carries it"
+    assert above.layers["mask_snow"].min() > 0.99, "the roof itself carries it"
 
 
 def test_muddy_water_is_lit_by_the_scene():
@@ -375,7 +383,7 @@ def test_muddy_water_is_lit_by_the_scene():
     for light in (0.5, 1.0):
         waves = at_time(make_waves(flood, 0), 0.0)
         water = Water(flood, 0.0, waves, torch.full((3,), math.pi * light))
-        shown.append(trace(World(black, water=water), o, d, torch.full((1,), 1e-3)).rgb[0])
+        shown.append(trace(World(black, surfaces=(water,)), o, d, torch.full((1,), 1e-3)).rgb[0])
     albedo = ((torch.tensor(flood.colour) + 0.055) / 1.055) ** 2.4
     assert torch.allclose(shown[0] * 2, shown[1], rtol=1e-4)
     assert torch.allclose(shown[1], albedo * (1 - 0.0204), rtol=0.01)
@@ -393,7 +401,7 @@ def test_white_furnace_from_under_water():
     d = torch.stack([torch.zeros(400), elevation.cos(), elevation.sin()], dim=-1)
     o = torch.tensor([0.0, 0.0, 1.0]).expand(400, 3).contiguous()
     for angle in (2e-3, 0.5):  # waves resolved, and averaged over
-        seen = trace(World(white, water=water), o, d, torch.full((400,), angle))
+        seen = trace(World(white, surfaces=(water,)), o, d, torch.full((400,), angle))
         assert (seen.rgb - 1).abs().max() < 1e-3
 
 
@@ -401,7 +409,7 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
     """A fitted kind of field, snow and water: Numba's kernels, not the closed form's torch."""
     import numba
 
-    from climatenerf.render import volume as module
+    from climatenerf.field import compositing as module
 
     field = random_field(full=True)
     field.occupancy.occupied[..., field.occupancy.side // 2 :] = 0  # air above the middle
@@ -410,8 +418,8 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
     places = (field.centre + torch.tensor([0.0, 0.0, 1.5]))[None].numpy().astype(np.float64)
     air, ground = medium(Smog(visibility=60.0), 0.0), float(field.centre[2])
     snow = bake_snow(field, Snow(depth=0.1), places, np.full(3, 0.6))
-    snowy = World(field, None, air, snow)
-    wet = World(field, None, air, None, flooded(ground + 0.3))
+    snowy = World(field, None, (air,), (snow,))
+    wet = World(field, None, (air,), (), (flooded(ground + 0.3),))
     o = (field.centre + torch.tensor([0.0, -1.0, 1.5])).expand(600, 3).contiguous()
     d = directions(600)
     d[:, 2] = -d[:, 2].abs()
@@ -424,16 +432,18 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
         parts = trace(snowy, o, d, angle), trace(wet, o, d, angle)
     finally:
         numba.set_num_threads(threads)
-    assert (whole[0].mask_snow > 0.5).sum() > 50 and (whole[1].mask_water > 0.5).sum() > 50
+    assert (whole[0].layers["mask_snow"] > 0.5).sum() > 50 and (
+        whole[1].layers["mask_water"] > 0.5
+    ).sum() > 50
     for one, other in zip(whole, parts, strict=True):
         for name in ("rgb", "mask_water", "mask_snow", "snow_thickness"):
-            assert (getattr(one, name) - getattr(other, name)).abs().max() < 1e-4, name
+            assert (values(one, name) - values(other, name)).abs().max() < 1e-4, name
 
 
 def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):
-    from climatenerf.render import volume as module
+    from climatenerf.field import compositing as module
 
-    world = World(street(), None, medium(Smog(visibility=60.0), 0.0), None, flooded(0.3))
+    world = World(street(), None, (medium(Smog(visibility=60.0), 0.0),), (), (flooded(0.3),))
     whole = linear(world).rgb
     monkeypatch.setattr(module, "RAYS_AT_ONCE", 777)
     threads = torch.get_num_threads()
@@ -452,16 +462,18 @@ def test_no_parameters_give_nan():
     ):
         assert flood.level is not None
         water = Water(flood, flood.level, at_time(make_waves(flood, 0), 3.0), torch.full((3,), 1.0))
-        for air in (None, medium(Smog(visibility=5.0, height_falloff=2.0), 0.0)):
-            seen = linear(World(street(), air=air, water=water))
+        for media in ((), (medium(Smog(visibility=5.0, height_falloff=2.0), 0.0),)):
+            seen = linear(World(street(), media=media, surfaces=(water,)))
             for name in ("rgb", "water_depth", "mask_water", "transmittance", "normal"):
-                assert torch.isfinite(getattr(seen, name)).all(), (flood, name)
+                assert torch.isfinite(values(seen, name)).all(), (flood, name)
             assert not torch.isnan(seen.depth).any()
             assert (seen.rgb >= 0).all()
 
 
 class Nothing:
     """Matter that is nowhere."""
+
+    mask, thickness_layer = "mask_nothing", "nothing_thickness"
 
     def march(self, rays_o, rays_d, t_min, t_max):
         none = torch.zeros(0)
@@ -485,24 +497,25 @@ def test_what_meets_no_weather_takes_a_short_way_to_the_same(monkeypatch, water)
         field.geometry_net[-1] += 2.0
     if water is not None:
         water = dataclasses.replace(water, level=float(field.centre[2]))
-    plain, taken = trace_module._see_plain, []
+    plain, taken = trace_module._trace_field, []
     monkeypatch.setattr(
-        trace_module, "_see_plain", lambda *given: taken.append(given[1]) or plain(*given)
+        trace_module, "_trace_field", lambda *given: taken.append(given[1]) or plain(*given)
     )
     d = directions(300)
     o = (field.centre + torch.tensor([0.0, 0.0, 1.5])).repeat(300, 1)
     o[:40, 2] -= 3.0  # all of them meet water at once
     angle = torch.full((300,), 0.01)
-    short = trace(World(field, None, water=water), o, d, angle)
+    surfaces = () if water is None else (water,)
+    short = trace(World(field, surfaces=surfaces), o, d, angle)
     if water is None:
         assert sum(map(len, taken)) == 300
     else:
         rise = (d[40:, 2] >= 0).sum()
         assert len(taken[0]) == rise and sum(map(len, taken)) > rise + 100, "and what is mirrored"
     taken.clear()
-    long = trace(World(field, None, matter=Nothing(), water=water), o, d, angle)
+    long = trace(World(field, matters=(Nothing(),), surfaces=surfaces), o, d, angle)
     assert not taken
     assert torch.isfinite(long.depth).float().mean() > 0.1
-    for each in dataclasses.fields(short):
-        ours, theirs = getattr(short, each.name), getattr(long, each.name)
-        assert torch.allclose(ours, theirs, atol=1e-5, rtol=1e-4), each.name
+    for name in ("rgb", "depth", "normal", "transmittance", *short.layers):
+        ours, theirs = values(short, name), values(long, name)
+        assert torch.allclose(ours, theirs, atol=1e-5, rtol=1e-4), name

@@ -5,27 +5,28 @@ from test_integrator import CAMERA, flooded, looking, street
 
 from climatenerf.core.cameras import Camera
 from climatenerf.render import progressive
-from climatenerf.render.frame import render_frame
-from climatenerf.weather.parameters import Smog
+from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.weather.smog.medium import medium
+from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.world import World
 
-WORLD = World(street(), air=medium(Smog(visibility=40.0), 0.0), water=flooded())
+WORLD = World(street(), media=(medium(Smog(visibility=40.0), 0.0),), surfaces=(flooded(),))
 POSE = looking((0.0, 1.0, -0.2))
 
 
-def shown(world, camera, *options):
+def shown(world, camera, supersample=1):
     pictures = []
-    frame, layers = render_frame(world, camera, POSE, *options, show=pictures.append)
+    options = FrameOptions(supersample, show=pictures.append)
+    frame, layers = render_frame(world, camera, POSE, options)
     return pictures, frame, layers
 
 
 def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
     traced = []
 
-    def counted(world, rays_o, *rest):
+    def counted(world, rays_o, *rest, **options):
         traced.append(len(rays_o))
-        return trace(world, rays_o, *rest)
+        return trace(world, rays_o, *rest, **options)
 
     trace = progressive.trace
     monkeypatch.setattr(progressive, "trace", counted)
@@ -47,7 +48,7 @@ def test_several_rays_a_pixel_show_whole_pictures():
     pictures, frame, _ = shown(WORLD, CAMERA, 2)
     assert [each.shape for each in pictures] == [frame.shape] * 3
     assert np.array_equal(pictures[-1], frame)
-    assert np.array_equal(frame, render_frame(WORLD, CAMERA, POSE, 2)[0])
+    assert np.array_equal(frame, render_frame(WORLD, CAMERA, POSE, FrameOptions(2))[0])
     off = [np.abs(each.astype(int) - frame).mean() for each in pictures]
     assert off[0] > off[1] > off[2] == 0
 

@@ -7,7 +7,7 @@ from support.random_field import random_field
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import BUILDING, CLASS_NAMES, SKY, SOLID
-from climatenerf.render.frame import see_frame
+from climatenerf.render.frame import FrameOptions, see_frame
 from climatenerf.render.heads import see_surface
 from climatenerf.render.volume import camera_rays
 from climatenerf.weather.world import World
@@ -52,11 +52,11 @@ def test_rays_that_meet_nothing_are_sky_without_a_normal(field):
 
 def test_layers_take_what_was_learned_and_planes_of_the_depth_otherwise(field):
     pose, (o, d) = rays(field)
-    _, layers = see_frame(World(field), CAMERA, pose, normals=True, labels=True)
+    _, layers = see_frame(World(field), CAMERA, pose, FrameOptions(normals=True, labels=True))
     assert "label" not in layers  # an untrained head is not asked
     planes = layers["normal"]
     field.learned[:] = True
-    _, layers = see_frame(World(field), CAMERA, pose, normals=True, labels=True)
+    _, layers = see_frame(World(field), CAMERA, pose, FrameOptions(normals=True, labels=True))
     assert layers["label"].shape == (24, 32) and (layers["label"] == BUILDING).all()
     assert np.allclose(np.abs(layers["normal"][..., 2]), 1, atol=1e-5)
     assert not np.allclose(planes, layers["normal"])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from climatenerf.core.samples import Samples
-from climatenerf.field.protocol import DENSITY
+from climatenerf.field.capabilities import DENSITY
 
 _OPAQUE = 8.0  # optical depth after which a solid is not followed further: exp(-8) < 1e-3
 _PIECES = 4  # samples that follow a solid down to that depth

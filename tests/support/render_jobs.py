@@ -9,7 +9,8 @@ from climatenerf.output.job import RenderedFrame, RenderJob, frames_of_part, joi
 from climatenerf.paths.camera_path import CameraPath
 from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather
-from climatenerf.weather.parameters import Smog, Weather
+from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.weather import Weather
 
 WIDTH, HEIGHT = 32, 18
 SCENE = Scene(Path("/none"), "test", (), ())

@@ -6,7 +6,7 @@ from PIL import Image
 
 from climatenerf.core.cameras import Camera
 from climatenerf.field.presets import FieldSize
-from climatenerf.render.frame import render_frame
+from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.scene.scene import Scene, View
 from climatenerf.weather.world import World
 from support.analytic_fields import AnalyticField, Box, HalfSpace
@@ -59,7 +59,7 @@ def poses(count: int = 24) -> list[np.ndarray]:
 
 def picture(c2w: np.ndarray) -> np.ndarray:
     torch.manual_seed(0)
-    return render_frame(World(FIELD), CAMERA, c2w, supersample=2)[0]
+    return render_frame(World(FIELD), CAMERA, c2w, FrameOptions(supersample=2))[0]
 
 
 def make_scene(folder) -> Scene:

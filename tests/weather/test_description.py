@@ -16,7 +16,10 @@ from climatenerf.weather.description import (
     weather_from_table,
     weather_to_table,
 )
-from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather
 
 FILE = """
 seed = 7

@@ -9,9 +9,13 @@ import pytest
 import tyro
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.srgb import linear_colour
-from climatenerf.weather import parameters, units
-from climatenerf.weather.parameters import Flood, Smog, Snow, Sun, Weather, check
+from climatenerf.weather import units
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.light.parameters import Sun
+from climatenerf.weather.registry import EFFECTS
+from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather, check
 
 
 @pytest.mark.parametrize(
@@ -110,28 +114,33 @@ def test_ranges():
         assert message in str(error.value)
 
 
-def test_every_value_has_a_range_and_no_section_is_too_long():
-    from dataclasses import fields
-
-    names = set()
-    for section in fields(Weather):
-        if section.name == "seed":
-            names.add("seed")
-            continue
-        items = fields(getattr(Weather(), section.name))
-        assert len(items) <= 12
-        names |= {f"{section.name}.{item.name}" for item in items}
-    assert names == set(parameters._RANGES)
+def test_every_parameter_has_a_range_and_no_section_is_too_long():
+    for effect in EFFECTS:
+        own = effect.fields()
+        assert 0 < len(own) <= 12
+        for parameter in own.values():
+            assert math.isfinite(parameter.low) and parameter.low < parameter.high
 
 
-def test_colours_are_decoded():
-    assert linear_colour((0, 0.5, 1)) == pytest.approx((0, 0.21404, 1), abs=1e-5)
+def test_help_shows_unit_and_range(capsys):
+    with pytest.raises(SystemExit):
+        tyro.cli(Arguments, args=["--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert 'LENGTH, e.g. "0.5 m"; -1000 m to 1000 m' in shown
+    assert "FLOAT FLOAT FLOAT; 0 to 1000" in shown
+
+
+def test_a_triple_is_read_or_none():
+    words = ["--flood.attenuation", "0.1", "0.2", "0.3"]
+    assert tyro.cli(Arguments, args=words).flood.attenuation == (0.1, 0.2, 0.3)
+    none = ["--flood.attenuation", "none", "none", "none"]
+    assert tyro.cli(Arguments, args=none).flood.attenuation is None
 
 
 def test_imports_stay_light():
     """Help and weather files must not wait for torch."""
     code = (
-        "import sys, climatenerf.weather.parameters, climatenerf.weather.description\n"
+        "import sys, climatenerf.weather.registry, climatenerf.weather.description\n"
         "assert not {'torch', 'pint', 'numba'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -21,8 +21,8 @@ def still(z: float) -> dict:
 
 def wavy(z: float, time: float, folder: Path) -> dict:
     """The surface with the program's own waves at a time, as a mesh with their normals."""
+    from climatenerf.weather.flood.parameters import Flood
     from climatenerf.weather.flood.waves import at_time, heights, make_waves
-    from climatenerf.weather.parameters import Flood
 
     waves = make_waves(Flood(level=0.0, wind_speed=WIND, wave_scale=WAVE_SCALE), SEED)
     frame = at_time(waves, time)

@@ -130,8 +130,11 @@ def _run(words: list[str]) -> int:
 
     verb = VERBS[name]
     module = importlib.import_module(verb.module)
+    kind = getattr(module, verb.options)
+    if name == "render":  # its flags depend on the installed weather effects
+        kind = module.options_class()
     # tyro prints help and errors itself, and raises SystemExit with status 0 or 2.
-    options = tyro.cli(getattr(module, verb.options), prog=f"climatenerf {name}", args=words[1:])
+    options = tyro.cli(kind, prog=f"climatenerf {name}", args=words[1:])
     if name == "render":  # given flags override a weather file
         return module.run(options, words[1:]) or 0
     return module.run(options) or 0

@@ -12,7 +12,10 @@ from climatenerf.cli.fit import Fit, fit_with_bars, summary
 from climatenerf.cli.render import parse_size
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json
-from climatenerf.weather.parameters import Flood, Smog, Snow, Weather
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather
 
 WEATHERS = {
     "clean": Weather(),

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,16 +10,10 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError
-from climatenerf.weather.description import (
-    KeyframedWeather,
-    combine,
-    given_flags,
-    read_weather,
-)
-from climatenerf.weather.parameters import Flood, Smog, Snow, Sun, Weather
-
-LAYER_NAMES = ("depth", "normal", "label", "water_depth", "transmittance", "snow_thickness",
-               "mask_water", "mask_snow", "mask_smog")  # fmt: skip
+from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
+from climatenerf.weather.effect import Effect
+from climatenerf.weather.registry import check_effects, installed_effects
+from climatenerf.weather.weather import Weather
 
 
 @dataclass(frozen=True)
@@ -47,8 +41,9 @@ class Render:
     """Exposure and light of the frames: mean, or those of a training photo, such as 0012.jpg."""
     preview: bool = False
     """Show the frame at work in OUT/preview.png: coarse at first, finer pass by pass."""
-    layers: tuple[Literal["all", *LAYER_NAMES], ...] = ()  # type: ignore[valid-type]
-    """Measured layers to write beside the frames."""
+    layers: tuple[str, ...] = ()
+    """Measured layers to write beside the frames: all, or names such as depth; a wrong name lists
+    them."""
     layer_format: tuple[Literal["npz", "png", "exr"], ...] = ("npz",)
     """File formats of the layers."""
     part: str | None = None
@@ -59,16 +54,32 @@ class Render:
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the present
     GPU kernels were tested without a GPU."""
-    smog: Smog = field(default_factory=Smog)
-    flood: Flood = field(default_factory=Flood)
-    snow: Snow = field(default_factory=Snow)
-    sun: Sun = field(default_factory=Sun)
     seed: int = 0
     """Random seed of waves and snowfall."""
 
 
-def run(options: Render, arguments: Sequence[str] | None = None) -> int:
-    """Render, and print where the result is."""
+def options_class(effects: Sequence[Effect] | None = None) -> type[Render]:
+    """`Render` with a section of flags for each effect; None takes the installed effects."""
+    used = installed_effects() if effects is None else effects
+    check_effects(used, reserved=[item.name for item in fields(Render)])
+    sections = [
+        (each.name, each.parameters, field(default_factory=each.parameters)) for each in used
+    ]
+    return make_dataclass("Render", sections, bases=(Render,), frozen=True)
+
+
+def run(
+    options: Render,
+    arguments: Sequence[str] | None = None,
+    effects: Sequence[Effect] | None = None,
+) -> int:
+    """Render, and print where the result is.
+
+    Args:
+        options: an instance of `options_class`.
+        arguments: words of the command line, which tell given flags from defaults.
+        effects: those that the options have flags for; None takes the installed effects.
+    """
     size = parse_size(options.size)
     if options.frames < 1 or not 1 <= options.supersample <= 8:
         raise UserError("--frames must be above 0, --supersample from 1 to 8")
@@ -77,11 +88,13 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
         raise UserError(
             "--part renders frames and --join assembles them; render all parts, then use --join"
         )
-    film = None if options.weather is None else read_weather(options.weather)
-    flags = Weather(options.smog, options.flood, options.snow, options.sun, options.seed)
-    given = given_flags(sys.argv[1:] if arguments is None else arguments)
-    weather = combine(film, flags, given)
-    for name, absent in without_effect(weather, given).items():
+    used = installed_effects() if effects is None else tuple(effects)
+    film = None if options.weather is None else read_weather(options.weather, used)
+    sections = {each.name: getattr(options, each.name) for each in used}
+    flags = Weather(seed=options.seed, effects=used, **sections)
+    given = given_flags(sys.argv[1:] if arguments is None else arguments, used)
+    weather = combine(film, flags, given, used)
+    for name, absent in without_effect(weather, given, used).items():
         progress.warn(f"--{name} changes nothing without {absent}")
 
     from climatenerf.api import render_movie
@@ -105,6 +118,7 @@ def run(options: Render, arguments: Sequence[str] | None = None) -> int:
             preview=options.preview,
             progress=bars,
             note=progress.say,
+            effects=used,
         )
     progress.result(f"{'movie' if part is None else 'frames'}: {made}")
     return 0
@@ -124,22 +138,6 @@ def parse_part(text: str | None) -> tuple[int, int] | None:
             f'--part wants a number and a count, from 1/N to N/N such as 3/16; got "{text}"'
         )
     return int(number), int(count)
-
-
-def without_effect(weather: KeyframedWeather, given: frozenset[str]) -> dict[str, str]:
-    """Return the given flags of absent effects, each with the flag that would add the effect."""
-    adding = {
-        "smog": "--smog.visibility or --smog.sigma",
-        "flood": "--flood.level",
-        "snow": "--snow.depth",
-    }
-    found = {}
-    for name in sorted(given):
-        section = name.partition(".")[0]
-        keyed = any(key.startswith(f"{section}.") for key in weather.keyframes)
-        if section in adding and not keyed and not getattr(weather.base, section).present:
-            found[name.replace("_", "-")] = adding[section]
-    return found
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:

@@ -11,11 +11,12 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.srgb import to_display
 from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, world_rays
+from climatenerf.field.compositing import RENDER_STEP
 from climatenerf.field.protocol import RadianceField
 from climatenerf.ops import compositing
-from climatenerf.render.frame import see_frame
-from climatenerf.render.session import Stage, prepare
-from climatenerf.render.volume import RENDER_STEP, camera_rays
+from climatenerf.render.frame import FrameOptions, see_frame
+from climatenerf.render.session import RenderSession
+from climatenerf.render.volume import camera_rays
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.world import World
@@ -81,7 +82,7 @@ def clean_view(run: EvaluatedRun, truth: Truth) -> CleanView:
 
 def render_clean(field: RadianceField, camera: Camera, c2w: Float[np.ndarray, "4 4"]) -> CleanView:
     """Render a field without weather from any camera (pose in world m)."""
-    linear, layers = see_frame(World(field), camera, c2w, normals=True)
+    linear, layers = see_frame(World(field), camera, c2w, FrameOptions(normals=True))
     rays_d = world_rays(camera, c2w)
     return CleanView(
         linear.double().numpy(), layers["depth"], layers["normal"], rays_d, c2w, camera
@@ -90,11 +91,11 @@ def render_clean(field: RadianceField, camera: Camera, c2w: Float[np.ndarray, "4
 
 def prepare_weather(
     run: EvaluatedRun, weather: KeyframedWeather, time: float, poses: list[np.ndarray]
-) -> Stage:
+) -> RenderSession:
     """Prepare a weather at one time (s) for cameras at some poses (world m)."""
     positions = np.stack([pose[:3, 3] for pose in poses])
     moment = np.array([time])
-    return prepare(run.field, run.scene, weather, positions, moment, lambda what, fraction: None)
+    return RenderSession(run.field, run.scene, weather, positions, moment)
 
 
 def render_weather(
@@ -103,7 +104,7 @@ def render_weather(
     """Render the test views in one weather; return linear radiance and layers of each."""
     cameras = [run.camera(truth) for truth in run.reference.truths]
     prepared = prepare_weather(run, case.weather, case.time, [c2w for _, c2w in cameras])
-    world = prepared.at(case.time)
+    world = prepared.world(case.time)
     rendered = [see_frame(world, camera, c2w) for camera, c2w in cameras]
     return [(linear.double().numpy(), layers) for linear, layers in rendered]
 

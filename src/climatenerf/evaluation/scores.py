@@ -34,14 +34,18 @@ from climatenerf.evaluation.evaluated_run import (
 )
 from climatenerf.evaluation.metrics import psnr, ssim
 from climatenerf.evaluation.reference import Truth, WeatherTruth
-from climatenerf.field.protocol import CLASSES
+from climatenerf.field.capabilities import CLASSES
+from climatenerf.field.compositing import RENDER_STEP
 from climatenerf.ops import compositing
 from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import see_frame
 from climatenerf.render.heads import see_surface
-from climatenerf.render.volume import RENDER_STEP, camera_rays
+from climatenerf.render.volume import camera_rays
 from climatenerf.weather.description import KeyframedWeather
-from climatenerf.weather.parameters import Flood, Weather
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.flood.surface import Water
+from climatenerf.weather.smog.parameters import SMOG
+from climatenerf.weather.weather import Weather
 
 Progress = Callable[[str], None]
 """Called with the name of each step as it begins."""
@@ -185,9 +189,10 @@ def mirror_scores(run: EvaluatedRun) -> dict[str, float]:
     calm = Flood(level=reference.mirror_level, wind_speed=0.0)
     weather = KeyframedWeather(Weather(flood=calm), {})
     prepared = prepare_weather(run, weather, 0.0, [run.camera(t)[1] for t in reference.truths])
-    world = prepared.at(0.0)
-    assert world.water is not None
-    world = dataclasses.replace(world, water=dataclasses.replace(world.water, mirror_only=True))
+    world = prepared.world(0.0)
+    (water,) = world.surfaces
+    assert isinstance(water, Water)
+    world = dataclasses.replace(world, surfaces=(dataclasses.replace(water, mirror_only=True),))
     level = reference.scene.ground_z + reference.mirror_level
     errors = []
     for truth in reference.truths:
@@ -269,7 +274,7 @@ def score_weather(
     if weather.snow.depth is not None:
         snow = [case.layers(truth.name) for truth in truths]
         found |= weather_scores.snow_scores(layers, truths, snow, 1.0 / cameras[0][0].fx)
-    if weather.smog.present:
+    if SMOG.present(weather.smog):
         found |= weather_scores.transmittance_scores(
             [each["transmittance"] for each in layers],
             [case.layers(truth.name)["transmittance"] for truth in truths],
@@ -325,7 +330,7 @@ def consistency(
         progress(f"consistency, {short}")
         case = cases[name]
         poses = [path.c2w[i] for i in indices]
-        world = prepare_weather(run, case.weather, case.time, poses).at(case.time)
+        world = prepare_weather(run, case.weather, case.time, poses).world(case.time)
         frames = {}
         for i in indices:
             linear, layers = see_frame(world, path.cameras[i], path.c2w[i])

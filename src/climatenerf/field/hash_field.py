@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from climatenerf.core.classes import SOLID
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples
 from climatenerf.core.vectors import unit as unit_vector
-from climatenerf.field import activations, protocol
+from climatenerf.field import activations, capabilities
 from climatenerf.field import spherical_harmonics as directions
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
@@ -159,12 +159,12 @@ class Field(nn.Module):
 
     @property
     def capabilities(self) -> frozenset[str]:
-        """Optional methods that this field answers; see `field.protocol`."""
-        learned = {protocol.NORMALS} if self.knows_normals else set()
-        learned |= {protocol.CLASSES} if self.knows_classes else set()
+        """Optional methods that this field answers; see `field.capabilities`."""
+        learned = {capabilities.NORMALS} if self.knows_normals else set()
+        learned |= {capabilities.CLASSES} if self.knows_classes else set()
         # The fused kernel runs on NVIDIA GPUs only.
-        fused = {protocol.FUSED} if fused_render.takes_whole_rays(self.geometry_grid) else set()
-        always = {protocol.DENSITY, protocol.APPEARANCE, protocol.OBSERVED}
+        fused = {capabilities.FUSED} if fused_render.takes_whole_rays(self.geometry_grid) else set()
+        always = {capabilities.DENSITY, capabilities.APPEARANCE, capabilities.OBSERVED}
         return frozenset(always | learned | fused)
 
     @property
@@ -237,7 +237,7 @@ class Field(nn.Module):
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Composite whole rays in one launch on a GPU; see `field.protocol.RadianceField`.
 
-        The twin is `render.volume.composited`.
+        The twin is `field.compositing.composited`.
         """
         sampler = self.sampler
         shared = self._ray_hidden(rays_d, self._appearance(appearance, rays_o.shape[0]))

@@ -12,19 +12,7 @@ from torch import Tensor
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
-
-DENSITY = "density"
-"""`density` answers at any position."""
-NORMALS = "normals"
-"""`surface_heads` gives normals that were learned."""
-CLASSES = "classes"
-"""`surface_heads` gives class logits that were learned."""
-APPEARANCE = "appearance"
-"""`colour` and `sky` depend on an appearance vector."""
-OBSERVED = "observed space"
-"""`observed_only` leaves out what no photo shows."""
-FUSED = "fused compositing"
-"""`composite` marches, evaluates and composites rays in one launch."""
+from climatenerf.field.capabilities import OBSERVED
 
 
 class RadianceField(Protocol):
@@ -42,7 +30,7 @@ class RadianceField(Protocol):
 
     @property
     def capabilities(self) -> frozenset[str]:
-        """Which optional methods this field answers: constants of this module."""
+        """Which optional methods this field answers; see `field.capabilities`."""
         ...
 
     def march(

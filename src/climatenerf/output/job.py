@@ -22,9 +22,10 @@ from jaxtyping import Float, UInt8
 
 import climatenerf
 from climatenerf.core.errors import UserError
+from climatenerf.core.layer_table import Layer
 from climatenerf.core.storage import explain, plain, read_json, write_json
 from climatenerf.output import render_folder
-from climatenerf.output.layers import LAYERS, LayerFormat, require_exr, save_layers
+from climatenerf.output.layers import LayerFormat, require_exr, save_layers
 from climatenerf.output.render_folder import MOVIE, PREVIEW, SIDECAR
 from climatenerf.output.sidecar import FrameRecord, sidecar
 from climatenerf.output.video import (
@@ -38,6 +39,8 @@ from climatenerf.paths.camera_path import CameraPath
 from climatenerf.scene import Scene
 from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
+from climatenerf.weather.effect import Effect
+from climatenerf.weather.registry import EFFECTS, layer_table
 
 MAX_SIDE = 8192
 MAX_RAYS = 2**26
@@ -54,7 +57,7 @@ class RenderedFrame:
 
     Attributes:
         picture: 8-bit sRGB.
-        layers: all measured layers, (h, w) or (h, w, 3) each; `LAYERS` gives their units.
+        layers: all measured layers, (h, w) or (h, w, 3) each; the layer table gives their units.
         facts: numbers about the whole render, for the sidecar.
     """
 
@@ -77,10 +80,11 @@ class RenderJob:
         fps: Frames per second; frame i shows the moment i / fps, s.
         weather: Weather over time.
         supersample: Rays per pixel along each side.
-        layers: Names of the layers to write, keys of `LAYERS`.
+        layers: Names of the layers to write, keys of `table`.
         formats: File formats of the layers.
         appearance: Index of the training view whose exposure and light the frames have; None takes
             the mean.
+        effects: The effects that the weather has sections for.
     """
 
     run: str
@@ -91,6 +95,12 @@ class RenderJob:
     layers: tuple[str, ...] = ()
     formats: tuple[LayerFormat, ...] = ("npz",)
     appearance: int | None = None
+    effects: tuple[Effect, ...] = EFFECTS
+
+    @property
+    def table(self) -> dict[str, Layer]:
+        """All layers that a frame can have, by name."""
+        return layer_table(self.effects)
 
     def __len__(self) -> int:
         return len(self.path)
@@ -110,7 +120,7 @@ class RenderJob:
         described = {
             "version": climatenerf.__version__,
             "run": self.run,
-            "weather": weather_to_table(self.weather),
+            "weather": weather_to_table(self.weather, self.effects),
             "fps": self.fps,
             "cameras": self.path.cameras,
             "c2w": (np.round(self.path.c2w, 6) + 0.0),
@@ -140,6 +150,7 @@ def plan(
     layers: Sequence[str] = (),
     formats: Sequence[LayerFormat] = ("npz",),
     appearance: int | None = None,
+    effects: Sequence[Effect] = EFFECTS,
 ) -> RenderJob:
     """Return the job that renders a fitted run along a path.
 
@@ -152,6 +163,7 @@ def plan(
         layers: names of the layers to write.
         formats: file formats of the layers.
         appearance: index of a training view, from `appearance_index`; None takes the mean.
+        effects: the effects that the weather has sections for.
 
     Raises:
         UserError: a value is out of range, the frames are too large, the run is incomplete, or EXR
@@ -161,12 +173,20 @@ def plan(
         raise UserError(f"--supersample must be from 1 to 8; got {supersample}")
     check_fps(fps)
     check_size(path.size, supersample)
-    layers = tuple(name for name in LAYERS if name in layers)
+    layers = tuple(name for name in layer_table(effects) if name in layers)
     formats = tuple(dict.fromkeys(formats))
     if layers and "exr" in formats:
         require_exr()
     return RenderJob(
-        hash_of_run(run), path, float(fps), weather, supersample, layers, formats, appearance
+        hash_of_run(run),
+        path,
+        float(fps),
+        weather,
+        supersample,
+        layers,
+        formats,
+        appearance,
+        tuple(effects),
     )
 
 
@@ -269,7 +289,7 @@ def check_folder(job: RenderJob, out: Path, preview: bool = False) -> None:
             render with other settings.
     """
     planned = [name for index in range(len(job)) for name in job.files(index)]
-    render_folder.check_foreign_files(out, planned, list(LAYERS), preview)
+    render_folder.check_foreign_files(out, planned, list(job.table), preview)
     render_folder.working_folder(out, job.key)
 
 
@@ -403,37 +423,39 @@ def frame_source(
     Raises:
         UserError: the weather does not fit the scene.
     """
-    from climatenerf.render.frame import render_frame
-    from climatenerf.render.session import prepare
+    from climatenerf.render.session import RenderSession
 
     appearance = None if job.appearance is None else field.embeddings[[job.appearance]].detach()
     times = np.array([job.time(index) for index in range(len(job))])
-    report = progress or (lambda what, fraction: None)
     positions = job.path.c2w[:, :3, 3]
-    stage = prepare(field, scene, job.weather, positions, times, report, appearance)
-    facts = {}
-    if stage.waves is not None:
-        facts["significant_wave_height_m"] = float(stage.waves.significant_height)
-    options = job.supersample, "normal" in job.layers, "label" in job.layers
+    session = RenderSession(
+        field, scene, job.weather, positions, times, appearance, progress, job.effects
+    )
 
     def render(index: int, preview: Preview | None) -> RenderedFrame:
-        world, camera = stage.at(job.time(index)), job.path.cameras[index]
-        picture, layers = render_frame(world, camera, job.path.c2w[index], *options, preview)
-        return RenderedFrame(picture, layers, facts)
+        frame = session.frame(
+            job.path.cameras[index],
+            job.path.c2w[index],
+            job.time(index),
+            supersample=job.supersample,
+            layers=job.layers,
+            preview=preview,
+        )
+        return RenderedFrame(frame.picture, frame.layers, session.facts)
 
     return render
 
 
-def measured(layers: dict[str, Float[np.ndarray, "h w *c"]]) -> dict[str, float]:
-    """Return a few numbers that describe a frame: fractions of the picture, and means in m."""
-    snow, water = layers["mask_snow"], layers["mask_water"]
-    return {
-        "water_share": float(water.mean()),
-        "mean_water_depth_m": _mean(layers["water_depth"], water > 0.5),
-        "mean_transmittance": float(layers["transmittance"].mean()),
-        "snow_share": float(snow.mean()),
-        "mean_snow_thickness_m": _mean(layers["snow_thickness"], snow > 0.5),
-    }
+def measured(
+    layers: dict[str, Float[np.ndarray, "h w *c"]], effects: Sequence[Effect] = EFFECTS
+) -> dict[str, float]:
+    """Return the means over a frame that its effects name; see `Effect.measures`."""
+    found = {"mean_transmittance": float(layers["transmittance"].mean())}
+    for measure in (measure for effect in effects for measure in effect.measures):
+        values = layers[measure.layer]
+        where = np.ones(values.shape, bool) if measure.mask is None else layers[measure.mask] > 0.5
+        found[measure.name] = _mean(values, where)
+    return found
 
 
 def _mean(values: np.ndarray, where: np.ndarray) -> float:
@@ -447,11 +469,11 @@ def _save(job: RenderJob, out: Path, index: int, frame: RenderedFrame) -> None:
     with render_folder.unfinished_files(out) as scratch:
         picture = job.files(index)[0]
         write_png(scratch / picture, frame.picture, SIMULATED, keys[1])
-        written = save_layers(scratch, f"{index:04d}", layers, job.formats)
+        written = save_layers(scratch, f"{index:04d}", layers, job.formats, job.table)
         record = {
             "files": [picture, *sum(written.values(), [])],
             "layers": written,
-            "measured": measured(frame.layers),
+            "measured": measured(frame.layers, job.effects),
             "facts": frame.facts,
         }
         render_folder.commit_frame(out, scratch, index, keys, record)
@@ -466,7 +488,7 @@ def _sidecar(job: RenderJob, scene: Scene, out: Path) -> dict[str, Any]:
             continue
         facts = record["facts"]
         camera, c2w, time = job.path.cameras[index], job.path.c2w[index], job.time(index)
-        weather = weather_to_table(job.weather.at(time))
+        weather = weather_to_table(job.weather.at(time), job.effects)
         layers, numbers = record["layers"], record["measured"]
         file = job.files(index)[0]
         records.append(FrameRecord(file, time, camera, c2w, layers, weather, numbers))
@@ -474,7 +496,8 @@ def _sidecar(job: RenderJob, scene: Scene, out: Path) -> dict[str, Any]:
     about["appearance_of_training_view"] = job.appearance  # null: the mean
     about |= {"supersample": job.supersample, "frames_wanted": len(job), "render": job.key, **facts}
     seed = job.weather.base.seed
-    return plain(sidecar(scene, records, weather_to_table(job.weather), seed, about))
+    weather = weather_to_table(job.weather, job.effects)
+    return plain(sidecar(scene, records, weather, seed, about, job.table))
 
 
 def _joined(out: Path, wanted: dict[str, Any]) -> bool:

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 import climatenerf
-from climatenerf.output.layers import LAYERS
+from climatenerf.core.layer_table import Layer
 from climatenerf.output.video import SIMULATED
 from climatenerf.scene import Camera, Scene
+from climatenerf.weather.registry import layer_table
 
 SIDECAR_SCHEMA = 1
 
@@ -45,6 +46,7 @@ def sidecar(
     weather: Mapping[str, Any],
     seed: int,
     about: Mapping[str, Any] | None = None,
+    table: Mapping[str, Layer] | None = None,
 ) -> dict[str, Any]:
     """Return the content of the JSON file beside a movie: all that is needed to use it as data.
 
@@ -54,7 +56,9 @@ def sidecar(
         weather: all weather parameters with their units.
         seed: random seed of the weather.
         about: further entries (camera path and its notes, frames per second).
+        table: all layers that a frame can have; default: those of the built-in effects.
     """
+    table = layer_table() if table is None else table
     used = {name for record in records for name in record.layers}
     return {
         "schema_version": SIDECAR_SCHEMA,
@@ -83,11 +87,11 @@ def sidecar(
         "world_from_input": scene.world_from_input,
         "layers": {
             name: {
-                "unit": LAYERS[name].unit,
-                "meaning": LAYERS[name].meaning,
+                "unit": table[name].unit,
+                "meaning": table[name].meaning,
                 "png": "(n + 1) / 2 * 255"
-                if LAYERS[name].png_step is None
-                else {"bits": LAYERS[name].png_bits, "value_of_one": LAYERS[name].png_step},
+                if table[name].png_step is None
+                else {"bits": table[name].png_bits, "value_of_one": table[name].png_step},
             }
             for name in sorted(used)
         },

@@ -1,7 +1,7 @@
-"""One frame: rays of a camera traced, averaged over sub-pixels, encoded."""
+"""One frame: rays of a camera traced, averaged over sub-pixels, with measured layers."""
 
-from collections.abc import Callable
-from dataclasses import fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,118 +11,137 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.field.protocol import CLASSES, NORMALS, RadianceField
+from climatenerf.core.layer_table import Layer
+from climatenerf.field.capabilities import CLASSES, NORMALS
+from climatenerf.field.protocol import RadianceField
 from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
 from climatenerf.render.volume import camera_rays
 from climatenerf.weather.flood.optics import pixel_rotation
+from climatenerf.weather.registry import layer_table
 from climatenerf.weather.world import World
 
+Picture = UInt8[np.ndarray, "h w 3"]
 
-def render_frame(
-    world: World,
-    camera: Camera,
-    c2w: Float[np.ndarray, "4 4"],
-    supersample: int = 1,
-    normals: bool = False,
-    labels: bool = False,
-    show: Callable[[UInt8[np.ndarray, "h w 3"]], None] | None = None,
-) -> tuple[UInt8[np.ndarray, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
-    """The display picture (8 bit) and the measured layers of one camera.
 
-    Args:
-        world: field and weather at this moment.
-        camera: intrinsics of the frame.
-        c2w: its pose, world m.
-        supersample: rays per pixel along each side; colours are averaged in linear light, layers
-            taken from the ray next to the pixel's centre.
+@dataclass(frozen=True)
+class FrameOptions:
+    """What is wanted of a frame beside its picture.
+
+    Attributes:
+        supersample: rays per pixel along each side, 1 to 8; radiance is averaged, layers are taken
+            from the ray next to the pixel's centre.
         normals: also the layer `normal`.
         labels: also the layer `label`, of a field that has learned classes.
+        table: all layers that a frame can have; those that the weather does not write are filled
+            with their no-data values.
         show: called with the display picture as it becomes finer; see `progressive`.
+        cancelled: asked between chunks of rays; see `integrator.trace`.
     """
-    linear, layers = see_frame(world, camera, c2w, supersample, normals, labels, show)
-    return encoded_8bit(linear), layers
+
+    supersample: int = 1
+    normals: bool = False
+    labels: bool = False
+    table: Mapping[str, Layer] | None = None
+    show: Callable[[Picture], None] | None = None
+    cancelled: Callable[[], bool] | None = None
 
 
-def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Linear radiance as a screen shows it."""
+def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> Picture:
+    """Linear radiance as 8-bit display sRGB."""
     return to_numpy((encode_srgb(linear).clamp(0, 1) * 255 + 0.5).to(torch.uint8))
 
 
 def traced_rays(
     camera: Camera, c2w: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """What `trace` wants of a camera's pixels (c2w: world m), row by row.
+    """The arguments of `trace` for a camera's pixels (c2w: world m), row by row.
 
     Returns:
-        Origins (world m), unit directions, the angle each pixel spans, and the turn of its glossy
-        reflection (both rad).
+        Origins (world m), unit directions, the angle that each pixel spans, and the angle that
+        rotates its glossy sample set (both rad).
     """
     rays_o, rays_d = camera_rays(camera, c2w)
-    # Solid angle's side at the image centre; towards the corners pixels see a little less.
+    # Side of the solid angle at the image centre; towards the corners pixels span a little less.
     angle = torch.full((rays_o.shape[0],), 1.0 / camera.fx)
     row, column = torch.meshgrid(
         torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
     )
-    roll = pixel_rotation(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
-    return rays_o, rays_d, angle, roll
+    rotation = pixel_rotation(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
+    return rays_o, rays_d, angle, rotation
+
+
+def render_frame(
+    world: World,
+    camera: Camera,
+    c2w: Float[np.ndarray, "4 4"],
+    options: FrameOptions | None = None,
+) -> tuple[Picture, dict[str, Float[np.ndarray, "h w *c"]]]:
+    """The display picture (8 bit) and the measured layers of one camera (c2w: world m)."""
+    linear, layers = see_frame(world, camera, c2w, options)
+    return encoded_8bit(linear), layers
 
 
 def see_frame(
     world: World,
     camera: Camera,
     c2w: Float[np.ndarray, "4 4"],
-    supersample: int = 1,
-    normals: bool = False,
-    labels: bool = False,
-    show: Callable[[UInt8[np.ndarray, "h w 3"]], None] | None = None,
+    options: FrameOptions | None = None,
 ) -> tuple[Float[Tensor, "h w 3"], dict[str, Float[np.ndarray, "h w *c"]]]:
-    """As `render_frame`, but the picture in linear light."""
-    height, width = camera.height, camera.width
-    fine = camera.resized(width * supersample, height * supersample)
-    rays = traced_rays(fine, c2w)
-    rays_d = rays[1]
-    shape = (height, supersample, width, supersample)
+    """As `render_frame`, but the picture in linear radiance."""
+    options = options or FrameOptions()
+    height, width, fine = camera.height, camera.width, options.supersample
+    fine_camera = camera.resized(width * fine, height * fine)
+    rays = traced_rays(fine_camera, c2w)
+    shape = (height, fine, width, fine)
 
     def averaged(rgb: Tensor) -> Float[Tensor, "h w 3"]:
         return rgb.reshape(*shape, 3).mean((1, 3))
 
+    show = options.show
     if show is None:
-        seen = trace(world, *rays)
+        seen = trace(world, *rays, cancelled=options.cancelled)
     else:
         seen = trace_coarse_first(
-            world, rays, fine.width, lambda rgb: show(encoded_8bit(averaged(rgb)))
+            world,
+            rays,
+            fine_camera.width,
+            lambda rgb: show(encoded_8bit(averaged(rgb))),
+            options.cancelled,
         )
-    linear = averaged(seen.rgb)
-    layers = {
-        each.name: _middle(getattr(seen, each.name), shape)
-        for each in fields(seen)
-        if each.name != "rgb" and (each.name != "normal" or normals)
-    }
-    if normals or labels:
-        directions, angle = _middle(rays_d, shape), 1.0 / camera.fx
-        solid, kind = _surface(world.field, c2w[:3, 3], directions)
-        if labels and kind is not None:
-            layers["label"] = kind
-        if solid is None:
-            solid = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
-    if normals:
-        known = (layers["normal"] != 0).any(-1, keepdims=True)  # of water and snow
-        layers["normal"] = np.where(known, layers["normal"], solid)
-    return linear, layers
+    table = layer_table() if options.table is None else options.table
+    given = {"depth": seen.depth, "transmittance": seen.transmittance, **seen.layers}
+    layers = {name: _middle(values, shape) for name, values in given.items()}
+    for name in table.keys() - layers.keys() - {"normal", "label"}:
+        layers[name] = np.full((height, width), table[name].no_data, np.float32)
+    if options.normals or options.labels:
+        directions, angle = _middle(rays[1], shape), 1.0 / camera.fx
+        normal, label = _surface(world.field, c2w[:3, 3], directions, options.cancelled)
+        if options.labels and label is not None:
+            layers["label"] = label
+        if options.normals:
+            if normal is None:
+                normal = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
+            weather = _middle(seen.normal, shape)
+            known = (weather != 0).any(-1, keepdims=True)  # of water and snow
+            layers["normal"] = np.where(known, weather, normal)
+    return averaged(seen.rgb), layers
 
 
 def _surface(
-    field: RadianceField, eye: Float[np.ndarray, "3"], directions: Float[np.ndarray, "h w 3"]
+    field: RadianceField,
+    eye: Float[np.ndarray, "3"],
+    directions: Float[np.ndarray, "h w 3"],
+    cancelled: Callable[[], bool] | None,
 ) -> tuple[Float[np.ndarray, "h w 3"] | None, UInt8[np.ndarray, "h w"] | None]:
-    """Normals and classes that the field has learned for a picture's rays; None what it has not."""
+    """Learned normals and classes for a picture's rays; None for those that were not learned."""
     if not field.capabilities & {NORMALS, CLASSES}:
         return None, None
     rays_d = to_device(directions.reshape(-1, 3))
     origin = to_device(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
-    normal, label = see_surface(field, origin, rays_d)
+    normal, label = see_surface(field, origin, rays_d, cancelled)
     return (
         to_numpy(normal.view(directions.shape)) if NORMALS in field.capabilities else None,
         to_numpy(label.view(directions.shape[:2])) if CLASSES in field.capabilities else None,

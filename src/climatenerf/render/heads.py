@@ -1,5 +1,7 @@
 """Normals and classes of pixels, composited from a field's surface heads."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
@@ -7,14 +9,17 @@ from torch import Tensor
 from climatenerf.core.classes import SKY, SOLID
 from climatenerf.core.device import to_device
 from climatenerf.core.samples import MIN_WEIGHT, offsets_of
+from climatenerf.field.compositing import RENDER_STEP, chunks
 from climatenerf.field.protocol import RadianceField
 from climatenerf.ops import compositing
-from climatenerf.render.volume import RENDER_STEP, rays_at_once
 
 
 @torch.no_grad()
 def see_surface(
-    field: RadianceField, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    field: RadianceField,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    cancelled: Callable[[], bool] | None = None,
 ) -> tuple[Float[Tensor, "n 3"], UInt8[Tensor, "n"]]:
     """Composited normals and classes of the dry scene along rays.
 
@@ -22,14 +27,15 @@ def see_surface(
         field: a field with normals or classes among its capabilities.
         rays_o: origins, m.
         rays_d: unit directions.
+        cancelled: asked between chunks of rays.
 
     Returns:
         Unit normals towards the eye, 0 where more than half of the light is the sky's; classes
         (`scene.classes`), sky there.
     """
     normals, labels = [], []
-    size = rays_at_once(rays_o)
-    for o, d in zip(rays_o.split(size), rays_d.split(size), strict=True):
+    for chunk in chunks(rays_o, cancelled):
+        o, d = rays_o[chunk], rays_d[chunk]
         near, far = torch.full((len(o),), field.near), torch.full((len(o),), 1e9)
         samples = field.march(o, d, near, far, RENDER_STEP)
         weights, transmittance = compositing.render_weights(

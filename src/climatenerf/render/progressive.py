@@ -1,7 +1,7 @@
-"""A frame that shows early: a sixteenth of its rays all over it, then a quarter, then all.
+"""Coarse-to-fine rendering: a sixteenth of a frame's rays, then a quarter, then all.
 
-What a ray sees does not depend on the rays beside it, so none is traced twice, and what is seen in
-the end is what `trace` sees, but for roundings.
+A ray's result does not depend on the rays beside it, so no ray is traced twice, and the last pass
+equals `trace` up to roundings.
 """
 
 from collections.abc import Callable
@@ -10,36 +10,41 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.render.integrator import RenderOutput, trace
-from climatenerf.weather.world import World, concatenate
+from climatenerf.render.integrator import trace
+from climatenerf.weather.world import RenderOutput, World, concatenate
 
-SPACINGS = (4, 2, 1)  # rays between those that are known after each pass
+SPACINGS = (4, 2, 1)  # rays between traced ones after each pass
 
 Rays = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]
 
 
 def trace_coarse_first(
-    world: World, rays: Rays, width: int, show: Callable[[Float[Tensor, "h w 3"]], None]
+    world: World,
+    rays: Rays,
+    width: int,
+    show: Callable[[Float[Tensor, "h w 3"]], None],
+    cancelled: Callable[[], bool] | None = None,
 ) -> RenderOutput:
-    """`trace` of a picture's rays, row by row, coarse ones first.
+    """`trace` a picture's rays, given row by row, in passes from coarse to fine.
 
     Args:
         world: field and weather.
-        rays: origins (m), unit directions, pixel angles and rolls, as `trace` takes them.
+        rays: origins (m), unit directions, pixel angles and sample rotations (rad).
         width: rays in a row.
-        show: called with each pass's picture in linear light, the last but for roundings complete.
-            A ray that is not known yet shows the nearest known one above and left of it.
+        show: called with each pass's picture in linear radiance. A ray that is not traced yet shows
+            the nearest traced one above and left of it.
+        cancelled: asked between chunks of rays; see `trace`.
     """
     n = rays[0].shape[0]
     row, column = torch.arange(n) // width, torch.arange(n) % width
-    linear, known = torch.zeros(n, 3), torch.zeros(n, dtype=torch.bool)
+    linear, traced = torch.zeros(n, 3), torch.zeros(n, dtype=torch.bool)
     order, parts = [], []
     for spacing in SPACINGS:
-        some = ((row % spacing == 0) & (column % spacing == 0) & ~known).nonzero()[:, 0]
-        if some.numel():
-            parts.append(trace(world, *(each[some] for each in rays)))
-            order.append(some)
-            linear[some], known[some] = parts[-1].rgb, True
+        pending = ((row % spacing == 0) & (column % spacing == 0) & ~traced).nonzero()[:, 0]
+        if pending.numel():
+            parts.append(trace(world, *(each[pending] for each in rays), cancelled=cancelled))
+            order.append(pending)
+            linear[pending], traced[pending] = parts[-1].rgb, True
         nearest = row // spacing * spacing * width + column // spacing * spacing
         show(linear[nearest].view(-1, width, 3))
     return concatenate(parts, torch.cat(order).argsort())

@@ -1,135 +1,200 @@
-"""Weather put into a fitted scene: prepared once, then asked for the world at each moment."""
+"""A render session: weather prepared once in a scene, then asked for frames at any moment.
 
-import dataclasses
-import math
-from collections.abc import Callable
+Every effect is prepared from the parameters that it names in `Effect.prepared_from`. A changed
+parameter prepares only the effects that name it; all others are placed anew at the next frame.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.core.device import to_numpy
-from climatenerf.core.errors import UserError
-from climatenerf.field.protocol import RadianceField, observed
+from climatenerf.core.cameras import Camera
+from climatenerf.field.protocol import RadianceField, require
+from climatenerf.render.frame import FrameOptions, Picture, encoded_8bit, see_frame
 from climatenerf.render.irradiance import scene_irradiance
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import KeyframedWeather
-from climatenerf.weather.flood.waves import Waves, at_time, make_waves
-from climatenerf.weather.parameters import Snow, Sun, Weather, check
-from climatenerf.weather.smog.medium import medium
-from climatenerf.weather.snow.layer import BakedSnow, bake_snow
-from climatenerf.weather.world import Water, World
+from climatenerf.weather.effect import Effect, Entity
+from climatenerf.weather.registry import EFFECTS, check_effects, in_order, layer_table
+from climatenerf.weather.weather import Weather, check
+from climatenerf.weather.world import Preparation, World
+
+Key = tuple[tuple[object, ...], ...]
 
 
-@dataclass
-class Stage:
-    """A fitted scene under a weather that may change over time."""
+@dataclass(frozen=True)
+class Frame:
+    """One rendered frame.
 
-    field: RadianceField
-    scene: Scene
-    weather: KeyframedWeather
-    irradiance: Float[Tensor, "3"]
-    snow: BakedSnow | None
-    waves: Waves | None
-    appearance: Float[Tensor, "1 e"] | None = None
-    """Exposure and light of a photo; None: the mean of all photos."""
-    _grown: dict[float, BakedSnow] = dataclasses.field(default_factory=dict)
-
-    def at(self, time: float) -> World:
-        """Everything there is at a time in s."""
-        weather = self.weather.at(time)
-        water = None
-        if weather.flood.level is not None and self.waves is not None:
-            water = Water(
-                weather.flood,
-                self.scene.ground_z + weather.flood.level,
-                at_time(self.waves, time),
-                self.irradiance,
-                weather.sun.elevation,
-            )
-        matter = self._snow_of(weather.snow)
-        if matter is not None:
-            matter = matter.above(None if water is None else water.level)
-        air = medium(weather.smog, self.scene.ground_z)
-        return World(self.field, self.appearance, air, matter, water)
-
-    def _snow_of(self, snow: Snow) -> BakedSnow | None:
-        if self.snow is None or snow.depth is None or snow.depth <= 0:
-            return None
-        if snow.depth != self.snow.snow.depth:
-            if snow.depth not in self._grown:
-                self._grown = {snow.depth: self.snow.with_depth(snow.depth)}
-            return self._grown[snow.depth]
-        return self.snow
-
-
-def sun_direction(sun: Sun) -> Float[np.ndarray, "3"] | None:
-    """Unit vector towards the sun, azimuth from +y towards +x; None without an elevation."""
-    if sun.elevation is None:
-        return None
-    azimuth = sun.azimuth or 0.0
-    flat = math.cos(sun.elevation)
-    return np.array([flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(sun.elevation)])
-
-
-def prepare(
-    field: RadianceField,
-    scene: Scene,
-    weather: KeyframedWeather,
-    places: Float[np.ndarray, "m 3"],
-    times: Float[np.ndarray, "f"],
-    progress: Callable[[str, float], None],
-    appearance: Float[Tensor, "1 e"] | None = None,
-) -> Stage:
-    """Everything that is done once: light, waves, snowfall.
-
-    Args:
-        field: the fitted field.
-        scene: its capture.
-        weather: what to put in.
-        places: camera positions of the movie, world m; snow is finest around them.
-        times: moments of the frames, s.
-        progress: told what is being done and the share that is over.
-
-    Raises:
-        UserError: a level above all of the scene.
+    Attributes:
+        linear: linear radiance.
+        layers: measured layers by name, float32 (label: uint8).
     """
-    moments = [check(weather.at(float(t))) for t in times]
-    _check_levels(scene, moments)
-    progress("light", 0.0)
-    wants = any(m.flood.level is not None or m.snow.depth is not None for m in moments)
-    irradiance = scene_irradiance(field, scene, appearance) if wants else torch.ones(3)
-    flooded = [m for m in moments if m.flood.level is not None]
-    snowy = [m for m in moments if m.snow.depth is not None and m.snow.depth > 0]
-    waves = make_waves(flooded[0].flood, flooded[0].seed) if flooded else None
-    snow = None
-    if snowy:
-        snow = bake_snow(
-            observed(field),
-            snowy[-1].snow,
-            places,
-            to_numpy(irradiance / math.pi),
-            sun_direction(snowy[-1].sun),
-            snowy[-1].seed,
-            progress=lambda share: progress("snowfall", share),
-            appearance=appearance,
+
+    linear: Float[Tensor, "h w 3"]
+    layers: dict[str, Float[np.ndarray, "h w *c"]]
+
+    @functools.cached_property
+    def picture(self) -> Picture:
+        """The frame in 8-bit display sRGB."""
+        return encoded_8bit(self.linear)
+
+
+class RenderSession:
+    """A field under weather that may change over time."""
+
+    def __init__(
+        self,
+        field: RadianceField,
+        scene: Scene,
+        weather: KeyframedWeather | Weather,
+        camera_positions: Float[np.ndarray, "m 3"] | None = None,
+        times: Float[np.ndarray, "f"] | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
+        progress: Callable[[str, float], None] | None = None,
+        effects: Sequence[Effect] = EFFECTS,
+    ):
+        """Prepare everything that is computed once: light, waves, snowfall.
+
+        Args:
+            field: the fitted field, or any other.
+            scene: its capture.
+            weather: what to put in, keyframed or not.
+            camera_positions: of the frames, world m; snow is finest around them. Default: those of
+                the training photos.
+            times: moments of the frames, s. Default: 0 s alone.
+            appearance: exposure and light of the field's colours; None: the mean of all photos.
+            progress: called with what is being done and the share that is done, [0, 1].
+            effects: effects that `weather` has sections for.
+
+        Raises:
+            UserError: a value out of its range, a level above the whole scene, effects that clash,
+                or a field that lacks what an effect needs.
+        """
+        if camera_positions is None:
+            views = scene.of_split("train")
+            camera_positions = np.stack([scene.c2w_world(view)[:3, 3] for view in views])
+        self.field = field
+        self.scene = scene
+        self.effects = in_order(check_effects(tuple(effects)))
+        self._camera_positions = camera_positions
+        self._times = np.zeros(1) if times is None else times
+        self._appearance = appearance
+        self._progress = progress or (lambda what, share: None)
+        self._light: Float[Tensor, 3] | None = None
+        self._keys: dict[str, Key] = {}
+        self._entities: dict[str, Entity] = {}
+        self.change(weather)
+
+    def change(self, weather: KeyframedWeather | Weather) -> tuple[str, ...]:
+        """Put other weather in; prepares what the changed parameters invalidate.
+
+        Returns:
+            Names of the effects that were prepared.
+
+        Raises:
+            UserError: as the constructor; the session then keeps its weather.
+        """
+        if isinstance(weather, Weather):
+            weather = KeyframedWeather(weather, {})
+        moments = [check(weather.at(float(t)), self.effects) for t in self._times]
+        prepared = {}
+        for effect in self.effects:
+            own = tuple(m for m in moments if effect.present(m.sections[effect.name]))
+            function = effect.load() if own else None
+            if function is None:
+                continue
+            require(self.field, effect.needs, f"the weather effect {effect.name!r}")
+            key = _key(effect, own)
+            if self._keys.get(effect.name) != key:
+                self._progress(effect.name, 0.0)
+                prepared[effect.name] = key, function(self._preparation(own))
+        for name, (key, entity) in prepared.items():
+            self._keys[name], self._entities[name] = key, entity
+        self.weather = weather
+        return tuple(prepared)
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Numbers about the prepared effects, for the sidecar."""
+        return {
+            name: value
+            for effect in self.effects
+            if effect.name in self._entities
+            for name, value in self._entities[effect.name].facts().items()
+        }
+
+    def world(self, time: float) -> World:
+        """Everything that a ray can meet at a time in s."""
+        weather = self.weather.at(time)
+        world = World(self.field, self._appearance)
+        for effect in self.effects:
+            if effect.name in self._entities and effect.present(weather.sections[effect.name]):
+                world = self._entities[effect.name].place(world, weather, time)
+        return world
+
+    def frame(
+        self,
+        camera: Camera,
+        c2w: Float[np.ndarray, "4 4"],
+        time: float = 0.0,
+        shutter: float = 0.0,
+        *,
+        supersample: int = 1,
+        layers: Sequence[str] = (),
+        preview: Callable[[Picture], None] | None = None,
+        cancelled: Callable[[], bool] | None = None,
+    ) -> Frame:
+        """Render one frame.
+
+        Args:
+            camera: intrinsics.
+            c2w: pose, world m.
+            time: moment at which the shutter opens, s.
+            shutter: seconds that it stays open. Until an effect integrates over it, the frame is
+                that of its middle.
+            supersample: rays per pixel along each side, 1 to 8.
+            layers: names of wanted layers; `normal` and `label` are computed on demand, the others
+                always.
+            preview: called with the display picture as it becomes finer.
+            cancelled: asked between chunks of rays that take at most about 20 ms.
+
+        Raises:
+            RenderCancelled: `cancelled` has answered True.
+        """
+        options = FrameOptions(
+            supersample,
+            "normal" in layers,
+            "label" in layers,
+            layer_table(self.effects),
+            preview,
+            cancelled,
         )
-    return Stage(field, scene, weather, irradiance, snow, waves, appearance)
+        return Frame(*see_frame(self.world(time + shutter / 2), camera, c2w, options))
+
+    def _preparation(self, moments: tuple[Weather, ...]) -> Preparation:
+        return Preparation(
+            self.field,
+            self.scene,
+            moments,
+            self._camera_positions,
+            self._appearance,
+            self._irradiance,
+            self._progress,
+        )
+
+    def _irradiance(self) -> Float[Tensor, "3"]:
+        if self._light is None:
+            self._progress("light", 0.0)
+            self._light = scene_irradiance(self.field, self.scene, self._appearance)
+        return self._light
 
 
-def _check_levels(scene: Scene, moments: list[Weather]) -> None:
-    """A flood above every camera and every point of the scene is a slip of the unit."""
-    highest = max(scene.c2w_world(view)[2, 3] for view in scene.views)
-    points = scene.points_world()
-    if points is not None and points.shape[0]:
-        highest = max(highest, float(np.quantile(points[:, 2], 0.99)))
-    top = highest - scene.ground_z
-    for moment in moments:
-        level = moment.flood.level
-        if level is not None and level > top:
-            raise UserError(
-                f"--flood.level {level:g} m is above the whole scene, whose top is {top:.1f} m"
-                " over its ground; give a lower level"
-            )
+def _key(effect: Effect, moments: Sequence[Weather]) -> Key:
+    """The values that an effect is prepared from, without repetitions."""
+    values = (tuple(m.value(name) for name in effect.prepared_from) for m in moments)
+    return tuple(dict.fromkeys(values))

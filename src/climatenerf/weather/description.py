@@ -7,20 +7,22 @@
     [smog]
     visibility = "200 m"
 
-Loads no torch.
+Sections, names, units and ranges come from the effects. Loads no torch.
 """
 
 import difflib
 import tomllib
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from climatenerf.core.errors import UserError
-from climatenerf.weather.parameters import Weather, check, kind_of
-from climatenerf.weather.units import DURATION, format_quantity, parse_quantity
+from climatenerf.weather.effect import Effect
+from climatenerf.weather.registry import EFFECTS, parameters
+from climatenerf.weather.units import DURATION, Parameter, format_quantity, parse_quantity
+from climatenerf.weather.weather import Weather, check
 
 Keyframes = tuple[tuple[float, Any], ...]
 
@@ -30,7 +32,7 @@ class KeyframedWeather:
     """Weather whose values may change with time.
 
     Attributes:
-        base: all values that do not change (keyframed ones hold their first value).
+        base: all values that do not change; keyframed ones have their first value.
         keyframes: for "section.field", the times in s, ascending, with their values.
     """
 
@@ -41,16 +43,16 @@ class KeyframedWeather:
         """The weather `time` seconds into the movie; the end values hold before and after."""
         weather = self.base
         for name, frames in self.keyframes.items():
-            weather = _with(weather, name, _interpolate(frames, time))
+            weather = weather.with_value(name, _interpolate(frames, time))
         return weather
 
 
-def read_weather(path: Path) -> KeyframedWeather:
+def read_weather(path: Path, effects: Sequence[Effect] = EFFECTS) -> KeyframedWeather:
     """Read a weather file.
 
     Raises:
-        UserError: the file cannot be read, is not TOML, names something unknown (the nearest valid
-            name is offered), or holds a value of the wrong dimension or outside its range.
+        UserError: the file cannot be read, is not TOML, names something unknown (the message offers
+            the nearest valid name), or holds a value of the wrong dimension or outside its range.
     """
     try:
         with path.open("rb") as file:
@@ -64,76 +66,71 @@ def read_weather(path: Path) -> KeyframedWeather:
             f"the weather file {path} is not valid TOML: {error}; correct it"
         ) from error
     try:
-        return weather_from_table(table)
+        return weather_from_table(table, effects)
     except UserError as error:
         raise UserError(f"in the weather file {path}: {error}") from error
 
 
-def weather_from_table(table: Mapping[str, Any]) -> KeyframedWeather:
-    """Turn the tables of a weather file, or of a sidecar, into weather; the errors are the same."""
-    weather, keyframes = Weather(), {}
-    sections = {section.name: getattr(weather, section.name) for section in fields(Weather)}
+def weather_from_table(
+    table: Mapping[str, Any], effects: Sequence[Effect] = EFFECTS
+) -> KeyframedWeather:
+    """Turn tables of a weather file or a sidecar into weather; errors as in `read_weather`."""
+    weather, keyframes = Weather(effects=effects), {}
+    known = {effect.name: effect.fields() for effect in effects}
     for title, entries in table.items():
-        section = _known(title, list(sections), "section")
+        section = _nearest(title, [*known, "seed"], "section")
         if section == "seed":
-            weather = replace(weather, seed=_integer(entries))
+            weather = weather.with_value("seed", _integer(entries))
             continue
         if not isinstance(entries, Mapping):
             raise UserError(f"[{section}] wants a table of values; got {entries!r}")
-        items = {item.name: item for item in fields(sections[section])}
         for key, raw in entries.items():
-            item = items[_known(key, list(items), f"key in [{section}]")]
-            name = f"{section}.{item.name}"
+            item = _nearest(key, list(known[section]), f"key in [{section}]")
+            name, parameter = f"{section}.{item}", known[section][item]
             if isinstance(raw, Mapping):
-                keyframes[name] = _read_keyframes(name, item, raw)
-                weather = _with(weather, name, keyframes[name][0][1])
+                keyframes[name] = _read_keyframes(name, parameter, raw)
+                weather = weather.with_value(name, keyframes[name][0][1])
             else:
-                weather = _with(weather, name, _read_value(name, item, raw))
+                weather = weather.with_value(name, parameter.read(raw, name.replace("_", "-")))
     for name, frames in keyframes.items():
         for _, value in frames:
-            check(_with(weather, name, value))
-    return KeyframedWeather(check(weather), keyframes)
+            check(weather.with_value(name, value), effects)
+    return KeyframedWeather(check(weather, effects), keyframes)
 
 
-def weather_to_table(weather: Weather | KeyframedWeather) -> dict[str, Any]:
+def weather_to_table(
+    weather: Weather | KeyframedWeather, effects: Sequence[Effect] = EFFECTS
+) -> dict[str, Any]:
     """Plain tables for JSON or TOML, with units; values that are None are left out.
 
     `weather_from_table` turns them back into equal weather.
     """
     film = weather if isinstance(weather, KeyframedWeather) else KeyframedWeather(weather, {})
     table: dict[str, Any] = {"seed": film.base.seed}
-    for section in fields(Weather):
-        if section.name == "seed":
-            continue
-        entries = {}
-        value = getattr(film.base, section.name)
-        for item in fields(value):
-            frames = film.keyframes.get(f"{section.name}.{item.name}")
-            key = item.name.replace("_", "-")
+    for effect in effects:
+        entries = table[effect.name] = {}
+        for item, parameter in effect.fields().items():
+            frames = film.keyframes.get(f"{effect.name}.{item}")
+            value, key = film.base.value(f"{effect.name}.{item}"), item.replace("_", "-")
             if frames is not None:
-                entries[key] = {
-                    format_quantity(t, DURATION): _write_value(item, v) for t, v in frames
-                }
-            elif getattr(value, item.name) is not None:
-                entries[key] = _write_value(item, getattr(value, item.name))
-        table[section.name] = entries
+                entries[key] = {format_quantity(t, DURATION): parameter.write(v) for t, v in frames}
+            elif value is not None:
+                entries[key] = parameter.write(value)
     return table
 
 
-def given_flags(arguments: Sequence[str]) -> frozenset[str]:
+def given_flags(arguments: Sequence[str], effects: Sequence[Effect] = EFFECTS) -> frozenset[str]:
     """Names ("flood.wind_speed", "seed") of the weather flags in a command line's arguments."""
-    names = {"seed"} | {
-        f"{section.name}.{item.name}"
-        for section in fields(Weather)
-        if section.name != "seed"
-        for item in fields(getattr(Weather(), section.name))
-    }
+    names = {"seed", *parameters(effects)}
     words = (word[2:].split("=")[0].replace("-", "_") for word in arguments if word[:2] == "--")
     return frozenset(names.intersection(words))
 
 
 def combine(
-    film: KeyframedWeather | None, flags: Weather, given: frozenset[str]
+    film: KeyframedWeather | None,
+    flags: Weather,
+    given: frozenset[str],
+    effects: Sequence[Effect] = EFFECTS,
 ) -> KeyframedWeather:
     """Weather of a file with flags on top: a flag replaces the file's value and its keyframes.
 
@@ -141,31 +138,47 @@ def combine(
         film: weather file, if any.
         flags: values of all flags, given or not.
         given: names of those that were given, from `given_flags`.
+        effects: the effects in use.
 
     Raises:
         UserError: file and flags contradict each other.
     """
     if film is None:
-        return KeyframedWeather(check(flags), {})
+        return KeyframedWeather(check(flags, effects), {})
     weather = film.base
     for name in sorted(given):
-        weather = _with(weather, name, _get(flags, name))
-    # Two words for one thing: the flag replaces the file's other word. (Attenuation alone decides
-    # where it is given, so a flag for it needs nothing dropped.)
-    dropped = set(given)
-    for said, other in (
-        ("smog.visibility", "smog.sigma"),
-        ("smog.sigma", "smog.visibility"),
-        ("flood.clarity", "flood.attenuation"),
-    ):
-        if said in given and other not in given:
-            weather = _with(weather, other, None)
-            dropped.add(other)
-    keyframes = {name: frames for name, frames in film.keyframes.items() if name not in dropped}
-    return KeyframedWeather(check(weather), keyframes)
+        weather = weather.with_value(name, flags.value(name))
+    replaced = set(given)
+    for effect in effects:
+        defaults = effect.defaults()
+        for pair in effect.alternatives:
+            for one, other in (pair, pair[::-1]):
+                other_name = f"{effect.name}.{other}"
+                if f"{effect.name}.{one}" in given and other_name not in given:
+                    weather = weather.with_value(other_name, defaults[other])
+                    replaced.add(other_name)
+    keyframes = {name: frames for name, frames in film.keyframes.items() if name not in replaced}
+    return KeyframedWeather(check(weather, effects), keyframes)
 
 
-def _known(name: str, valid: list[str], what: str) -> str:
+def without_effect(
+    film: KeyframedWeather, given: frozenset[str], effects: Sequence[Effect] = EFFECTS
+) -> dict[str, str]:
+    """Flags of effects that are absent from the whole movie, with the flags that enable them."""
+    found = {}
+    for effect in effects:
+        keyframed = any(key.startswith(f"{effect.name}.") for key in film.keyframes)
+        section = film.base.sections[effect.name]
+        if not effect.enabled_by or keyframed or effect.present(section):
+            continue
+        enabling = " or ".join(f"--{effect.name}.{name}" for name in effect.enabled_by)
+        for name in sorted(given):
+            if name.startswith(f"{effect.name}."):
+                found[name.replace("_", "-")] = enabling
+    return found
+
+
+def _nearest(name: str, valid: list[str], what: str) -> str:
     plain = name.replace("-", "_")
     if plain in valid:
         return plain
@@ -173,46 +186,19 @@ def _known(name: str, valid: list[str], what: str) -> str:
     raise UserError(f'unknown {what} "{name}"; did you mean "{near}"?')
 
 
-def _read_value(name: str, item: Any, raw: Any) -> Any:
-    where, kind = name.replace("_", "-"), kind_of(item.type)
-    if kind is not None:
-        if not isinstance(raw, str):
-            raise UserError(f'{where} wants {kind.name} such as "{kind.example}"; got {raw}')
-        if raw.strip().lower() == "none" and item.default is None:
-            return None
-        return parse_quantity(raw, kind, where)
-    if item.type is float:
-        if isinstance(raw, bool) or not isinstance(raw, int | float):
-            raise UserError(f"{where} wants a number; got {raw!r}")
-        return float(raw)
-    if raw == "none" and item.default is None:
-        return None
-    numbers = isinstance(raw, list | tuple) and len(raw) == 3
-    if not numbers or any(isinstance(x, bool) or not isinstance(x, int | float) for x in raw):
-        raise UserError(f"{where} wants three numbers such as [0.5, 0.4, 0.3]; got {raw!r}")
-    return tuple(float(x) for x in raw)
-
-
-def _read_keyframes(name: str, item: Any, raw: Mapping[str, Any]) -> Keyframes:
+def _read_keyframes(name: str, parameter: Parameter, raw: Mapping[str, Any]) -> Keyframes:
     where = name.replace("_", "-")
     if not raw:
         raise UserError(f"{where} has an empty table of keyframes; give it at least one time")
     times = {parse_quantity(text, DURATION, f"a time of {where}"): v for text, v in raw.items()}
     if len(times) < len(raw):
         raise UserError(f"{where} names the same time twice")
-    frames = tuple((t, _read_value(name, item, times[t])) for t in sorted(times))
+    frames = tuple((t, parameter.read(times[t], where)) for t in sorted(times))
     if any(value is None for _, value in frames):
         raise UserError(
             f'{where} has "none" in a keyframe; there is nothing between it and a value'
         )
     return frames
-
-
-def _write_value(item: Any, value: Any) -> Any:
-    kind = kind_of(item.type)
-    if kind is not None:
-        return format_quantity(value, kind)
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _integer(raw: Any) -> int:
@@ -221,28 +207,15 @@ def _integer(raw: Any) -> int:
     return raw
 
 
-def _get(weather: Weather, name: str) -> Any:
-    section, _, item = name.partition(".")
-    value = getattr(weather, section)
-    return getattr(value, item) if item else value
-
-
-def _with(weather: Weather, name: str, value: Any) -> Weather:
-    section, _, item = name.partition(".")
-    if item:
-        value = replace(getattr(weather, section), **{item: value})
-    return replace(weather, **{section: value})
-
-
 def _interpolate(frames: Keyframes, time: float) -> Any:
     i = bisect_right([t for t, _ in frames], time)
     if i == 0 or i == len(frames):
         return frames[min(i, len(frames) - 1)][1]
     (t0, a), (t1, b) = frames[i - 1], frames[i]
-    share = (time - t0) / (t1 - t0)
+    fraction = (time - t0) / (t1 - t0)
     if isinstance(a, tuple):
-        return tuple((1 - share) * x + share * y for x, y in zip(a, b, strict=True))
-    return (1 - share) * a + share * b
+        return tuple((1 - fraction) * x + fraction * y for x, y in zip(a, b, strict=True))
+    return (1 - fraction) * a + fraction * b
 
 
 def to_toml(table: Mapping[str, Any]) -> str:

@@ -1,15 +1,15 @@
 """Quantities with units, as users write them: `"0.5 m"`, `"6 m/s"`, `"35 deg"`.
 
-Inside the program every quantity is a plain float in SI units (angles: radians). The types at the
-end annotate dataclass fields so that tyro reads flags, and `weather.description` reads weather
-files, through the same parser. Importing this module loads neither torch nor pint.
+Inside the program every quantity is a plain float in SI units (angles: radians). A `Parameter` in a
+dataclass field's annotation states unit and range once: flags, help, weather files, keyframes and
+checks all read it. Importing this module loads neither torch nor pint.
 """
 
 import functools
 import math
 import re
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from tyro.constructors import PrimitiveConstructorSpec
 
@@ -18,8 +18,8 @@ from climatenerf.core.errors import UserError
 if TYPE_CHECKING:
     import pint
 
-# A number, then a unit. The unit's alphabet is small on purpose: whatever reaches the units library
-# is short and holds no expression worth evaluating.
+# A number, then a unit. The alphabet of units is small on purpose: the text that reaches the units
+# library is short and cannot hold an expression.
 _QUANTITY = re.compile(
     r"\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>[\w°/*^. -]{0,24}?)\s*"
 )
@@ -28,13 +28,13 @@ _ANGLE_UNITS = ("degree", "radian", "milliradian", "arcminute", "arcsecond", "tu
 
 @dataclass(frozen=True)
 class Kind:
-    """One dimension that a user can give.
+    """One physical dimension.
 
     Attributes:
-        name: what the dimension is called in messages, with its article ("a length").
-        metavar: the word shown in `--help`.
-        example: a valid text, quoted in messages.
-        unit: unit in which the value is written back.
+        name: the dimension in messages, with its article ("a length").
+        metavar: the word in `--help`.
+        example: a valid text for messages.
+        unit: unit in which values are written.
         scale: SI value of one `unit`.
     """
 
@@ -63,9 +63,9 @@ def parse_quantity(text: str, kind: Kind, where: str = "") -> float:
     """Read a quantity with its unit.
 
     Args:
-        text: what the user wrote, for example `"10 cm"`.
-        kind: the dimension that is wanted.
-        where: name of the flag or of the entry in a file, put before the message.
+        text: a number and a unit, for example `"10 cm"`.
+        kind: the expected dimension.
+        where: name of the flag or of the file's entry, which begins the message.
 
     Returns:
         The value in SI units; angles in radians.
@@ -111,37 +111,157 @@ def _is_small_integer(value: float) -> bool:
     return abs(value) < 1e9 and value == int(value)
 
 
-def _spec(kind: Kind, optional: bool) -> PrimitiveConstructorSpec[Any]:
-    def instance_from_str(words: list[str]) -> float | None:
-        text = words[0]
-        if optional and text.strip().lower() == "none":
-            return None
-        try:
-            return parse_quantity(text, kind)
-        except UserError as error:
-            raise ValueError(str(error)) from error  # tyro prints it and exits with status 2
+class Parameter(PrimitiveConstructorSpec[Any]):
+    """Unit and range of a dataclass field, as metadata of its annotation.
 
-    def is_instance(value: Any) -> bool:
-        return (optional and value is None) or (
-            isinstance(value, int | float) and not isinstance(value, bool)
+    `quantity`, `number` and `colour` make them. tyro reads flags through it, as through any of its
+    constructor specifications.
+
+    Attributes:
+        kind: dimension; None: a plain number.
+        low: least valid value, SI.
+        high: greatest valid value, SI.
+        count: how many numbers one value has, 1 or 3.
+        optional: whether "none" is a value.
+    """
+
+    kind: Kind | None
+    low: float
+    high: float
+    count: int
+    optional: bool
+
+    def __init__(
+        self, kind: Kind | None, low: float, high: float, count: int = 1, optional: bool = False
+    ):
+        self.kind, self.low, self.high, self.count = kind, low, high, count
+        self.optional = optional
+        name = (
+            f'{kind.metavar}, e.g. "{kind.example}"' if kind else "FLOAT" + " FLOAT" * (count - 1)
+        )
+        super().__init__(
+            nargs=count,
+            metavar=f"{name}; {self.range}" if math.isfinite(low) else name,
+            instance_from_str=self._from_words,
+            is_instance=self._is_instance,
+            str_from_instance=self._to_words,
         )
 
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f'{kind.metavar}, e.g. "{kind.example}"',
-        instance_from_str=instance_from_str,
-        is_instance=is_instance,
-        str_from_instance=lambda value: ["none" if value is None else format_quantity(value, kind)],
-    )
+    @property
+    def range(self) -> str:
+        """The valid range in words, in the unit in which values are written."""
+        return f"{self.text(self.low)} to {self.text(self.high)}"
+
+    def text(self, value: float) -> str:
+        """One number with its unit, rounded for people."""
+        if self.kind is None:
+            return f"{value:g}"
+        return f"{value / self.kind.scale:.6g} {self.kind.unit}"
+
+    def check(self, value: float | tuple[float, ...] | None, name: str) -> None:
+        """Check a value against the range; `name` is the field's, such as "flood.wind_speed".
+
+        Raises:
+            UserError: outside the range, or not finite.
+        """
+        if value is None:
+            return
+        for number in value if isinstance(value, tuple) else (value,):
+            # The slack forgives 360 deg in radians. A NaN fails every comparison.
+            slack = 1e-12 * max(abs(self.low), abs(self.high)) if self.kind is not None else 0.0
+            if not self.low - slack <= number <= self.high + slack:
+                raise UserError(
+                    f"--{name.replace('_', '-')} must lie between {self.text(self.low)} and"
+                    f" {self.text(self.high)}; got {self.text(number)}"
+                )
+
+    def read(self, raw: Any, where: str) -> Any:
+        """A value of a weather file; `where` begins the message.
+
+        Raises:
+            UserError: another type or dimension.
+        """
+        if self.optional and isinstance(raw, str) and raw.strip().lower() == "none":
+            return None
+        if self.kind is not None:
+            if not isinstance(raw, str):
+                example = self.kind.example
+                raise UserError(f'{where} wants {self.kind.name} such as "{example}"; got {raw}')
+            return parse_quantity(raw, self.kind, where)
+        if self.count == 1:
+            if isinstance(raw, bool) or not isinstance(raw, int | float):
+                raise UserError(f"{where} wants a number; got {raw!r}")
+            return float(raw)
+        numbers = isinstance(raw, list | tuple) and len(raw) == self.count
+        if not numbers or any(isinstance(x, bool) or not isinstance(x, int | float) for x in raw):
+            raise UserError(f"{where} wants three numbers such as [0.5, 0.4, 0.3]; got {raw!r}")
+        return tuple(float(x) for x in raw)
+
+    def write(self, value: Any) -> Any:
+        """The value as a weather file holds it; `read` returns it unchanged."""
+        if self.kind is not None:
+            return "none" if value is None else format_quantity(value, self.kind)
+        return list(value) if isinstance(value, tuple) else value
+
+    def _from_words(self, words: list[str]) -> Any:
+        if self.optional and all(word.strip().lower() == "none" for word in words):
+            return None
+        try:
+            if self.kind is not None:
+                return parse_quantity(words[0], self.kind)
+            values = tuple(float(word) for word in words)
+        except UserError as error:
+            raise ValueError(str(error)) from error  # tyro prints it and exits with status 2
+        return values if self.count > 1 else values[0]
+
+    def _is_instance(self, value: Any) -> bool:
+        if value is None:
+            return self.optional
+        numbers = value if self.count > 1 and isinstance(value, tuple) else (value,)
+        return len(numbers) == self.count and all(
+            isinstance(x, int | float) and not isinstance(x, bool) for x in numbers
+        )
+
+    def _to_words(self, value: Any) -> list[str]:
+        if value is None:
+            return ["none"] * self.count
+        if self.kind is not None:
+            return [format_quantity(value, self.kind)]
+        return [str(x) for x in (value if self.count > 1 else (value,))]
 
 
-Length = Annotated[float, _spec(LENGTH, False), LENGTH]
-Speed = Annotated[float, _spec(SPEED, False), SPEED]
-Angle = Annotated[float, _spec(ANGLE, False), ANGLE]
-PerLength = Annotated[float, _spec(PER_LENGTH, False), PER_LENGTH]
-Duration = Annotated[float, _spec(DURATION, False), DURATION]
-OptionalLength = Annotated[float | None, _spec(LENGTH, True), LENGTH]
-OptionalSpeed = Annotated[float | None, _spec(SPEED, True), SPEED]
-OptionalAngle = Annotated[float | None, _spec(ANGLE, True), ANGLE]
-OptionalPerLength = Annotated[float | None, _spec(PER_LENGTH, True), PER_LENGTH]
-OptionalDuration = Annotated[float | None, _spec(DURATION, True), DURATION]
+def quantity(
+    kind: Kind, low: float = -math.inf, high: float = math.inf, optional: bool = False
+) -> Parameter:
+    """A number with a unit, from `low` to `high` (SI)."""
+    return Parameter(kind, low, high, 1, optional)
+
+
+def number(low: float, high: float) -> Parameter:
+    """A plain number from `low` to `high`."""
+    return Parameter(None, low, high)
+
+
+def triple(low: float, high: float, optional: bool = False) -> Parameter:
+    """Three numbers, such as red, green and blue, each from `low` to `high`."""
+    return Parameter(None, low, high, 3, optional)
+
+
+def parameters_of(section: type) -> dict[str, Parameter]:
+    """The parameters of a dataclass by field name, in order.
+
+    Raises:
+        TypeError: a field has no `Parameter` in its annotation.
+    """
+    hints = get_type_hints(section, include_extras=True)
+    found = {}
+    for item in fields(section):
+        metadata = getattr(hints[item.name], "__metadata__", ())
+        own = next((each for each in metadata if isinstance(each, Parameter)), None)
+        if own is None:
+            raise TypeError(f"{section.__name__}.{item.name} states no unit and range")
+        found[item.name] = own
+    return found
+
+
+OptionalLength = Annotated[float | None, quantity(LENGTH, optional=True)]

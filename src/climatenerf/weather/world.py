@@ -1,96 +1,271 @@
-"""What a ray can meet: the fitted field, and the weather put into it."""
+"""What a ray can meet at one moment: the field, and lists of what the weather has put into it.
+
+Four kinds of things act on a ray. A *medium* fills space and attenuates what is behind it. *Matter*
+lies on the scene and brings samples of its own. A *surface* cuts rays off and shades them by
+tracing further ones. The field is the scene itself. Lengths are metres, z is up, radiance linear.
+"""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import RadianceField
-from climatenerf.weather.flood.waves import WaveFrame
-from climatenerf.weather.parameters import Flood
-from climatenerf.weather.smog.medium import Medium
+from climatenerf.scene.scene import Scene
+from climatenerf.weather.weather import Weather
+
+SKY_OPACITY = 0.5  # rays whose sky weighs more have no surface
+TINY = math.exp(-12)  # keeps means over nothing finite: 0/0
+
+
+class Medium(Protocol):
+    """A participating medium that absorbs, and has a radiance of its own."""
+
+    @property
+    def mask(self) -> str:
+        """Name of the layer with the share of light that the medium adds."""
+        ...
+
+    def optical_depth(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n"]:
+        """Optical depth from each origin (m) to ray length t (m; may be +inf)."""
+        ...
+
+    def source(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "*n 3"]:
+        """Radiance of the infinitely thick medium, one for all rays or one a ray."""
+        ...
+
+    def breaks(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n b"]:
+        """Ray lengths (m) at which its extinction jumps or bends; +inf for none."""
+        ...
 
 
 class Matter(Protocol):
-    """What lies on the scene (snow): density and colour of its own."""
+    """Solid matter on the scene, such as snow: density and colour of its own."""
 
-    def march(self, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, t_max: Tensor) -> Samples:
-        """Samples where it is."""
+    @property
+    def mask(self) -> str:
+        """Name of the layer with the share of the pixel that shows this matter."""
+        ...
+
+    @property
+    def thickness_layer(self) -> str:
+        """Name of the layer with its thickness, m."""
+        ...
+
+    def march(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        t_max: Float[Tensor, "n"],
+    ) -> Samples:
+        """Samples along rays, front to back, where it has density."""
         ...
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Linear radiance."""
+        """Linear radiance at positions (m)."""
         ...
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Outward unit normal."""
+        """Outward unit normal at positions (m)."""
         ...
 
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Height above the ground under it, m."""
+        """Height above the ground beneath, m."""
         ...
 
 
 @dataclass(frozen=True)
-class Water:
-    """A flood at one moment."""
+class RaySamples:
+    """Merged samples of rays, with what the integrator knows of them."""
 
-    flood: Flood
-    level: float
-    """World height of the surface, m."""
-    waves: WaveFrame
-    irradiance: Float[Tensor, "3"]
-    """On level ground in the open, linear."""
-    sun_elevation: float | None = None
-    """rad; None: light from an even sky."""
-    mirror_only: bool = False
-    """Reflectance 1 and no gloss: a check against a mirrored camera."""
+    samples: Samples
+    ray: Int[Tensor, "s"]
+    """Ray of each sample."""
+    weights: Float[Tensor, "s"]
+    """Share of its ray's light that ends on each sample."""
+
+
+@dataclass(frozen=True)
+class SurfaceHits:
+    """Rays that arrive at a surface."""
+
+    rays_o: Float[Tensor, "n 3"]
+    rays_d: Float[Tensor, "n 3"]
+    t: Float[Tensor, "n"]
+    """Ray length to the surface, m."""
+    t_bottom: Float[Tensor, "n"]
+    """Mean ray length of what lies behind the surface, m; 0 where nothing does."""
+    pixel_angle: Float[Tensor, "n"]
+    """Angle that a pixel spans, rad."""
+    sample_rotation: Float[Tensor, "n"] | None
+    """Angle that rotates each pixel's glossy sample set, rad."""
+
+
+TraceRadiance = Callable[
+    [Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]], Float[Tensor, "n 3"]
+]
+"""Radiance along further rays: origins (m), unit directions, pixel angles (rad)."""
+
+
+class Surface(Protocol):
+    """A surface that shades rays by tracing further ones, such as water."""
+
+    @property
+    def mask(self) -> str:
+        """Name of the layer with the share of the pixel that shows this surface."""
+        ...
+
+    @property
+    def extra_layers(self) -> tuple[str, ...]:
+        """Names of the layers that `shade` gives besides the mask."""
+        ...
+
+    @property
+    def level(self) -> float:
+        """World height below which matter is submerged, m."""
+        ...
+
+    def distance(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n"]:
+        """Ray length to the surface, from either side, m; +inf where it is missed."""
+        ...
+
+    def inside(self, rays_o: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether origins lie in the body behind the surface."""
+        ...
+
+    def fraction_behind(
+        self,
+        world: "World",
+        along: RaySamples,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t: Float[Tensor, "n"],
+        pixel_angle: Float[Tensor, "n"],
+    ) -> Float[Tensor, "s"]:
+        """Share of each sample that lies behind the surface, which rays meet at length t (m)."""
+        ...
+
+    def attenuate(
+        self,
+        radiance: Float[Tensor, "n 3"],
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance at ray length t (m) as it arrives at an eye inside the body."""
+        ...
+
+    def shade(
+        self, world: "World", hits: SurfaceHits, trace: TraceRadiance
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], dict[str, Float[Tensor, "n"]]]:
+        """What arriving rays see of the surface.
+
+        Args:
+            world: everything at this moment.
+            hits: the rays.
+            trace: traces further rays through the whole world, with one surface hit less to go.
+
+        Returns:
+            Radiance, unit normals, and the layers named in `extra_layers`.
+        """
+        ...
 
 
 @dataclass(frozen=True)
 class World:
-    """Everything there is at one moment."""
+    """Everything that a ray can meet at one moment.
+
+    Attributes:
+        field: the fitted field, or any other.
+        appearance: exposure and light in which the field is rendered; None: the mean of all photos.
+        media: what fills the air.
+        matters: what lies on the scene.
+        surfaces: what cuts rays off.
+    """
 
     field: RadianceField
     appearance: Float[Tensor, "1 e"] | None = None
-    """Exposure and light in which the field is rendered; None: the mean of all photos."""
-    air: Medium | None = None
-    matter: Matter | None = None
-    water: Water | None = None
+    media: tuple[Medium, ...] = ()
+    matters: tuple[Matter, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
+
+    @property
+    def layer_names(self) -> tuple[str, ...]:
+        """Layers that rays through this world have."""
+        names = [medium.mask for medium in self.media]
+        for matter in self.matters:
+            names += [matter.mask, matter.thickness_layer]
+        for surface in self.surfaces:
+            names += [surface.mask, *surface.extra_layers]
+        return tuple(names)
 
 
 @dataclass
 class RenderOutput:
-    """What rays see; all per ray, colours linear."""
+    """What rays see; all per ray, radiance linear."""
 
     rgb: Float[Tensor, "n 3"]
     depth: Float[Tensor, "n"]
-    """Ray length to the surface seen (water counts), m; +inf for sky."""
+    """Ray length to the visible surface (water counts), m; +inf for sky."""
     normal: Float[Tensor, "n 3"]
-    """Of water and snow; 0 elsewhere: solid surfaces' come from the field (`frame.py`)."""
+    """Of surfaces and matter of the weather; 0 elsewhere: the field's come later (`frame.py`)."""
     transmittance: Float[Tensor, "n"]
-    """Of the air to that surface."""
-    water_depth: Float[Tensor, "n"]
-    snow_thickness: Float[Tensor, "n"]
-    mask_water: Float[Tensor, "n"]
-    mask_snow: Float[Tensor, "n"]
-    mask_smog: Float[Tensor, "n"]
+    """Of all media up to that surface."""
+    layers: dict[str, Float[Tensor, "n"]] = field(default_factory=dict)
+    """Layers of the effects that are present, by name."""
 
 
 def concatenate(parts: Sequence[RenderOutput], order: Int[Tensor, "n"] | slice) -> RenderOutput:
-    """What all the parts' rays see, one part after the other, and then in this order."""
+    """The rays of all parts in one output, then in the given order. All have the same layers."""
+
+    def joined(values: list[Tensor]) -> Tensor:
+        return torch.cat(values)[order]
+
     return RenderOutput(
-        **{
-            key: torch.cat([getattr(p, key) for p in parts])[order]
-            for key in RenderOutput.__annotations__
-        }
+        joined([part.rgb for part in parts]),
+        joined([part.depth for part in parts]),
+        joined([part.normal for part in parts]),
+        joined([part.transmittance for part in parts]),
+        {name: joined([part.layers[name] for part in parts]) for name in parts[0].layers},
     )
 
 
-SKY_OPACITY = 0.5  # rays with more sky than this on them have no surface
-TINY = math.exp(-12)  # keeps means over nothing finite: 0/0
+@dataclass(frozen=True)
+class Preparation:
+    """What an effect is prepared from.
+
+    Attributes:
+        field: the fitted field, or any other.
+        scene: its capture.
+        moments: the weather at all moments of the movie at which the effect is present.
+        camera_positions: world m; detail is finest around them.
+        appearance: exposure and light of the field's colours; None: the mean of all photos.
+        irradiance: gives the linear irradiance on open level ground; computed at its first call.
+        progress: called with what is being done and the share that is done, [0, 1].
+    """
+
+    field: RadianceField
+    scene: Scene
+    moments: tuple[Weather, ...]
+    camera_positions: Float[np.ndarray, "m 3"]
+    appearance: Float[Tensor, "1 e"] | None
+    irradiance: Callable[[], Float[Tensor, "3"]]
+    progress: Callable[[str, float], None]

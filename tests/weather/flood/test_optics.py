@@ -7,7 +7,7 @@ import torch
 
 from climatenerf.weather.flood import fresnel, waves
 from climatenerf.weather.flood import optics as water
-from climatenerf.weather.parameters import Flood
+from climatenerf.weather.flood.parameters import Flood
 
 IOR = 1.333
 PUDDLE = Flood(level=0.0)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from climatenerf.weather.flood import spectrum, waves
-from climatenerf.weather.parameters import Flood
+from climatenerf.weather.flood.parameters import Flood
 
 STREET = Flood(level=0.0)
 SEA = Flood(level=0.0, wind_speed=10.0, fetch=1e5, depth=200.0)

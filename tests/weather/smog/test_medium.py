@@ -1,13 +1,15 @@
 """Optical depth of smog: against quadrature, known visibilities, and at singular points."""
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from climatenerf.weather.parameters import Smog
+from climatenerf.weather import media
 from climatenerf.weather.smog import medium as smog
+from climatenerf.weather.smog.parameters import Smog
 
 STRATIFIED = smog.Medium(sigma=0.03, falloff=12.0, base_z=2.0, colour=(0.8, 0.7, 0.6))
 
@@ -63,7 +65,7 @@ def test_regression_recovers_sigma_of_a_homogeneous_medium():
     t = 1 + 99 * torch.rand(500, generator=generator)
     clean = 0.1 + 0.4 * torch.rand(500, 3, generator=generator)
     o, d = torch.zeros(500, 3), torch.tensor([1.0, 0.0, 0.0]).expand(500, 3)
-    hazy = smog.apply(air, clean, smog.transmittance(air, o, d, t))
+    hazy = media.attenuate([air], clean, o, d, t)
     for channel in range(3):
         air_colour = air.colour[channel]
         y = torch.log((hazy[:, channel] - air_colour) / (clean[:, channel] - air_colour))
@@ -141,4 +143,6 @@ def test_optical_depth_is_monotone_and_additive():
 
 def test_full_transmittance_leaves_colours_unchanged():
     colour = torch.rand(100, 3, generator=torch.Generator().manual_seed(2))
-    assert torch.equal(smog.apply(STRATIFIED, colour, torch.ones(100)), colour)
+    o, d = torch.zeros(100, 3), torch.tensor([0.0, 0.6, 0.8]).expand(100, 3)
+    clear = dataclasses.replace(STRATIFIED, sigma=0.0)
+    assert torch.equal(media.attenuate([clear], colour, o, d, torch.full((100,), 50.0)), colour)

@@ -8,10 +8,10 @@ import pytest
 import torch
 from support.analytic_fields import AnalyticField, Box, HalfSpace, ground, table
 
-from climatenerf.weather.parameters import Snow
 from climatenerf.weather.snow.deposition import fall_directions
 from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
 from climatenerf.weather.snow.layer import bake_snow
+from climatenerf.weather.snow.parameters import Snow
 
 CAMERAS = np.array([[0.0, 0.0, 1.6]])
 WHITE = np.ones(3)

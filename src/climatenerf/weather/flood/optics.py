@@ -14,7 +14,7 @@ from torch import Tensor
 
 from climatenerf.core.srgb import linear_colour
 from climatenerf.weather.flood.fresnel import diffuse_reflectances, slope_averaged
-from climatenerf.weather.parameters import Flood
+from climatenerf.weather.flood.parameters import Flood
 
 # Koschmieder's law for the path down and up: a white disc at the depth `clarity` keeps 2 % of its
 # contrast.

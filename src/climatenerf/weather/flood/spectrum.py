@@ -15,7 +15,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.weather.parameters import Flood
+from climatenerf.weather.flood.parameters import Flood
 
 GRAVITY = 9.81  # m/s^2
 TENSION = 0.074 / 1000  # surface tension over density, m^3/s^2

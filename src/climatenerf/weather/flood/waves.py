@@ -16,6 +16,7 @@ from jaxtyping import Complex, Float, Int64
 from torch import Tensor
 
 from climatenerf.core.device import to_device
+from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.spectrum import (
     MAX_CUTOFF,
     MIN_PEAK_RATIO,
@@ -28,7 +29,6 @@ from climatenerf.weather.flood.spectrum import (
     spreading,
     wavenumber_spectrum,
 )
-from climatenerf.weather.parameters import Flood
 
 _CYCLES = 8  # periods of a tile's longest wave along its side
 _RATIO = 5  # side of a tile over that of the next finer one

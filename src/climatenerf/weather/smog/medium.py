@@ -7,14 +7,16 @@ it. All integrals are closed forms: there is no step size, and empty space costs
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.srgb import linear_colour
-from climatenerf.weather.parameters import Smog
+from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import Preparation, World
 
 # Rays with a smaller |dz| count as horizontal. The gradient of a division by dz contains 1/dz^2,
 # which still fits float32 at this bound.
@@ -36,6 +38,32 @@ class Medium:
     falloff: float | None
     base_z: float
     colour: tuple[float, float, float]
+    mask = "mask_smog"
+
+    def optical_depth(
+        self,
+        rays_o: Float[Tensor, "*n 3"],
+        rays_d: Float[Tensor, "*n 3"],
+        t: Float[Tensor, "*n"],
+    ) -> Float[Tensor, "*n"]:
+        """See the function `optical_depth`."""
+        return optical_depth(self, rays_o, rays_d, t)
+
+    def source(
+        self, rays_o: Float[Tensor, "*n 3"], rays_d: Float[Tensor, "*n 3"]
+    ) -> Float[Tensor, "3"]:
+        """Radiance of the infinitely thick medium, the same for all rays."""
+        return torch.tensor(self.colour, dtype=rays_o.dtype, device=rays_o.device)
+
+    def breaks(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n 1"]:
+        """Ray length (m) at which rays cross `base_z`; +inf where they do not."""
+        dz = rays_d[:, 2]
+        level = dz.abs() < _HORIZONTAL
+        t = (self.base_z - rays_o[:, 2]) / torch.where(level, torch.ones_like(dz), dz)
+        crossed = ~level & (t > 0) & (self.falloff is not None)
+        return torch.where(crossed, t, torch.full_like(t, torch.inf))[:, None]
 
 
 def sigma_from_visibility(visibility: float, contrast: float = 0.05) -> float:
@@ -150,16 +178,22 @@ def transmittance(
     return torch.exp(-optical_depth(air, rays_o, rays_d, t))
 
 
-def apply(
-    air: Medium, colour: Float[Tensor, "*n 3"], transmitted: Float[Tensor, "*n"]
-) -> Float[Tensor, "*n 3"]:
-    """Return T L + (1 - T) c: the attenuated radiance plus the radiance of the medium.
+@dataclass(frozen=True)
+class SmogEntity:
+    """Smog in a scene whose ground datum lies at world height `ground_z` (m)."""
 
-    Args:
-        air: the medium, with its linear radiance c.
-        colour: linear radiance L at the far end of the segment.
-        transmitted: transmittance T of the segment, in [0, 1].
-    """
-    air_colour = torch.tensor(air.colour, dtype=colour.dtype, device=colour.device)
-    weight = transmitted[..., None]
-    return weight * colour + (1 - weight) * air_colour
+    ground_z: float
+
+    def place(self, world: World, weather: Weather, time: float) -> World:
+        """The world with smog in its air."""
+        air = medium(weather.smog, self.ground_z)
+        return world if air is None else replace(world, media=(*world.media, air))
+
+    def facts(self) -> dict[str, float]:
+        """Nothing is prepared."""
+        return {}
+
+
+def prepare(preparation: Preparation) -> SmogEntity:
+    """Smog needs nothing of the field."""
+    return SmogEntity(preparation.scene.ground_z)

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.protocol import RadianceField
-from climatenerf.weather.parameters import Snow
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid
+from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.surface_fit import half_transmittance, smooth_ground
 
 PASSES = 3

@@ -3,9 +3,10 @@
 ClimateNeRF, sections "Snow Simulation" and "Bake Editing": balls of density on a lattice, weighted
 by where the field shows surfaces that face the falling snow, summed with a compact kernel; the
 surface lies where the sum crosses a threshold. Instead of a trained network there is an explicit
-sparse grid (`snow_lattice`), filled by rays along the fall direction (`snow_bake`).
+sparse grid (`lattice`), filled by rays along the fall direction (`deposition`).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -16,32 +17,44 @@ from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import Samples
-from climatenerf.field.protocol import RadianceField
+from climatenerf.field.protocol import RadianceField, observed
 from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu.metaballs import THRESHOLD, Lattice
-from climatenerf.weather.parameters import Snow
+from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid, choose_grid, grow
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import Preparation, World
 
 
 @dataclass(frozen=True)
 class BakedSnow:
-    """Snow lying on a scene."""
+    """Snow lying on a scene.
+
+    Attributes:
+        lattice: the balls' sums, what rays march through.
+        deposits: where snow landed, from which other depths grow.
+        snow: its parameters.
+        light: light of the scene.
+        floor_z: height below which there is no snow (a water level), m.
+    """
 
     lattice: Lattice
     deposits: Deposits
     snow: Snow
     light: Light
     floor_z: float | None = None
-    """There is no snow below this height (a water level), m."""
+    mask = "mask_snow"
+    thickness_layer = "snow_thickness"
 
     def with_depth(self, depth: float) -> "BakedSnow":
-        """The same places under another depth of snow, m; takes no look at the field."""
+        """Another depth of snow (m) on the same deposits; the field is not asked again."""
         snow = replace(self.snow, depth=depth)
         return replace(self, lattice=grow(self.deposits, depth), snow=snow)
 
     def above(self, floor_z: float | None) -> "BakedSnow":
-        """The same snow, gone below a height (m)."""
+        """The same snow, removed below a height (m)."""
         return replace(self, floor_z=floor_z)
 
     @property
@@ -170,6 +183,56 @@ def bake_snow(
     with torch.no_grad():
         deposits = find_deposits(field, snow, grid, light, cameras, seed, progress, appearance)
     return BakedSnow(grow(deposits, snow.depth), deposits, snow, light)
+
+
+class SnowEntity:
+    """Fallen snow in a scene; it keeps the depth that was grown last."""
+
+    def __init__(self, preparation: Preparation):
+        """Bake the snow, with the parameters of the last moment that has any."""
+        self._preparation = preparation
+        self._baked = self._grown = None
+        snowy = [moment for moment in preparation.moments if moment.snow.depth > 0]
+        if snowy:
+            self._bake(snowy[-1])
+
+    def _bake(self, weather: Weather) -> None:
+        given = self._preparation
+        self._baked = self._grown = bake_snow(
+            observed(given.field),
+            weather.snow,
+            given.camera_positions,
+            to_numpy(given.irradiance() / math.pi),
+            sun_direction(weather.sun),
+            weather.seed,
+            progress=lambda share: given.progress("snowfall", share),
+            appearance=given.appearance,
+        )
+
+    def place(self, world: World, weather: Weather, time: float) -> World:
+        """The world with snow on it, down to the highest water level."""
+        depth = weather.snow.depth
+        if not depth:
+            return world
+        if self._baked is None:
+            self._bake(weather)
+        assert self._baked is not None and self._grown is not None
+        if depth != self._grown.snow.depth:
+            same = depth == self._baked.snow.depth
+            self._grown = self._baked if same else self._baked.with_depth(depth)
+        look = replace(self._grown.snow, wrap=weather.snow.wrap)
+        floor = max((surface.level for surface in world.surfaces), default=None)
+        snow = replace(self._grown, snow=look, floor_z=floor)
+        return replace(world, matters=(*world.matters, snow))
+
+    def facts(self) -> dict[str, float]:
+        """None: thickness is a layer."""
+        return {}
+
+
+def prepare(preparation: Preparation) -> SnowEntity:
+    """Let snow fall on the scene."""
+    return SnowEntity(preparation)
 
 
 def _array(x: Tensor) -> np.ndarray:

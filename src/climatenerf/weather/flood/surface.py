@@ -1,0 +1,295 @@
+"""Flood water as a surface: where rays meet it, how its shore is antialiased, how it is shaded.
+
+The physics is in `optics`, `fresnel` and `waves`. The surface is a level plane; waves change its
+normals alone. Reflected and refracted rays are traced through the whole world by the integrator,
+which hands itself over as `trace`.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from climatenerf.core.errors import UserError
+from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT
+from climatenerf.field.compositing import RENDER_STEP, composited
+from climatenerf.scene.scene import Scene
+from climatenerf.weather.flood import optics, waves
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.flood.waves import WaveFrame, Waves, at_time, make_waves
+from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import (
+    TINY,
+    Preparation,
+    RaySamples,
+    SurfaceHits,
+    TraceRadiance,
+    World,
+)
+
+SKIN = 2e-3  # secondary rays begin this far from the water, m
+MIN_BOTTOM = 1.0 / 2048  # transmittance below which no bottom is traced: under an 8-bit step
+
+
+@dataclass(frozen=True)
+class Water:
+    """A flood at one moment.
+
+    Attributes:
+        flood: its parameters.
+        level: world height of the surface, m.
+        waves: their slopes at this moment.
+        irradiance: on level ground in the open, linear.
+        sun_elevation: rad; None: light from an even sky.
+        mirror_only: reflectance 1 and no gloss: a check against a mirrored camera.
+    """
+
+    flood: Flood
+    level: float
+    waves: WaveFrame
+    irradiance: Float[Tensor, "3"]
+    sun_elevation: float | None = None
+    mirror_only: bool = False
+    mask = "mask_water"
+    extra_layers = ("water_depth",)
+
+    def distance(
+        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n"]:
+        """Ray length to the level plane, m; +inf where it is missed."""
+        return optics.plane_distance(rays_o, rays_d, self.level)
+
+    def inside(self, rays_o: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether origins lie under water."""
+        return rays_o[:, 2] < self.level
+
+    def fraction_behind(
+        self,
+        world: World,
+        along: RaySamples,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t: Float[Tensor, "n"],
+        pixel_angle: Float[Tensor, "n"],
+    ) -> Float[Tensor, "s"]:
+        """Share of each sample behind the plane: 0 or 1 but in the pixels of the waterline.
+
+        The soft edge lies on the wet side (0 at the waterline, 1 half a pixel from it), so that
+        water under the ground shows nowhere; the visible edge moves by a quarter of a pixel. Its
+        width depends on the ground's slope, so the field's normal is found for rays that have
+        matter within a pixel of the plane.
+        """
+        ray, lengths = along.ray, along.samples.t
+        behind = (lengths > t[ray]).float()
+        near = ((along.weights > MIN_WEIGHT) & (t[ray] < torch.inf)).nonzero()[:, 0]
+        of = ray[near]
+        arguments = (t[of], lengths[near], rays_d[of], pixel_angle[of])
+        soft = optics.shore_coverage(*arguments)
+        rays = torch.unique(of[(soft > 0) & (soft < 1)])
+        if not rays.numel():
+            return behind
+        x = rays_o[rays] + t[rays, None] * rays_d[rays]
+        step = (2 * pixel_angle[rays] * t[rays]).clamp_min(0.02)
+        normal = torch.zeros_like(rays_d)
+        normal[:, 2] = 1.0
+        normal[rays] = _field_normal(world, x, step, rays_d[rays])
+        covered = 2 * optics.shore_coverage(*arguments, normal[of]) - 1
+        return behind.index_copy(0, near, covered.clamp_min(0.0))
+
+    def attenuate(
+        self,
+        radiance: Float[Tensor, "n 3"],
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance at ray length t (m) as it arrives at an eye under water."""
+        beta = torch.tensor(optics.attenuation(self.flood))
+        depth = self.level - rays_o[:, 2] - t.clamp_max(1e6) * rays_d[:, 2]
+        light = optics.light_cosine(self.flood, self.sun_elevation)
+        passed = optics.water_transmittance(beta, t, depth, light)
+        return radiance * passed + optics.body_colour(self.flood, self.irradiance) * (1 - passed)
+
+    def shade(
+        self, world: World, hits: SurfaceHits, trace: TraceRadiance
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], dict[str, Float[Tensor, "n"]]]:
+        """Reflection of the world, and the bottom seen through the water (Fresnel; Snell)."""
+        n, rays_d = hits.t.shape[0], hits.rays_d
+        below = self.inside(hits.rays_o)
+        vertical = (hits.t_bottom - hits.t).clamp_min(0) * rays_d[:, 2].abs()
+        depth = torch.where(torch.isfinite(vertical) & ~below, vertical, torch.zeros(n))
+        x = hits.rays_o + hits.t[:, None] * rays_d
+        x[:, 2] = self.level
+        footprint = optics.footprint(hits.t, rays_d, hits.pixel_angle)
+        slope, variance = waves.slopes(self.waves, x[:, :2], footprint)
+        normal = optics.normal_of(slope)
+        directions, parts, reflectance = optics.reflection(
+            rays_d, slope, variance, self.flood, below, hits.sample_rotation
+        )
+        if self.mirror_only:
+            directions, parts = directions[:, :1], torch.ones(1)
+            reflectance = torch.ones_like(reflectance)
+
+        # --- Reflected rays, traced like any other ------------------------------------------------
+        count = directions.shape[1]
+        side = torch.where(below, -SKIN, SKIN)
+        start = x + torch.stack([torch.zeros(n), torch.zeros(n), side], dim=-1)
+        radiance = trace(
+            start.repeat_interleave(count, 0),
+            directions.reshape(-1, 3),
+            hits.pixel_angle.repeat_interleave(count, 0) * 2,
+        )
+        reflected = (radiance.view(n, count, 3) * parts[:, None]).sum(1)
+
+        # --- What is on the other side ------------------------------------------------------------
+        direction, total = optics.refract(rays_d, normal, self.flood.ior, below)
+        direction = direction * ~total[:, None]  # total reflection: no ray goes on
+        start = start - 2 * side[:, None] * torch.tensor([0.0, 0.0, 1.0])
+        background, passed = self._other_side(
+            world, start, direction, below, hits.pixel_angle, depth, trace
+        )
+        # From below, the mean over slopes lets a little light through even where the visible facet
+        # reflects all of it.
+        reflectance = torch.where(total, torch.ones_like(reflectance), reflectance)
+        body = optics.body_colour(self.flood, self.irradiance)
+        shaded = optics.shade(reflected, reflectance, background, passed, body)
+        return shaded, normal, {"water_depth": depth}
+
+    def _other_side(
+        self,
+        world: World,
+        start: Float[Tensor, "n 3"],
+        direction: Float[Tensor, "n 3"],
+        below: Bool[Tensor, "n"],
+        pixel_angle: Float[Tensor, "n"],
+        depth: Float[Tensor, "n"],
+        trace: TraceRadiance,
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Radiance behind the surface along the refracted ray, and the water's transmittance to it.
+
+        From above: the bottom, converted from dry to wet. From below: the air's light, and 1.
+        """
+        n = start.shape[0]
+        background, passed = torch.zeros(n, 3), torch.zeros(n, 3)
+        beta = torch.tensor(optics.attenuation(self.flood))
+        # Where the water is opaque over the straight ray's depth, no ray is spent on the bottom.
+        # Light comes down through this depth and goes up through at least as much.
+        shows = torch.exp(-2 * beta.min() * depth) > MIN_BOTTOM
+        down = (~below & shows & (direction[:, 2] < 0)).nonzero()[:, 0]
+        if down.numel():
+            o, d = start[down], direction[down]
+            # The bottom is seen directly, so its steps are those of camera rays.
+            matter, transmittance, length = composited(
+                world.field,
+                o,
+                d,
+                torch.zeros(down.shape[0]),
+                RENDER_STEP,
+                pruning_threshold=MIN_TAU,
+                appearance=world.appearance,
+            )
+            opacity = (1 - transmittance).clamp_min(TINY)
+            dry, path = matter / opacity[:, None], length / opacity
+            light = optics.light_cosine(self.flood, self.sun_elevation)
+            through = optics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
+            background[down] = optics.bottom_radiance(dry, self.irradiance, self.flood.ior)
+            passed[down] = through * (1 - transmittance)[:, None]
+        passed[below] = 1.0
+        up = (below & (direction[:, 2] > 0)).nonzero()[:, 0]
+        if up.numel():
+            background[up] = trace(start[up], direction[up], pixel_angle[up])
+        return background, passed
+
+
+@dataclass(frozen=True)
+class FloodEntity:
+    """A flood in a scene.
+
+    Attributes:
+        waves: the random amplitudes of its waves.
+        irradiance: on level ground in the open, linear.
+        ground_z: world height of the ground datum, m.
+        top: height of the scene's top above the ground datum, m.
+    """
+
+    waves: Waves
+    irradiance: Float[Tensor, "3"]
+    ground_z: float
+    top: float
+
+    def place(self, world: World, weather: Weather, time: float) -> World:
+        """The world with the flood's surface in it."""
+        level = weather.flood.level
+        if level is None:
+            return world
+        check_level(level, self.top)
+        water = Water(
+            weather.flood,
+            self.ground_z + level,
+            at_time(self.waves, time),
+            self.irradiance,
+            weather.sun.elevation,
+        )
+        return replace(world, surfaces=(*world.surfaces, water))
+
+    def facts(self) -> dict[str, float]:
+        """Height of the waves."""
+        return {"significant_wave_height_m": self.waves.significant_height}
+
+
+def prepare(preparation: Preparation) -> FloodEntity:
+    """Sample the waves and gather the light. The waves are those of the first flooded moment.
+
+    Raises:
+        UserError: a level above the whole scene.
+    """
+    scene, first = preparation.scene, preparation.moments[0]
+    top = scene_top(scene)
+    for moment in preparation.moments:
+        check_level(moment.flood.level, top)
+    waves = make_waves(first.flood, first.seed)
+    return FloodEntity(waves, preparation.irradiance(), scene.ground_z, top)
+
+
+def scene_top(scene: Scene) -> float:
+    """Height of the highest camera or sparse point above the ground datum, m."""
+    highest = max(scene.c2w_world(view)[2, 3] for view in scene.views)
+    points = scene.points_world()
+    if points is not None and points.shape[0]:
+        highest = max(highest, float(np.quantile(points[:, 2], 0.99)))
+    return highest - scene.ground_z
+
+
+def check_level(level: float, top: float) -> None:
+    """Refuse a level (m) above the top of the scene (m): the unit is wrong.
+
+    Raises:
+        UserError: the level is higher.
+    """
+    if level > top:
+        raise UserError(
+            f"--flood.level {level:g} m is above the whole scene, whose top is {top:.1f} m"
+            " over its ground; give a lower level"
+        )
+
+
+def _field_normal(
+    world: World, x: Float[Tensor, "n 3"], step: Float[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Unit normal of the field near x by central differences over `step` (m), towards the eye."""
+    gradient = torch.zeros_like(x)
+    for axis in range(3):
+        offset = torch.zeros_like(x)
+        offset[:, axis] = step
+        gradient[:, axis] = _opacity(world, x + offset, step) - _opacity(world, x - offset, step)
+    length = gradient.norm(dim=-1, keepdim=True)
+    # Where the density is constant the surface is taken to face the eye.
+    normal = torch.where(length > 1e-9, -gradient / length.clamp_min(1e-9), -rays_d)
+    return torch.where((normal * rays_d).sum(-1, keepdim=True) > 0, -rays_d, normal)
+
+
+def _opacity(world: World, x: Tensor, step: Tensor) -> Float[Tensor, "n"]:
+    """Opacity over a step's length: unlike density it does not jump by orders of magnitude."""
+    return 1 - torch.exp(-world.field.density(x) * step)

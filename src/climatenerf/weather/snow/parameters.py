@@ -1,0 +1,64 @@
+"""What a user can ask of fallen snow."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+from climatenerf.core.layer_table import Layer
+from climatenerf.weather.effect import Effect, Measure
+from climatenerf.weather.units import ANGLE, LENGTH, number, quantity
+
+_TURN = 2 * math.pi
+
+
+@dataclass(frozen=True)
+class Snow:
+    """Fallen snow on upward surfaces."""
+
+    depth: Annotated[float | None, quantity(LENGTH, 0.0, 2.0, optional=True)] = None
+    """Thickness on open level ground. none: no snow."""
+    fall_tilt: Annotated[float, quantity(ANGLE, 0.0, math.radians(80))] = 0.0
+    """Angle between the fall direction and the vertical."""
+    wind_direction: Annotated[float, quantity(ANGLE, -_TURN, _TURN)] = 0.0
+    """Where tilted snow comes from, clockwise from +y."""
+    slope: Annotated[float, quantity(ANGLE, 0.0, math.pi / 2)] = math.radians(37.0)
+    """Slope on which half of the snow stays."""
+    slope_sharpness: Annotated[float, number(1.0, 1000.0)] = 50.0
+    """Steepness a' of the logistic in cos(slope)."""
+    albedo_offset: Annotated[float, number(0.0, 100.0)] = 4.0
+    """c0 of the snow's colour (g + c0)/(1 + c0); larger is whiter."""
+    wrap: Annotated[float, number(0.0, 100.0)] = 8.0
+    """Wrap lighting gamma of (n.l + gamma)/(1 + gamma); larger is flatter."""
+    sun_share: Annotated[float, number(0.0, 1.0)] = 0.7
+    """beta_s: brightness that the sun's shadow takes away."""
+    shade: Annotated[float, number(0.0, 1.0)] = 0.3
+    """V_s0: brightness that is left in shadow."""
+
+
+SNOW = Effect(
+    name="snow",
+    parameters=Snow,
+    enabled_by=("depth",),
+    prepare="climatenerf.weather.snow.layer:prepare",
+    layers=(
+        Layer("snow_thickness", "m", "snow upon the surface that is seen, else 0", 1e-4, 16),
+        Layer("mask_snow", "1", "share of the pixel that shows snow", 1 / 255, 8),
+    ),
+    measures=(
+        Measure("snow_share", "mask_snow"),
+        Measure("mean_snow_thickness_m", "snow_thickness", "mask_snow"),
+    ),
+    after=("flood",),
+    prepared_from=(
+        "snow.fall_tilt",
+        "snow.wind_direction",
+        "snow.slope",
+        "snow.slope_sharpness",
+        "snow.albedo_offset",
+        "snow.sun_share",
+        "snow.shade",
+        "sun.elevation",
+        "sun.azimuth",
+        "seed",
+    ),
+)
