@@ -11,7 +11,7 @@ import pytest
 import climatenerf
 
 FUNCTIONS = ["evaluate", "fit", "load_run", "open_scene", "render_movie"]
-CLASSES = ["Flood", "Smog", "Snow", "Sun", "Weather"]
+CLASSES = ["Flood", "RenderSession", "Smog", "Snow", "Sun", "Weather"]
 
 
 def public(names):
