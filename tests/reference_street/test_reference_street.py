@@ -99,8 +99,8 @@ def test_snow_is_reproducible_by_its_seed(yard):
 
 
 def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path):
-    from climatenerf.weather.flood.waves import at_time, heights, make_waves, slopes
     from climatenerf.weather.flood.parameters import Flood
+    from climatenerf.weather.flood.waves import at_time, heights, make_waves, slopes
 
     water.wavy(5.0, 1.0, tmp_path)
     raw = (tmp_path / "water.ply").read_bytes()
@@ -114,9 +114,7 @@ def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path):
     analytic = -normal[..., :2] / normal[..., 2:]
     wanted = np.stack([slope_x, slope_y], -1)
     error = np.sqrt(((analytic - wanted)[inner] ** 2).mean())
-    assert error < 0.25 * np.sqrt((analytic[inner] ** 2).mean()), (
-        "differences smooth short waves"
-    )
+    assert error < 0.25 * np.sqrt((analytic[inner] ** 2).mean()), "differences smooth short waves"
     waves = make_waves(
         Flood(level=0.0, wind_speed=water.WIND, wave_scale=water.WAVE_SCALE), water.SEED
     )
