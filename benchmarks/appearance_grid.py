@@ -1,12 +1,11 @@
-"""What the appearance grid, and whose exposure scores are in, do to the score of a fit.
+"""Measure how appearance decay and the size of the appearance grid affect held-out quality.
 
 python benchmarks/appearance_grid.py --captures fox --steps 700 --decays 0 0.5
 python benchmarks/appearance_grid.py --captures stone_sign --downscale 2 --steps 4000 --rows 17 19
 
-Captures are names in ../shared/data or folders. Fits of as many steps with each decay and with
-tables of each number of rows (its logarithm), one after the other, every eighth photo held out; of
-each the held-out PSNR as `fit` measures it, the same in the mean appearance of all fitted photos,
-and after the affine colour map that fits best.
+Captures are names in ../shared/data or folders. One fit is made for each decay and each table size
+(logarithm of its rows), with every eighth photo held out. Each row gives the held-out PSNR as `fit`
+measures it, after the best affine colour map, and in the mean appearance of all fitted photos.
 """
 
 import argparse
@@ -26,7 +25,7 @@ from climatenerf.training.settings import FitSettings
 
 
 def main() -> None:
-    """Makes the fits asked for, and prints the scores of each."""
+    """Make the fits and print the scores of each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--captures", nargs="+", default=["fox"])
     parser.add_argument("--downscale", type=int, default=1)
@@ -65,7 +64,7 @@ def main() -> None:
                 rows.append(row | {"psnr_mean_appearance": in_mean["psnr"]})
                 print(rows[-1], file=sys.stderr)
     report(
-        "held-out quality by the appearance grid and by whose exposure is shown", rows, options.seed
+        "held-out quality by appearance decay, table size and shown appearance", rows, options.seed
     )
 
 

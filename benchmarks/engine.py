@@ -1,16 +1,17 @@
-"""How fast is a step of fitting, a frame, and a fit as a whole?
+"""Time an optimiser step, a frame, and a whole fit.
 
 python benchmarks/engine.py RUN
 python benchmarks/engine.py RUN --capture ../shared/data/fox --minutes 5
 python benchmarks/engine.py RUN --capture ../shared/data/fox --peer peer/bin/python
 
-`step`: samples a second of one optimiser step on the field of RUN, with rays of its photos: ours;
-the same in eager PyTorch; the same under `torch.compile`. Every sample passes every head in all
-three (density, colour, classes, normals and the normals' target); marching is in none of them.
-`frame`: seconds of a picture, as `frame_time.py`. `time_to_psnr`: seconds from nothing until the
-held-out photos of a capture reach so many dB in the mean appearance of all; reading and matching
-photos are counted, measuring and compiling are not. The peer's is of `peer_nerfacto.py`, run by
-the Python of its own environment, without its reading of photos; null: not within its minutes.
+`step`: samples per second of one optimiser step on the field of RUN with rays of its photos, for
+our kernels, for the same step in eager PyTorch, and under `torch.compile`. In all three every
+sample passes every head (density, colour, classes, normals and the normals' target); marching is
+excluded. `frame`: seconds per picture, as in `frame_time.py`. `time_to_psnr`: seconds from the
+start of a fit until the held-out photos of a capture reach some PSNR in the mean appearance of all
+photos. Reading photos and multi-view stereo are included, evaluation and compilation are not. The
+peer's times come from `peer_nerfacto.py`, run by the Python of its own environment, without reading
+photos. null means not reached within its minutes.
 """
 
 import argparse
@@ -47,7 +48,7 @@ from climatenerf.training.settings import FitSettings
 from climatenerf.training.trainer import Fitting, Report
 
 GOALS = (20, 22, 24)  # dB
-STEPS = 5  # of ours for one of a twin's
+STEPS = 5  # steps of our kernels per step of a twin
 
 
 # --- the same operations in plain PyTorch, without a loop over rays ------------------------------
@@ -58,7 +59,7 @@ def ray_of(offsets: Int[Tensor, "rays+1"]) -> Int[Tensor, "s"]:
 
 
 def before_each(values: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]) -> Float[Tensor, "s"]:
-    """Sum of what comes before each sample on its ray."""
+    """Return the sum of the preceding values on each sample's ray."""
     passed = values.double().cumsum(0) - values
     first = offsets[:-1].clamp_max(values.shape[0] - 1)
     return (passed - passed[first][ray_of(offsets)]).to(values.dtype)
@@ -104,7 +105,7 @@ def eager_slopes(q: Float[Tensor, "n 3"], net: marching.Net) -> Float[Tensor, "n
 
 @contextmanager
 def plain_pytorch() -> Iterator[None]:
-    """Within it the program computes with PyTorch alone."""
+    """Replace all kernels by PyTorch operations within the context."""
     encodings = mock.patch.object(encoding, "hash_encode", reference.hash_encode)
     networks = mock.patch.multiple(network, mlp=reference.mlp, encoded_mlp=eager_encoded)
     marches = mock.patch.multiple(marching, density_slopes=eager_slopes, positions=eager_positions)
@@ -129,8 +130,8 @@ def plain_pytorch() -> Iterator[None]:
 
 
 @dataclass
-class Drawn:
-    """A batch of rays and the samples on them."""
+class RayBatch:
+    """A batch of rays with their samples."""
 
     batch: Batch
     samples: Samples
@@ -139,10 +140,10 @@ class Drawn:
     """Grid units."""
 
 
-def drawn(fitting: Fitting, samples: int) -> Drawn:
-    """Rays with about so many samples."""
+def draw_batch(fitting: Fitting, samples: int) -> RayBatch:
+    """Draw rays that have about `samples` samples in total."""
     field, rays = fitting.field, 512
-    for _ in range(50):  # rays differ: a few may never come near enough
+    for _ in range(50):  # rays differ, so that the target may not be reached
         batch = fitting.pixels.draw(rays, fitting.generator)
         n = batch.rays_o.shape[0]
         near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
@@ -153,33 +154,35 @@ def drawn(fitting: Fitting, samples: int) -> Drawn:
         rays = max(16, int(rays * samples / max(found.t.shape[0], 1)))
     ray = found.ray_index()
     x = batch.rays_o[ray] + found.t[:, None] * batch.rays_d[ray]
-    return Drawn(batch, found, ray, field.to_grid(x))
+    return RayBatch(batch, found, ray, field.to_grid(x))
 
 
-def loss_of(field: Field, at: Drawn) -> Float[Tensor, ""]:
-    """Colours, distortion, opacity, classes and normals of all samples."""
+def loss_of(field: Field, at: RayBatch) -> Float[Tensor, ""]:
+    """Compute all losses: colour, distortion, opacity, classes and normals of all samples."""
     batch, samples = at.batch, at.samples
     n = batch.rays_o.shape[0]
     u = field.sample_positions(batch.rays_o, batch.rays_d, samples)
     dt, t = samples.dt / field.unit, samples.t / field.unit
-    weights, left = compositing.render_weights(field.density_with_gradient(u) * dt, samples.offsets)
+    weights, transmittance = compositing.render_weights(
+        field.density_with_gradient(u) * dt, samples.offsets
+    )
     embedding = field.embeddings.index_select(0, batch.image)
     colour = field.colour_at(u, at.ray, batch.rays_d, embedding)
     radiance = compositing.accumulate(weights, colour, samples.offsets)
-    radiance = radiance + left[:, None] * field.sky_colour(batch.rays_d, embedding)
+    radiance = radiance + transmittance[:, None] * field.sky_colour(batch.rays_d, embedding)
     loss = losses.colour_error(radiance, batch.rgb).mean()
     loss = loss + 1e-2 * losses.distortion_loss(weights, t, dt, samples.offsets)
-    loss = loss + 2e-4 * losses.opacity_entropy_loss(left)
-    goal = field.density_normal(at.q)
+    loss = loss + 2e-4 * losses.opacity_entropy_loss(transmittance)
+    density_normal = field.density_normal(at.q)
     logits, apart = compositing.surface(
-        weights.detach(), field.surface_raw(u), goal, samples.offsets
+        weights.detach(), field.surface_raw(u), density_normal, samples.offsets
     )
-    target = torch.arange(n) % len(SOLID)  # their cost does not depend on what they are
+    target = torch.arange(n) % len(SOLID)  # any classes: the cost does not depend on them
     loss = loss + 4e-2 * losses.class_loss(logits, target, torch.ones(n, dtype=torch.bool))
     return loss + 4e-2 * apart.sum() / n
 
 
-def our_step(field: Field, at: Drawn) -> Callable[[], None]:
+def our_step(field: Field, at: RayBatch) -> Callable[[], None]:
     tables = [p for n, p in field.named_parameters() if n.endswith("_grid")]
     others = [p for n, p in field.named_parameters() if not n.endswith("_grid")]
     grids, nets = GridAdam(tables), torch.optim.Adam(others, lr=1e-6, fused=True)
@@ -194,13 +197,13 @@ def our_step(field: Field, at: Drawn) -> Callable[[], None]:
             nets.step()
             grids.step(1e-6)
         finally:
-            for table in tables:  # the twins know of no buffers
+            for table in tables:  # the twins use autograd's gradients
                 del table.grad_buffer
 
     return step
 
 
-def twin_step(field: Field, at: Drawn, compiled: bool) -> Callable[[], None]:
+def twin_step(field: Field, at: RayBatch, compiled: bool) -> Callable[[], None]:
     adam = torch.optim.Adam(field.parameters(), lr=1e-6, fused=True)
     loss = torch.compile(loss_of) if compiled else loss_of
 
@@ -215,12 +218,12 @@ def twin_step(field: Field, at: Drawn, compiled: bool) -> Callable[[], None]:
 
 
 def steps(fitting: Fitting, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
-    """Samples a second, ours and the twins', on the same field and rays.
+    """Measure samples per second of our kernels and the twins on the same field and rays.
 
-    In turn: a machine that others use, too, may be slower in one minute than in the next.
+    Measurements alternate, so that a change of the machine's load affects all of them.
     """
-    many = drawn(fitting, samples)
-    few = many if twin_samples == samples else drawn(fitting, twin_samples)
+    many = draw_batch(fitting, samples)
+    few = many if twin_samples == samples else draw_batch(fitting, twin_samples)
     jobs = {
         "ours": our_step(fitting.field, many),
         "eager": twin_step(fitting.field, few, False),
@@ -232,15 +235,15 @@ def steps(fitting: Fitting, samples: int, twin_samples: int, repeats: int) -> di
     for turn in range(repeats + 1):
         for name in [each for each in jobs if each not in failed]:
             try:
-                jobs[name]()  # the other's tables are in the caches
+                jobs[name]()  # fills the caches, which hold the other's tables
                 for _ in range(STEPS if name == "ours" else 1):
-                    own = common.measure(jobs[name], 1, warm_up=0)["median"]
-                    if turn:  # the first one compiles
-                        taken[name].append(own)
-            except Exception as error:  # torch.compile needs a compiler, may not know an operation
+                    seconds = common.measure(jobs[name], 1, warm_up=0)["median"]
+                    if turn:  # the first turn compiles
+                        taken[name].append(seconds)
+            except Exception as error:  # no C compiler, or an unsupported operation
                 failed[name] = f"{type(error).__name__}: {error}"[:300]
-    seconds = {name: common.spread(own) for name, own in taken.items() if name not in failed}
-    rates = {name: counts[name] / own["median"] for name, own in seconds.items()}
+    seconds = {name: common.spread(values) for name, values in taken.items() if name not in failed}
+    rates = {name: counts[name] / each["median"] for name, each in seconds.items()}
     times = {
         f"times_{name}": rates["ours"] / rates[name]
         for name in ("eager", "compile")
@@ -259,7 +262,7 @@ def time_to_psnr(
     every: float,
     goals: tuple[int, ...] = GOALS,
 ) -> dict[str, object]:
-    """Seconds until the held-out photos reach `goals`; the whole curve beside them."""
+    """Fit a capture; return the seconds to reach each PSNR of `goals` (dB), and the curve."""
     scene = read_scene(capture)
     start = time.perf_counter()
     fitting = begin(scene, settings, downscale)
@@ -287,7 +290,7 @@ def time_to_psnr(
 def reached(
     curve: list[dict[str, float]], goals: tuple[int, ...] = GOALS
 ) -> dict[str, float | None]:
-    """Seconds until each of the goals; None: not reached."""
+    """Return the seconds to reach each goal; None if it was not reached."""
     return {
         str(goal): next((at["seconds"] for at in curve if at["psnr"] >= goal), None)
         for goal in goals
@@ -295,7 +298,7 @@ def reached(
 
 
 def peer_time_to_psnr(python: str, capture: Path, minutes: float, rays: int, seed: int) -> dict:
-    """The same of nerfacto, in the environment of that interpreter."""
+    """Run `peer_nerfacto.py` with another interpreter; return its times and curve."""
     script = Path(__file__).with_name("peer_nerfacto.py")
     words = [capture, "--minutes", minutes, "--rays", rays, "--seed", seed]
     done = subprocess.run(
@@ -314,14 +317,14 @@ def main() -> None:
     parser.add_argument("--size", default="480x270")
     parser.add_argument("--path", default="still")
     parser.add_argument(
-        "--capture", type=Path, help="fitted for `time_to_psnr`; default: not asked"
+        "--capture", type=Path, help="capture to fit for `time_to_psnr`; default: none"
     )
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--every", type=float, default=5.0, help="seconds between measurements")
-    parser.add_argument("--peer", help="the Python of an environment with nerfstudio")
+    parser.add_argument("--peer", help="Python interpreter of an environment with nerfstudio")
     parser.add_argument("--peer-minutes", type=float, default=10.0)
-    parser.add_argument("--peer-rays", type=int, default=1024, help="a step")
+    parser.add_argument("--peer-rays", type=int, default=1024, help="rays per step")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     scene = load_scene(options.run)

@@ -1,12 +1,12 @@
-"""How good is a fit after so many minutes?
+"""Measure held-out quality after fits of bounded duration.
 
 python benchmarks/fit_quality.py --minutes 5 --captures fox ditch stone_sign kitti_drive
 python benchmarks/fit_quality.py --minutes 5 15 --captures fox --seed 1
 
-Captures are names in ../shared/data or folders, fitted at their stored size by the command line in
-a process of their own. Held-out PSNR, SSIM and colour-corrected PSNR, as `fit` measures them; and
-PSNR in the mean appearance of all photos instead of that of those nearby. With `--holdout NAME` one
-photo is held out instead of every eighth.
+Captures are names in ../shared/data or folders. Each is fitted at its stored size by the command
+line in a process of its own. Each row gives held-out PSNR, SSIM and colour-corrected PSNR as `fit`
+measures them, and PSNR in the mean appearance of all photos instead of that of nearby photos. With
+`--holdout NAME` one photo is held out instead of every eighth.
 """
 
 import argparse
@@ -25,7 +25,7 @@ KEYS = ("psnr", "psnr_cc", "ssim", "seconds", "steps", "samples")
 
 
 def in_mean_appearance(run: Path, downscale: int) -> float:
-    """PSNR over the held-out photos, all shown in the fitted photos' mean exposure and light."""
+    """Return the PSNR over the held-out photos in the mean appearance of the fitted photos, dB."""
     field, scene = load_field(run), load_scene(run)
     return evaluate(field, scene, downscale, lambda done, of: None, nearby=False)["psnr"]
 
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--holdout", help="photo to hold out; default: every eighth")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--keep", type=Path, help="folder for the runs; default: thrown away")
+    parser.add_argument("--keep", type=Path, help="folder for the runs; default: deleted")
     options = parser.parse_args()
     rows = []
     with tempfile.TemporaryDirectory() as temporary:

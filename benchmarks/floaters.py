@@ -1,12 +1,12 @@
-"""Where a fit of the reference street loses light in clear air, and how few photos look there.
+"""Show where a fit of the reference street has density in free space, by photo coverage.
 
 python benchmarks/floaters.py RUN
 
-Floaters (`floater_mass` in reports) of the test views' pixels, shared out by how many of the fitted
-photos show the place that a pixel truly shows, by whether a pixel beside it shows what is nearer,
-by distance, and by how much of its own light a pixel loses: haze takes a little of many, a surface
-in the wrong place all of some. What hardly any photo shows has a depth that no photo can tell: only
-a prior could. Needs `pip install ".[street]"`.
+The mass of floaters (`floater_mass` in reports) of the test views' pixels is divided by four
+criteria: the number of fitted photos that show the pixel's true surface point; whether a
+neighbouring pixel shows a nearer surface; distance; and the fraction of light that the pixel loses.
+Haze absorbs little in many pixels, a misplaced surface all light of a few. Depth that hardly any
+photo shows can only come from a prior. Needs `pip install ".[street]"`.
 """
 
 import argparse
@@ -28,14 +28,14 @@ from climatenerf.scene import load_scene
 from climatenerf.scene.scene import Scene
 
 ROOT = Path(__file__).resolve().parents[1]
-SAME = 0.02  # of the distance: a photo shows a place that lies in the range of its 3x3 pixels there
-PHOTOS = (0, 1, 2, 3, 5, 9, 17)  # from so many photos on
-METRES = (0, 20, 60)
-LOST = (0, 0.1, 0.7)
+DEPTH_TOLERANCE = 0.02  # relative; a photo shows a point within the depths of 3x3 pixels there
+PHOTOS = (0, 1, 2, 3, 5, 9, 17)  # lower edges of the bins: number of photos,
+METRES = (0, 20, 60)  # distance, m,
+ABSORBED = (0, 0.1, 0.7)  # fraction of light
 
 
 def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
-    """Traced ray lengths (m) of every fitted photo's pixels; +inf in the sky."""
+    """Trace the ray lengths (m) of every fitted photo's pixels; +inf in the sky."""
     import mitsuba as mi
 
     sys.path.insert(0, str(ROOT))
@@ -44,11 +44,11 @@ def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
 
     with tempfile.TemporaryDirectory() as meshes:
         street = load(build_scene(), Path(meshes), threads=2)
-        asked = mi.load_dict({"type": "aov", "aovs": "t:depth"})
+        depth_aov = mi.load_dict({"type": "aov", "aovs": "t:depth"})
         found = []
         for view in scene.of_split("train"):
             camera = scene.cameras[view.camera]
-            seen = render_view(street, view.c2w, camera.width, camera.height, 1, 0, asked)
+            seen = render_view(street, view.c2w, camera.width, camera.height, 1, 0, depth_aov)
             depth = np.asarray(seen)[..., -1]
             found.append(np.where(depth > 0, depth, np.inf))
     return found
@@ -57,29 +57,30 @@ def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
 def times_shown(
     x: Float[np.ndarray, "n 3"], scene: Scene, depths: list[Float[np.ndarray, "h w"]]
 ) -> Int[np.ndarray, "n"]:
-    """How many fitted photos show places (world m)."""
+    """Count the fitted photos that show each point (world m)."""
     count = np.zeros(len(x), int)
     for view, depth in zip(scene.of_split("train"), depths, strict=True):
         camera = scene.cameras[view.camera]
         local = (x - view.c2w[:3, 3]) @ view.c2w[:3, :3]
         ahead = np.flatnonzero(local[:, 2] > 0)
-        place = np.floor(camera.project(local[ahead])).astype(int)
-        inside = ((place >= 0) & (place < (camera.width, camera.height))).all(-1)
-        ahead, (column, row) = ahead[inside], place[inside].T
-        way = np.linalg.norm(local[ahead], axis=-1)
+        pixel = np.floor(camera.project(local[ahead])).astype(int)
+        inside = ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(-1)
+        ahead, (column, row) = ahead[inside], pixel[inside].T
+        distance = np.linalg.norm(local[ahead], axis=-1)
         farthest = maximum_filter(np.where(np.isinf(depth), 0.0, depth), 3)
-        least, most = minimum_filter(depth, 3)[row, column], farthest[row, column]
-        count[ahead] += (way > (1 - SAME) * least) & (way < (1 + SAME) * most)
+        near, far = minimum_filter(depth, 3)[row, column], farthest[row, column]
+        near, far = (1 - DEPTH_TOLERANCE) * near, (1 + DEPTH_TOLERANCE) * far
+        count[ahead] += (distance > near) & (distance < far)
     return count
 
 
-def shares(lost: Float[np.ndarray, "n"], which: Bool[np.ndarray, "n"]) -> dict[str, float]:
-    """The share of pixels that these are, and their part in the mean of all."""
-    return {"pixels": float(which.mean()), "floaters": float(lost[which].sum() / len(lost))}
+def contribution(absorbed: Float[np.ndarray, "n"], mask: Bool[np.ndarray, "n"]) -> dict[str, float]:
+    """Return the fraction of pixels in a mask, and their contribution to the mean of all."""
+    return {"pixels": float(mask.mean()), "floaters": float(absorbed[mask].sum() / len(absorbed))}
 
 
 def main() -> None:
-    """Renders the test views and prints the shares."""
+    """Render the test views and print the contributions."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     options = parser.parse_args()
@@ -90,35 +91,37 @@ def main() -> None:
     )
     check_views(run.scene, run.reference)
     photos = depths_of_photos(run.scene)
-    lost, shown, edge, way = [], [], [], []
+    absorbed, shown, edge, distance = [], [], [], []
     for truth in run.reference.truths:
         free = torch.from_numpy(geometry.free_space(truth).astype(np.float32).ravel())
         passed = (
             transmittance_to(run.field, *run.camera(truth), free).view(truth.depth.shape).numpy()
         )
         solid = ~truth.sky
-        lost.append(1 - passed[solid])
+        absorbed.append(1 - passed[solid])
         shown.append(times_shown(truth.points[solid], run.scene, photos))
         edge.append(geometry.occluded_edges(truth)[solid])
-        way.append(truth.depth[solid])
-    lost, shown, edge, way = (np.concatenate(each) for each in (lost, shown, edge, way))
-    everything = np.ones(len(lost), bool)
+        distance.append(truth.depth[solid])
+    absorbed, shown, edge, distance = (
+        np.concatenate(each) for each in (absorbed, shown, edge, distance)
+    )
+    everything = np.ones(len(absorbed), bool)
     common.report(
-        "floaters by how well the photos show the place",
+        "density in free space by photo coverage",
         {
-            "all": shares(lost, everything),
-            "edges": shares(lost, edge),
+            "all": contribution(absorbed, everything),
+            "edges": contribution(absorbed, edge),
             "photos": {
-                f"{least} to {most - 1}": shares(lost, (shown >= least) & (shown < most))
-                for least, most in zip(PHOTOS, (*PHOTOS[1:], len(photos) + 1), strict=True)
+                f"{low} to {high - 1}": contribution(absorbed, (shown >= low) & (shown < high))
+                for low, high in zip(PHOTOS, (*PHOTOS[1:], len(photos) + 1), strict=True)
             },
             "metres": {
-                f"from {least}": shares(lost, (way >= least) & (way < most))
-                for least, most in zip(METRES, (*METRES[1:], np.inf), strict=True)
+                f"from {low}": contribution(absorbed, (distance >= low) & (distance < high))
+                for low, high in zip(METRES, (*METRES[1:], np.inf), strict=True)
             },
-            "lost": {
-                f"from {least}": shares(lost, (lost >= least) & (lost < most))
-                for least, most in zip(LOST, (*LOST[1:], np.inf), strict=True)
+            "absorbed": {
+                f"from {low}": contribution(absorbed, (absorbed >= low) & (absorbed < high))
+                for low, high in zip(ABSORBED, (*ABSORBED[1:], np.inf), strict=True)
             },
         },
         0,

@@ -1,12 +1,13 @@
-"""How long does a frame take: clean, with water on about 40 % of it, in smog, under snow?
+"""Time a frame: clean, with water on about 40 % of it, in smog, under snow.
 
 python benchmarks/frame_time.py RUN
 python benchmarks/frame_time.py RUN --size 480x270 --path still --repeats 5
 python benchmarks/frame_time.py RUN --sizes 240x135 480x270 960x540 1920x1080
 
-The flood's level is searched for (on a small picture) so that water shows on 35 to 45 % of the
-frame; the share reached is reported. Preparing (light, waves, snowfall) is timed once, apart.
-With --sizes a clean frame of each, and the exponent of its seconds over its pixels (1: linear).
+The flood's level is chosen on a small picture so that water covers 35 to 45 % of the frame; the
+coverage reached is reported. The preparation (light, waves, snowfall) is timed once, separately.
+With --sizes a clean frame of each size is timed, and the exponent of seconds over pixels reported
+(1 is linear).
 """
 
 import argparse
@@ -31,12 +32,12 @@ from climatenerf.weather.world import World
 
 
 def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:
-    """Level over the datum at which about `wanted` of the frame shows water, by its depth layer."""
+    """Return the level above the datum (m) at which water covers about `wanted` of the frame."""
     camera, c2w = path.cameras[0].resized(120, 68), path.c2w[0]
     _, layers = render_frame(World(field), camera, c2w)
     direction = camera.directions() @ c2w[:3, :3].T
     eye = c2w[2, 3]
-    # A pixel is wet once the level is above its surface, or above the horizon's foot for sky.
+    # A pixel is wet if the level is above its surface; sky below the horizon lies at 1000 km.
     height = eye + np.where(np.isfinite(layers["depth"]), layers["depth"], 1e6) * direction[..., 2]
     height = np.where(direction[..., 2] < 0, height, np.inf)
     return float(min(np.quantile(height, wanted), eye - 0.05)) - scene.ground_z
@@ -48,7 +49,7 @@ WEATHERS = ("clean", "flood", "smog", "snow")
 def frames(
     run: Path, size: str, view: str, repeats: int, seed: int, wanted: tuple[str, ...] = WEATHERS
 ) -> dict[str, Any]:
-    """Seconds of one view of a run in each weather; the first frame of the camera path `view`."""
+    """Time the first frame of the camera path `view` in each weather."""
     field, scene = load_field(run), load_scene(run)
     path = camera_path(view, scene, 1, parse_size(size))
     level = water_level(field, scene, path)
@@ -82,7 +83,7 @@ def frames(
 
 
 def growth(run: Path, sizes: list[str], view: str, repeats: int) -> dict[str, Any]:
-    """Seconds of a clean frame in several sizes, and the exponent of pixels that fits them best."""
+    """Time a clean frame in several sizes; fit the exponent of the number of pixels."""
     field, scene = load_field(run), load_scene(run)
     world = World(field)
     rows = []

@@ -1,4 +1,4 @@
-"""Makes the contact sheets of docs/gallery from fitted runs.
+"""Make the contact sheets of docs/gallery from fitted runs.
 
 python benchmarks/gallery.py street RUN
 python benchmarks/gallery.py ditch RUN --level "-1.5 m" --visibility "60 m" --snow "15 cm"
@@ -6,10 +6,10 @@ python benchmarks/gallery.py ditch RUN --level "-1.5 m" --visibility "60 m" --sn
 python benchmarks/gallery.py ditch RUN --surfaces
 python benchmarks/gallery.py street-busy RUN --passers-by
 
-A sheet NAME.jpg of at most 150 KB, marked as simulated: rows clean, flood, smog, snow and all at
-once, columns along the camera path. With --surfaces NAME-surfaces.jpg: colours, depth, normals and
-classes of held-out views. With --passers-by NAME-passers-by.jpg: fitted photos of which most was
-masked, what was in red, and the field from there.
+Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
+smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
+shows colours, depth, normals and classes of held-out views. With --passers-by, NAME-passers-by.jpg
+shows the most masked photos, the mask in red, and the field from the same cameras.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from climatenerf.training.folder import OPTIMISER
 from climatenerf.training.transients import MASKED, TransientMasks
 from climatenerf.weather.world import World
 
-# Road, building, vegetation, terrain, sky, person, vehicle, as Cityscapes paints them.
+# Cityscapes' colours of road, building, vegetation, terrain, sky, person and vehicle.
 PAINT = np.zeros((256, 3), np.uint8)
 PAINT[:7] = [[128, 64, 128], [70, 70, 70], [107, 142, 35], [152, 251, 152], [70, 130, 180],
              [220, 20, 60], [0, 0, 142]]  # fmt: skip
@@ -43,7 +43,7 @@ Rows = list[tuple[str, list[np.ndarray]]]
 
 
 def weathers(run: Path, options: argparse.Namespace) -> Rows:
-    """Frames along the path in each weather, by the command line."""
+    """Render frames along the path in each weather with the command line."""
     flood = ["--flood.level", options.level]
     smog = ["--smog.visibility", options.visibility]
     snow = ["--snow.depth", options.snow]
@@ -62,7 +62,7 @@ def weathers(run: Path, options: argparse.Namespace) -> Rows:
 
 
 def surfaces(run: Path, columns: int) -> Rows:
-    """Held-out views as the field has them: colours, inverse depth, normals and classes."""
+    """Render colours, inverse depth, normals and classes of held-out views."""
     field, scene = load_field(run), load_scene(run)
     views = scene.of_split("heldout") or scene.of_split("train")
     chosen = np.unique(np.linspace(0, len(views) - 1, columns).round().astype(int))
@@ -83,20 +83,20 @@ def surfaces(run: Path, columns: int) -> Rows:
 
 
 def passers_by(run: Path, columns: int) -> Rows:
-    """Some of the dozen most masked photos, the same with the mask, the field in their light."""
+    """Show some of the twelve most masked photos, their masks, and renders in their appearance."""
     field, scene = load_field(run), load_scene(run)
     views, state = scene.of_split("train"), read_safetensors(run / OPTIMISER)[0]
     masks = TransientMasks(len(views))
-    own = {key.removeprefix("masks."): value for key, value in state.items() if "masks." in key}
-    masks.load_state_dict({key: torch.as_tensor(value) for key, value in own.items()})
+    weights = {key.removeprefix("masks."): value for key, value in state.items() if "masks." in key}
+    masks.load_state_dict({key: torch.as_tensor(value) for key, value in weights.items()})
     most = np.argsort(-masks.shares().numpy())[:12]
     rows: Rows = [("photo", []), ("masked", []), ("field", [])]
     for i in np.sort(most)[:: max(1, 12 // columns)][:columns]:
         view, photo = views[i], load_image(views[i], scene)
         y, x = ((np.arange(side) + 0.5) / side for side in photo.shape[:2])
-        place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
+        position = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
         with torch.no_grad():
-            mask = masks(torch.full((len(place),), int(i)), torch.from_numpy(place)) > MASKED
+            mask = masks(torch.full((len(position),), int(i)), torch.from_numpy(position)) > MASKED
         marked = photo.copy()
         marked[mask.view(photo.shape[:2]).numpy()] = (220, 20, 60)
         world = World(field, appearance=field.embeddings[[int(i)]].detach())

@@ -1,16 +1,15 @@
-"""What an NVIDIA GPU makes of it: fitting, a capture from nothing, and frames, in one command.
+"""Measure steps, a whole fit and frames on an NVIDIA GPU in one command.
 
 python benchmarks/gpu.py RUN --capture ../shared/data/fox
 
-`step`: million samples a second of one optimiser step on the field of RUN, every sample through
-every head, as in `engine.py`, beside eager PyTorch on the same device. `fit`: the capture from
-nothing: samples a second in practice, and seconds until the held-out photos reach so many dB
-(reading and matching photos are counted, measuring and compiling are not); `waits`: how often a
-step waits for the card there, by PyTorch's own count, and at which lines. `frames`: seconds and
-frames a second of a view of RUN in each size, clean and with water on about 40 % of it, and of
-clean ones the samples a second (those that a march finds before a ray ends). Memory is each part's
-peak on the device.
-`--device cpu` tries the same without a GPU; its figures are the CPU's.
+`step`: million samples per second of one optimiser step on the field of RUN, with every head of
+every sample as in `engine.py`, and the same in eager PyTorch on the same device. `fit`: samples per
+second of a whole fit, and seconds until the held-out photos reach some PSNR; reading photos and
+multi-view stereo are included, evaluation and compilation are not. `waits`: how often a step of
+that fit synchronises with the device, counted by PyTorch, and at which lines. `frames`: seconds per
+frame and frames per second of a view of RUN in each size, clean and with water on about 40 % of it,
+and samples per second of clean frames (samples that marching finds before a ray ends). `peak_gb` is
+each part's peak memory on the device. `--device cpu` measures the same on the CPU.
 """
 
 import argparse
@@ -24,7 +23,7 @@ from typing import Any
 
 import common
 import torch
-from engine import drawn, our_step, time_to_psnr, twin_step
+from engine import draw_batch, our_step, time_to_psnr, twin_step
 from frame_time import frames
 
 from climatenerf.cli.render import parse_size
@@ -43,7 +42,7 @@ WEATHERS = ("clean", "flood")
 
 
 def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
-    """The job, until the device is done with it."""
+    """Return the job followed by a synchronisation with the device."""
 
     def wait() -> None:
         job()
@@ -54,13 +53,13 @@ def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
 
 
 def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
-    """Samples a second of a step, ours and eager PyTorch's, on the same field and rays."""
+    """Measure samples per second of a step, ours and eager PyTorch's, on the same rays."""
     fitting = begin(load_scene(run), FitSettings(seed=seed, multiview_stereo=False), 1)
     fitting.field = load_field(run).requires_grad_()
-    at = drawn(fitting, samples)
+    at = draw_batch(fitting, samples)
     size, found = at.samples.t.shape[0], {}
     makers = {"ours": our_step, "eager": lambda field, at: twin_step(field, at, False)}
-    for name, make in makers.items():  # made one by one: the twin takes our optimiser's buffers
+    for name, make in makers.items():  # one by one: the twin removes our optimiser's buffers
         job = finished(make(fitting.field, at), device)
         seconds = common.measure(job, repeats, warm_up=3)
         found[name] = {"samples_per_s": size / seconds["median"], "seconds": seconds}
@@ -68,7 +67,7 @@ def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict
 
 
 def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> dict[str, Any]:
-    """Frames a second in each size and weather."""
+    """Measure frames per second in each size and weather."""
     rows: dict[str, Any] = {}
     for size in sizes:
         found = frames(run, size, view, repeats, seed, WEATHERS)["frames"]
@@ -83,7 +82,7 @@ def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> di
 
 
 def samples_of_frame(run: Path, size: str, view: str) -> int:
-    """Samples that a clean frame's rays have until they end."""
+    """Count the samples of a clean frame's rays until they end."""
     field = load_field(run)
     path = camera_path(view, load_scene(run), 1, parse_size(size))
     rays_o, rays_d = camera_rays(path.cameras[0], path.c2w[0])
@@ -96,7 +95,7 @@ def samples_of_frame(run: Path, size: str, view: str) -> int:
 
 
 def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300) -> dict[str, Any]:
-    """How often a step of a fit waits for the card, in its last third, and where that is."""
+    """Count synchronisations with the device per step in the last third of a fit, by line."""
     fitting = begin(read_scene(capture), replace(settings, minutes=None, steps=steps), downscale)
     met, ends = [], []
     with warnings.catch_warnings(record=True) as caught:
@@ -107,20 +106,20 @@ def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300
         finally:
             torch.cuda.set_sync_debug_mode("default")
         met = [f"{Path(each.filename).name}:{each.lineno}" for each in caught]
-    late = ends[2 * len(ends) // 3]
-    places = Counter(met[late:]).most_common(10)
-    return {"of_a_step": (ends[-1] - late) / (len(ends) / 3), "places": dict(places)}
+    last_third = ends[2 * len(ends) // 3]
+    lines = Counter(met[last_third:]).most_common(10)
+    return {"per_step": (ends[-1] - last_third) / (len(ends) / 3), "lines": dict(lines)}
 
 
 def measured(part: Callable[[], Any], device: str) -> dict[str, Any]:
-    """What a part finds, and its peak memory on the device; if it fails, the others still run."""
+    """Run a part; return its results and peak device memory, or its failure."""
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
     try:
         found = part()
     except UserError:
         raise
-    except Exception as error:  # too little memory, or a kernel that this driver does not take
+    except Exception as error:  # too little memory, or a kernel that the driver rejects
         return {"failed": f"{type(error).__name__}: {error}"[:300]}
     if device == "cuda":
         found["peak_gb"] = torch.cuda.max_memory_allocated() / 1e9
@@ -130,12 +129,12 @@ def measured(part: Callable[[], Any], device: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--capture", type=Path, help="fitted from nothing; default: not asked")
+    parser.add_argument("--capture", type=Path, help="capture to fit; default: none")
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=3.0)
     parser.add_argument("--every", type=float, default=2.0, help="seconds between measurements")
-    parser.add_argument("--preset", default="gpu", choices=("gpu", "cpu"), help="of the fit")
-    parser.add_argument("--samples", type=int, default=2**20, help="of a step")
+    parser.add_argument("--preset", default="gpu", choices=("gpu", "cpu"), help="preset of the fit")
+    parser.add_argument("--samples", type=int, default=2**20, help="samples per step")
     parser.add_argument("--sizes", nargs="+", default=["1280x720", "1920x1080"])
     parser.add_argument("--path", default="still")
     parser.add_argument("--repeats", type=int, default=7)

@@ -1,15 +1,15 @@
-"""How fast is each kernel, and how much faster than its twin (the same in eager PyTorch)?
+"""Measure the speed of each kernel, and compare it with its eager PyTorch twin and a bound.
 
 python benchmarks/kernels.py
 python benchmarks/kernels.py --samples 131072 --repeats 7
 
-Million samples a second, forward and with backward. Twins that loop over rays in Python get fewer
-samples and fewer repeats; the rate is what counts.
+Rates are million samples per second, forward alone and with backward. Twins that loop over rays in
+Python get fewer samples and fewer repeats.
 
-`bound`: what the machine could do at best. Reads of 64 bits at random places of one level's table,
-multiply-adds of a large matrix product (by PyTorch's library) and bytes of two arrays added to a
-third, each of a value a sample, are measured in the same run; a kernel needs so many of each a
-sample (`NEEDS`), and the slowest of the three bounds it.
+`bound` is the highest rate that the machine allows. Three limits are measured in the same run:
+reads of 64 bits at random rows of one level's table, multiply-adds of a large matrix product (by
+PyTorch's library), and memory traffic of the addition of two arrays. `NEEDS` states how many reads,
+multiply-adds and bytes each kernel needs per sample; the slowest of the three is its bound.
 """
 
 import argparse
@@ -31,7 +31,7 @@ SAMPLES_PER_RAY = 32
 SIZE = PRESETS["cpu"]
 COLOURED = 2 * SIZE.appearance_levels * SIZE.colour_hidden, 3 * SIZE.colour_hidden
 DENSE = (2 * SIZE.geometry_levels + 1) * SIZE.geometry_hidden
-NEEDS = {  # a sample: reads of a table's rows, multiply-adds of what is read and of networks, bytes
+NEEDS = {  # per sample: reads of table rows, multiply-adds, bytes
     "hash encode": (8 * SIZE.appearance_levels, 16 * SIZE.appearance_levels, 12),
     # Every row is read once forward, and read and written backward.
     "hash encode + backward": (24 * SIZE.appearance_levels, 32 * SIZE.appearance_levels, 24),
@@ -39,16 +39,16 @@ NEEDS = {  # a sample: reads of a table's rows, multiply-adds of what is read an
     "march": (8 * SIZE.geometry_levels, 16 * SIZE.geometry_levels + DENSE, 12),
     "density slopes": (8 * SIZE.geometry_levels, 64 * SIZE.geometry_levels + 2 * DENSE, 24),
     "network": (0, sum(COLOURED), 108),
-    # Forward; the hidden layer again, and three products for the gradients of the first layer's
-    # weights and inputs and the second's weights, one for the hidden layer's.
+    # Forward; the hidden layer again; gradients of the first layer's weights and inputs, of the
+    # second layer's weights, and of the hidden layer.
     "network + backward": (0, 4 * COLOURED[0] + 3 * COLOURED[1], 312),
-    # What is given is read, what is asked for written, once each way.
+    # Inputs are read and outputs written once, forward and backward.
     "weights + backward": (0, 0, 20),
     "accumulate + backward": (0, 0, 48),
     "surface + backward": (0, 0, 136),
     "distortion + backward": (0, 0, 28),
     "merge": (0, 0, 24),
-    # Of three values: 8 bytes each forward, 16 backward.
+    # Three values: 8 bytes each forward, 16 backward.
     "radiance + backward": (0, 0, 72),
 }
 
@@ -63,7 +63,7 @@ def read_rows(table, index, out):
 
 
 def bounds(repeats: int, samples: int) -> dict[str, float]:
-    """Reads of table rows, multiply-adds and bytes a second, all cores."""
+    """Measure reads of table rows, multiply-adds and bytes per second with all cores."""
     random, parts = np.random.default_rng(0), torch.get_num_threads()
     table = random.integers(0, 2**40, 2**SIZE.appearance_log2_rows)
     index = random.integers(0, table.shape[0], (parts, 2**20))
@@ -93,19 +93,19 @@ def jobs(n: int, fast: bool) -> dict[str, Callable[[], object]]:
     size = SIZE
     field = Field(size, 10, torch.zeros(3).numpy(), 1.0)
     table, resolutions = field.appearance_grid, field.appearance_resolutions
-    table.grad_buffer = torch.zeros_like(table)  # as the optimiser gives it: spares a copy
+    table.grad_buffer = torch.zeros_like(table)  # as in the optimiser: avoids a copy
     u, offsets = torch.rand(n, 3), packed(n)
     row = torch.arange(n) // SAMPLES_PER_RAY
-    x = torch.rand(2 * size.appearance_levels, n).T.requires_grad_()  # as the encoding leaves it
+    x = torch.rand(2 * size.appearance_levels, n).T.requires_grad_()  # as the encoding
     shared = torch.rand(n // SAMPLES_PER_RAY, size.colour_hidden, requires_grad=True)
     layers = list(zip(field.colour_net[::2], field.colour_net[1::2], strict=True))
     geometry = list(zip(field.geometry_net[::2], field.geometry_net[1::2], strict=True))
     tau = torch.rand(n, requires_grad=True)
-    values = torch.rand(3, n).T.requires_grad_()  # as networks leave them
+    values = torch.rand(3, n).T.requires_grad_()  # memory layout of networks
     t = torch.rand(n // SAMPLES_PER_RAY, SAMPLES_PER_RAY).sort(-1)[0].flatten()
     ds = torch.full((n,), 0.01)
     raw = torch.randn(9, n).T.requires_grad_()
-    goal = torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
+    target = torch.nn.functional.normalize(torch.randn(n, 3), dim=-1)
     q = torch.randn(n, 3)
 
     radiance = activations.radiance if fast else activations.plain_radiance
@@ -117,7 +117,7 @@ def jobs(n: int, fast: bool) -> dict[str, Callable[[], object]]:
             return reference.density(q, field.geometry_grid, field.geometry_resolutions, geometry)
 
     def march() -> torch.Tensor:
-        """Rays through cells that are all full, as long as they have samples enough."""
+        """March rays through occupied cells until they have `SAMPLES_PER_RAY` samples."""
         if fast:
             rays = n // SAMPLES_PER_RAY
             start, end = torch.zeros(rays), torch.full((rays,), SAMPLES_PER_RAY / 256 + 1e-6)
@@ -156,7 +156,7 @@ def jobs(n: int, fast: bool) -> dict[str, Callable[[], object]]:
         "network + backward": lambda: backward(networks.mlp(x, layers, shared, row)),
         "weights + backward": lambda: backward(*sums.render_weights(tau, offsets)),
         "accumulate + backward": lambda: backward(sums.accumulate(tau, values, offsets)),
-        "surface + backward": lambda: backward(*sums.surface(tau.detach(), raw, goal, offsets)),
+        "surface + backward": lambda: backward(*sums.surface(tau.detach(), raw, target, offsets)),
         "distortion + backward": lambda: backward(sums.distortion(tau, t, ds, offsets)),
         "radiance + backward": lambda: backward(radiance(values)),
         "merge": lambda: sums.merge_order(t, offsets, t, offsets),
@@ -187,7 +187,7 @@ def main() -> None:
                 size / best["GB/s"] / 1e3,
             )
             rows[name]["bound Msamples/s"] = 1 / each
-            rows[name]["share of bound"] = rate * each
+            rows[name]["fraction of bound"] = rate * each
     table = torch.randn(2**22)
     gradient = torch.randn(2**22) * (torch.rand(2**22) < 0.1)
     moments = [torch.zeros(2**22).numpy() for _ in range(2)]
@@ -196,8 +196,11 @@ def main() -> None:
         lambda: cpu_optimiser.adam(table.numpy(), gradient.clone().numpy(), *moments, *scalars),
         options.repeats,
     )
-    rows["Adam, a tenth touched"] = {"Mentries/s": 2**22 / adam["median"] / 1e6, "seconds": adam}
-    common.report("speed of the kernels against their twins", rows, seed=0)
+    rows["Adam, a tenth of the rows with gradients"] = {
+        "Mentries/s": 2**22 / adam["median"] / 1e6,
+        "seconds": adam,
+    }
+    common.report("speed of the kernels and their twins", rows, seed=0)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,15 @@
-"""How much memory does fitting take, and how does it grow with the number of photos?
+"""Measure the memory of a fit, and its growth with the number of photos.
 
 python benchmarks/memory.py
 python benchmarks/memory.py --photos 50 100 200 --size 1000x750 --steps 300
 
-The embedded street's photos, enlarged and repeated as often as asked for, each as if it had a
-camera of its own (the worst case); every fit in a process of its own. Peak resident memory in GB
-(10^9 bytes), how much a photo adds, and what its 8-bit pixels are.
+The photos are those of the embedded street, enlarged and repeated, each with a camera of its own
+(the worst case). Every fit runs in a process of its own. Reported are peak resident memory in GB
+(10^9 bytes), the growth per photo, and the size of a photo's 8-bit pixels.
 """
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -27,7 +24,7 @@ STREET = Path(common.__file__).resolve().parents[1] / "src/climatenerf/assets/st
 
 
 def capture(folder: Path, photos: int, width: int, height: int, labels: bool) -> None:
-    """A capture of so many photos in nerfstudio's format."""
+    """Write a capture of some photos in nerfstudio's format."""
     scene = read_scene(STREET)
     (folder / "images").mkdir(parents=True)
     (folder / "labels").mkdir()
@@ -59,15 +56,9 @@ def capture(folder: Path, photos: int, width: int, height: int, labels: bool) ->
 
 
 def peak(scene: Path, run: Path, steps: int) -> float:
-    """Peak resident memory of a fit, bytes."""
-    words = [common.PYTHON, "-m", "climatenerf", "fit", str(scene), "-o", str(run)]
-    words += ["--minutes", "60", "--steps", str(steps), "--metric-input"]
-    child = subprocess.Popen(words, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    if status:
-        sys.exit("the fit failed; what it printed says why")
-    # Linux counts in KiB, macOS in bytes.
-    return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    """Return the peak resident memory of a fit, bytes."""
+    words = ["-m", "climatenerf", "fit", str(scene), "-o", str(run)]
+    return common.peak_bytes([*words, "--minutes", "60", "--steps", str(steps), "--metric-input"])
 
 
 def main() -> None:
@@ -77,10 +68,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--no-labels", action="store_true")
     options = parser.parse_args()
-    asked = parse_size(options.size)
-    if asked is None:
-        parser.error("--size has to be WxH")
-    width, height = asked
+    size = parse_size(options.size)
+    if size is None:
+        parser.error("--size must be WxH")
+    width, height = size
     rows = []
     for photos in options.photos:
         with tempfile.TemporaryDirectory() as temporary:

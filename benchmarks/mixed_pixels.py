@@ -1,14 +1,14 @@
-"""How pure the reference street's pixels are: what a perfect field would score, and what one does.
+"""Measure the effect of mixed pixels on the scores of the reference street.
 
 python benchmarks/mixed_pixels.py --rays 6 --run RUN
 
-The truth of a pixel is that of the ray through its middle; its photo is the mean over its area.
-Pixels of leaves against the sky are both. With `rays` times `rays` rays a pixel this tells which
-share of the true sky pixels is sky over 99 % of its area, which share is so of those with sky all
-around, and how much of the area lies before the surface of the middle: the scores of a field that
-shows the photos' areas rightly. Of a fit of the street, RUN, it tells how many of the pure and of
-the mixed sky pixels are empty, and of the sky pixels of the photos it was fitted to (every eighth).
-Needs `pip install ".[street]"`.
+The ground truth of a pixel is that of its central ray; its photo is the mean over its area. Pixels
+at the edge of leaves and sky contain both. With `rays` times `rays` rays per pixel the script
+computes the scores of a perfect field: the fraction of true sky pixels that are sky over 99 % of
+their area, the same of those with sky neighbours only, and the area in front of the central
+surface. For a fit of the street, RUN, it reports the fraction of empty pixels among the pure and
+the mixed sky pixels, and among the sky pixels of every eighth fitted photo. Needs `pip install
+".[street]"`.
 """
 
 import argparse
@@ -33,26 +33,26 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def depths(scene, pose: Float[np.ndarray, "4 4"], size: tuple[int, int], rays: int):
-    """Ray lengths at random places of each pixel's area, [h, w, rays²]; +inf in the sky."""
+    """Trace ray lengths at random points of each pixel's area, [h, w, rays²]; +inf in the sky."""
     import mitsuba as mi
 
     from tools.reference_street.render import render_view
 
     width, height = size
-    asked = mi.load_dict({"type": "aov", "aovs": "t:depth"})
-    t = render_view(scene, pose, width * rays, height * rays, 1, 0, asked)[..., -1]
+    depth_aov = mi.load_dict({"type": "aov", "aovs": "t:depth"})
+    t = render_view(scene, pose, width * rays, height * rays, 1, 0, depth_aov)[..., -1]
     t = np.where(t > 0, t, np.inf).reshape(height, rays, width, rays)
     return t.transpose(0, 2, 1, 3).reshape(height, width, rays * rays)
 
 
 def transmittance(fitted, camera, c2w) -> Float[np.ndarray, "h w"]:
-    """Of the whole ray of each pixel of a view."""
+    """Return the transmittance of the whole ray of each pixel of a view."""
     endless = torch.full((camera.width * camera.height,), 1e9)
     return transmittance_to(fitted, camera, c2w, endless).view(camera.height, camera.width).numpy()
 
 
 def run_scores(folder: Path, truths, pure: list[np.ndarray]) -> dict[str, float]:
-    """Shares of a fit's sky pixels that are empty; `pure` are those that are all sky."""
+    """Return the fractions of empty sky pixels of a fit; `pure` marks pixels that are all sky."""
     reference = read_reference(ROOT / "reference" / "street")
     run = EvaluatedRun(load_field(folder), load_scene(folder), reference)
     check_views(run.scene, run.reference)
@@ -74,7 +74,7 @@ def run_scores(folder: Path, truths, pure: list[np.ndarray]) -> dict[str, float]
 
 
 def main() -> None:
-    """Traces the test views and prints the scores of a perfect field, and of a run."""
+    """Trace the test views; print the scores of a perfect field, and of a run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rays", type=int, default=6)
     parser.add_argument("--run", type=Path, help="a fit of the reference street")
@@ -96,7 +96,7 @@ def main() -> None:
     found = {"perfect": emptiness_scores(absorbed, skyward, truths)}
     if options.run:
         found["run"] = run_scores(options.run, truths, [s > EMPTY for s in skyward])
-    common.report("how pure pixels are", found)
+    common.report("effect of mixed pixels", found)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What relative depth is good for where nothing else tells of depth: the paper's ablation of it.
+"""Measure the effect of relative depth without other depth supervision: the paper's ablation.
 
 python benchmarks/monocular.py --minutes 4 --keep runs/monocular
 
-A capture like the reference street, half the size, with a depth as networks give it: the true
-inverse z-depth of each photo times and plus numbers of its own, blurred, and off by smooth errors
-of a tenth. (Weights of a network are not part of the project.) Fitted without sparse points and
-without the ground that they show, with and without that depth; holes in the ground, depth and
-normals are measured against the truth. Needs `pip install ".[street]"`.
+The capture is the reference street with a simulated network's depth: the true inverse z-depth of
+each photo with a random scale and offset, blurred, and with smooth relative errors of a tenth. (The
+project has no network weights.) It is fitted at half size without sparse points and ground height,
+with and without that depth. Ground holes, depth and normals are scored against the truth. Needs
+`pip install ".[street]"`.
 """
 
 import argparse
@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "reference" / "street"
 WIDTH, HEIGHT = 192, 108
 BLUR = 1.5  # pixels
-ERROR, ERROR_WIDTH = 0.1, 24.0  # share of the inverse depth; pixels over which it changes
+ERROR, ERROR_WIDTH = 0.1, 24.0  # relative to the inverse depth; width of the errors, pixels
 ROWS = {
     "no depth": Losses(sparse_depth=0.0, ground_height=0.0, monocular_depth=0.0),
     "relative depth": Losses(sparse_depth=0.0, ground_height=0.0),
@@ -42,7 +42,7 @@ ROWS = {
 
 
 def inverse_z(scene, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w"]:
-    """True inverse z-depth through the pixels' middles; 0 in the sky."""
+    """Trace the true inverse z-depth, 1/m, through the pixel centres; 0 in the sky."""
     import mitsuba as mi
 
     from tools.reference_street.truth import pixel_rays
@@ -50,24 +50,24 @@ def inverse_z(scene, pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "h w"]
     rays = pixel_rays(pose, WIDTH, HEIGHT)
     out = np.zeros((HEIGHT, WIDTH))
     start = mi.Point3f(*pose[:3, 3])
-    for place in np.ndindex(HEIGHT, WIDTH):
-        hit = scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*rays[place])))
+    for pixel in np.ndindex(HEIGHT, WIDTH):
+        hit = scene.ray_intersect_preliminary(mi.Ray3f(start, mi.Vector3f(*rays[pixel])))
         if hit.is_valid():
-            out[place] = 1 / (float(hit.t) * float(rays[place] @ pose[:3, 2]))
+            out[pixel] = 1 / (float(hit.t) * float(rays[pixel] @ pose[:3, 2]))
     return out
 
 
-def as_networks_give_it(
+def simulate_network(
     inverse: Float[np.ndarray, "h w"], random: np.random.Generator
 ) -> Float[np.ndarray, "h w"]:
-    """Blurred, with smooth errors, in a scale of the photo's own."""
+    """Blur an inverse depth; add smooth errors and a random scale and offset."""
     wave = gaussian_filter(random.normal(size=inverse.shape), ERROR_WIDTH)
     seen = gaussian_filter(inverse * (1 + ERROR * wave / wave.std()), BLUR)
     return random.uniform(2.0, 20.0) * seen + random.uniform(0.0, 0.5)
 
 
 def make_capture(folder: Path, seed: int) -> None:
-    """The reference street's photos, labels and points, and relative depths."""
+    """Copy the reference street's photos, labels and points, and write relative depths."""
     sys.path.insert(0, str(ROOT))
     from tools.reference_street.layout import build_scene, camera_poses
     from tools.reference_street.render import load
@@ -81,9 +81,9 @@ def make_capture(folder: Path, seed: int) -> None:
     with tempfile.TemporaryDirectory() as meshes:
         scene = load(build_scene(), Path(meshes))
         for name, pose in camera_poses():
-            given = as_networks_give_it(inverse_z(scene, pose), random).astype(np.float32)
+            relative = simulate_network(inverse_z(scene, pose), random).astype(np.float32)
             path = folder / "depth_relative" / f"{Path(name).stem}.npz"
-            np.savez_compressed(path, inverse_depth=given)
+            np.savez_compressed(path, inverse_depth=relative)
 
 
 def main() -> None:

@@ -1,11 +1,11 @@
-"""Which normals are right, and at which size of picture: predicted ones, planes, or slopes.
+"""Compare three kinds of normals at several picture sizes: predicted, planes, density gradient.
 
 python benchmarks/normals.py RUN
 
-RUN is a fit of the reference street. Its test views are seen at their size and at odd parts of it,
-so that the middles of pixels stay where the truth is known. Median angles off, without vegetation:
-of the normals that the field predicts, of planes fitted to the depth picture (which stand in where
-none were learned), and of the density's own slope.
+RUN is a fit of the reference street. Its test views are rendered at full size and at odd fractions
+of it, so that pixel centres coincide with those of the truth. Reported are the median angles
+without vegetation of the normals that the field predicts, of planes fitted to the depth picture
+(used for fields without predicted normals), and of the density's gradient.
 """
 
 import argparse
@@ -25,33 +25,33 @@ from climatenerf.studies.ablation import density_normals
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 
 
-def thinned(truth: Truth, camera: Camera, part: int) -> tuple[Truth, Camera]:
-    """Each `part`th pixel of a view, and the camera that sees those alone."""
+def subsampled(truth: Truth, camera: Camera, part: int) -> tuple[Truth, Camera]:
+    """Return every `part`th pixel of a view, and the camera with these pixels."""
     height, width = truth.depth.shape[0] // part, truth.depth.shape[1] // part
 
-    def some(pixels: np.ndarray) -> np.ndarray:
+    def subset(pixels: np.ndarray) -> np.ndarray:
         return pixels[part // 2 :: part, part // 2 :: part][:height, :width]
 
     small = replace(camera, width=width * part, height=height * part).resized(width, height)
-    own = replace(
-        truth, depth=some(truth.depth), normal=some(truth.normal), label=some(truth.label)
+    subset_truth = replace(
+        truth, depth=subset(truth.depth), normal=subset(truth.normal), label=subset(truth.label)
     )
-    return own, small
+    return subset_truth, small
 
 
 def main() -> None:
-    """Sees the test views at each size and prints the medians."""
+    """Render the test views at each size and print the medians."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--parts", type=int, nargs="+", default=[1, 3, 5, 9], help="odd numbers")
     options = parser.parse_args()
     if any(part % 2 == 0 for part in options.parts):
-        parser.error("--parts are odd: else a small pixel's middle is the middle of no true one")
+        parser.error("--parts must be odd, so that centres of small and full-size pixels coincide")
     reference = read_reference(REFERENCE)
     run = EvaluatedRun(load_field(options.run), load_scene(options.run), reference)
     check_views(run.scene, run.reference)
     if not run.field.knows_normals:
-        parser.error(f"{options.run} has learned no normals")
+        parser.error(f"{options.run} has no predicted normals; fit with labels")
     found = {}
     for part in options.parts:
         angles = {}
@@ -60,16 +60,16 @@ def main() -> None:
             truths, normals = [], []
             for truth in run.reference.truths:
                 camera, c2w = run.camera(truth)
-                own, small = thinned(truth, camera, part)
-                dry = render_clean(run.field, small, c2w)
-                sloped = kind == "slope"
+                small_truth, small = subsampled(truth, camera, part)
+                view = render_clean(run.field, small, c2w)
+                from_density = kind == "slope"
                 normals.append(
-                    density_normals(run.field, dry) if sloped else dry.normal @ c2w[:3, :3]
+                    density_normals(run.field, view) if from_density else view.normal @ c2w[:3, :3]
                 )
-                truths.append(own)
+                truths.append(small_truth)
             angles[kind] = geometry.normal_scores(normals, tuple(truths))
         found[f"{truths[0].depth.shape[1]}x{truths[0].depth.shape[0]}"] = angles
-    common.report("normals by size of picture", found)
+    common.report("normals by picture size", found)
 
 
 if __name__ == "__main__":

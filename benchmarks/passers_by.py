@@ -1,11 +1,11 @@
-"""What of the people who pass through a capture is masked, and what else is.
+"""Measure how well transient masks cover people who pass through a capture.
 
 python benchmarks/passers_by.py --steps 3000 --rows named unnamed quiet
 
-Fits the reference street with people in 24 of its photos, once with labels that name them and once
-with labels that leave them open, and the street that nobody passes. Of the pixels that truly show
-people the share that is masked, of all others the share that is too, and how well the held-out
-photos are met, in which nobody is.
+Three fits of the reference street: with people in 24 photos and labels of them ("named"), with the
+same photos but without these labels ("unnamed"), and without people ("quiet"). Reported are the
+masked fractions of the pixels that show people and of all others, and the quality of the held-out
+photos, which show no people.
 """
 
 import argparse
@@ -34,7 +34,7 @@ ROWS = ("named", "unnamed", "quiet")
 
 
 def without_people(scene: Scene, folder: Path) -> Scene:
-    """The scene with labels, written into `folder`, that leave open what is a person."""
+    """Return the scene with labels, written to `folder`, in which people are unknown."""
     views = []
     for index, view in enumerate(scene.views):
         labels = load_labels(view, scene)
@@ -47,13 +47,13 @@ def without_people(scene: Scene, folder: Path) -> Scene:
 
 
 def people(scene: Scene) -> list[Bool[np.ndarray, "h w"]]:
-    """The pixels of each fitted photo that show people; all photos have labels."""
+    """Return the pixels of each fitted photo that show people."""
     labels = (load_labels(view, scene) for view in scene.of_split("train"))
     return [np.equal(MERGED[each], PERSON) for each in labels]
 
 
 def fit(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
-    """A fit of the scene, as `climatenerf fit` makes it."""
+    """Fit a scene like `climatenerf fit`."""
     fitting = begin(scene, settings, downscale)
     fitting.run(lambda _: None)
     fitting.field.occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
@@ -61,16 +61,18 @@ def fit(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
 
 
 def masked(fitting: Fitting, image: int, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """What is masked in a photo, at the middles of its pixels."""
+    """Evaluate the mask of a photo at its pixel centres."""
     y, x = ((np.arange(side) + 0.5) / side for side in shape)
-    place = torch.tensor(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), dtype=torch.float32)
+    position = torch.tensor(
+        np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), dtype=torch.float32
+    )
     with torch.no_grad():
-        found = fitting.masks(torch.full((len(place),), image), place) > MASKED
+        found = fitting.masks(torch.full((len(position),), image), position) > MASKED
     return found.view(shape).numpy()
 
 
 def main() -> None:
-    """Makes the fits asked for, and prints what each masked."""
+    """Make the fits and print what each masked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--downscale", type=int, default=1)
@@ -95,7 +97,7 @@ def main() -> None:
                 "psnr": scores["psnr"],
                 "psnr_cc": scores["psnr_cc"],
             }
-    question = f"what is masked after {options.steps} steps at 1/{options.downscale}"
+    question = f"transient masks after {options.steps} steps at 1/{options.downscale}"
     common.report(question, found, options.seed)
 
 

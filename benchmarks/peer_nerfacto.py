@@ -1,13 +1,14 @@
-"""How soon nerfstudio's nerfacto reaches some PSNR on a CPU, for `engine.py --peer`.
+"""Measure the PSNR of nerfstudio's nerfacto over time on a CPU, for `engine.py --peer`.
 
-It needs an environment of its own, since nerfstudio pins other versions:
+nerfstudio pins other versions, so the script needs an environment of its own:
 
 python -m venv peer && peer/bin/pip install torch==2.13.0 torchvision nerfstudio==1.1.5
 peer/bin/python benchmarks/peer_nerfacto.py ../shared/data/fox --minutes 10 --rays 1024
 
-The photos with a `transforms.json`, every eighth by name held out, as `climatenerf fit` does; the
-method's own settings but for the number of rays and fixed cameras. Printed, as JSON: seconds of
-training and PSNR of some thousand pixels drawn from the held-out photos, at each look.
+The capture has a `transforms.json`; every eighth photo by name is held out, as in `climatenerf
+fit`. The settings are the method's own except for the number of rays and fixed cameras. Prints
+JSON: seconds of training and PSNR of some thousand pixels of the held-out photos, at each
+measurement.
 """
 
 import argparse
@@ -24,8 +25,8 @@ import torch
 try:
     import torchvision  # noqa: F401
 except RuntimeError:
-    # A torchvision for CUDA beside a PyTorch for the CPU lacks its operators. Nothing here calls
-    # them, but it will not be imported without knowing of these two.
+    # A CUDA build of torchvision lacks its operators beside a CPU build of PyTorch. They are not
+    # called here, but its import requires that these two are registered.
     OPERATORS = torch.library.Library("torchvision", "DEF")
     OPERATORS.define("nms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
     OPERATORS.define("qnms(Tensor boxes, Tensor scores, float threshold) -> Tensor")
@@ -42,42 +43,42 @@ from nerfstudio.engine.optimizers import Optimizers  # noqa: E402
 from torch.amp import GradScaler  # noqa: E402
 from torchmetrics.image import lpip  # noqa: E402
 
-LOOKS = 4096  # held-out pixels
+HELDOUT_PIXELS = 4096
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--minutes", type=float, default=10.0, help="of training")
-    parser.add_argument("--rays", type=int, default=4096, help="a step; the method's own: 4096")
+    parser.add_argument("--rays", type=int, default=4096, help="per step; nerfacto has 4096")
     parser.add_argument("--every", type=float, default=30.0, help="seconds between measurements")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    out, sys.stdout = sys.stdout, sys.stderr  # it prints much
+    out, sys.stdout = sys.stdout, sys.stderr  # nerfstudio prints to standard output
     with tempfile.TemporaryDirectory() as folder:
-        answer = fitted(present(options.capture, Path(folder)), options)
+        answer = fitted(existing_poses(options.capture, Path(folder)), options)
     print(json.dumps(answer), file=out)
 
 
-def present(capture: Path, folder: Path) -> Path:
-    """The capture's poses without those of pictures that are not on disk."""
+def existing_poses(capture: Path, folder: Path) -> Path:
+    """Write the capture's poses without those of missing pictures; return the file."""
     poses = json.loads((capture / "transforms.json").read_text())
     for frame in poses["frames"]:
         name = Path(frame["file_path"])
         found = [name, *(name.with_name(name.name + end) for end in (".jpg", ".png"))]
-        there = [path for each in found if (path := capture.resolve() / each).is_file()]
-        frame["file_path"] = str(there[0]) if there else ""
+        existing = [path for each in found if (path := capture.resolve() / each).is_file()]
+        frame["file_path"] = str(existing[0]) if existing else ""
         for key in [key for key in frame if key.endswith("_path") and key != "file_path"]:
-            del frame[key]  # masks and depths are beside the photos, not here
+            del frame[key]  # paths relative to the capture
     poses["frames"] = [frame for frame in poses["frames"] if frame["file_path"]]
     (folder / "transforms.json").write_text(json.dumps(poses))
     return folder / "transforms.json"
 
 
 def fitted(poses: Path, options: argparse.Namespace) -> dict:
-    """Steps, seconds and the curve of PSNR over them."""
+    """Fit; return steps, seconds and the curve of PSNR."""
     torch.manual_seed(options.seed)
-    # A score that is not asked for here; making it fetches a network's weights.
+    # LPIPS is not measured here, and its construction downloads network weights.
     lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: torch.nn.Identity()
     config = method_configs["nerfacto"]
     model = config.pipeline.model
@@ -89,7 +90,7 @@ def fitted(poses: Path, options: argparse.Namespace) -> dict:
     config.pipeline.datamanager = VanillaDataManagerConfig(
         dataparser=parsing,
         train_num_rays_per_batch=options.rays,
-        eval_num_rays_per_batch=LOOKS,
+        eval_num_rays_per_batch=HELDOUT_PIXELS,
     )
     pipeline = config.pipeline.setup(device="cpu", test_mode="val")
     pipeline.train()

@@ -1,9 +1,9 @@
-"""What longer marching steps cost in truth, and what shorter ones cost in time.
+"""Measure quality and time of rendering by the marching step.
 
 python benchmarks/render_step.py RUN --steps 0.5 1 1.5 2
 
-Held-out PSNR and SSIM of a run, as `fit` measures them, when its views are rendered in steps of so
-many times the finest one of a fit, and the seconds that all of its held-out views take.
+A factor of 1 is the finest step of a fit. Reported are the held-out PSNR and SSIM of a run, as
+`fit` measures them, and the seconds that all held-out views take.
 """
 
 import argparse
@@ -20,14 +20,14 @@ from climatenerf.training.run import evaluate
 
 
 def main() -> None:
-    """Renders the held-out views once for each step."""
+    """Render the held-out views once for each step."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--steps", type=float, nargs="+", default=[0.5, 1.0, 1.5, 2.0])
     options = parser.parse_args()
     field, scene = load_field(options.run), load_scene(options.run)
     downscale = json.loads((options.run / "config.json").read_text())["downscale"]
-    evaluate(field, scene, downscale, lambda *_: None)  # compiles, or reads what is compiled
+    evaluate(field, scene, downscale, lambda *_: None)  # compiles or loads the kernels
     found = {}
     for step in options.steps:
         view.RENDER_STEP = step

@@ -1,12 +1,12 @@
-"""How long until something happens: `climatenerf --help`, `fit --help`, imports?
+"""Time the start of the program: `climatenerf --help`, `fit --help`, imports.
 
 python benchmarks/startup.py
 python benchmarks/startup.py --repeats 20
 python benchmarks/startup.py --compile
 
-With --compile instead: seconds of a fit of two steps and of a small frame in all weathers, with no
-compiled kernels on disk and again with them. The difference is what compiling takes, once on a
-machine.
+With --compile instead, a fit of two steps and a small frame in all weathers are timed without
+compiled kernels on disk, and again with them. The difference is the time of compilation, which
+happens once per machine.
 """
 
 import argparse
@@ -34,7 +34,7 @@ COMMANDS = {
 
 
 def compiling() -> dict[str, dict[str, float]]:
-    """Seconds of a fit and of a frame, without and with compiled kernels."""
+    """Time a fit and a frame, without and with compiled kernels."""
     rows: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         run, out = f"{temporary}/run", f"{temporary}/out"
@@ -64,7 +64,7 @@ def main() -> None:
     parser.add_argument("--compile", action="store_true")
     options = parser.parse_args()
     if options.compile:
-        report("seconds of the first run on a machine, and of the next", compiling())
+        report("seconds of the first run on a machine, and of the second", compiling())
         return
 
     def run(words: list[str]) -> None:

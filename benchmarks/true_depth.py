@@ -1,11 +1,11 @@
-"""How much cleaner the air would be if the distance of every surface were known.
+"""Measure floaters of a fit with exact depth supervision.
 
 python benchmarks/true_depth.py --steps 5000 --fits sparse 1 10
 
-Fits the reference street with the sparse points that it has, and with thousands of points a photo
-that lie exactly on what the photo shows, their loss weighted so many times more than usual. What
-these fits still leave in the air is not for want of depth: it is what the field cannot hold, or not
-learn in so many steps. Needs `pip install ".[street]"`.
+Fits the reference street with its own sparse points ("sparse"), and with thousands of exact surface
+points per photo, whose loss has a factor on its usual weight. Floaters that remain in these fits do
+not come from missing depth, but from the field's capacity or the number of steps. Needs
+`pip install ".[street]"`.
 """
 
 import argparse
@@ -28,11 +28,11 @@ from climatenerf.training.settings import FitSettings, Losses
 
 ROOT = Path(__file__).resolve().parents[1]
 REFERENCE = ROOT / "reference" / "street"
-WIDTH, HEIGHT = 768, 432  # of the pixels whose middles are traced
+WIDTH, HEIGHT = 768, 432  # pixels whose centres are traced
 
 
 def with_true_points(capture: Scene, each: int, seed: int) -> Scene:
-    """The capture with points on the true surfaces, `each` a photo, seen by that photo."""
+    """Return the capture with `each` exact surface points per photo, seen by that photo."""
     import mitsuba as mi
 
     sys.path.insert(0, str(ROOT))
@@ -44,28 +44,31 @@ def with_true_points(capture: Scene, each: int, seed: int) -> Scene:
     points, views, count = [], [], 0
     with tempfile.TemporaryDirectory() as meshes:
         street = load(build_scene(), Path(meshes), threads=2)
-        asked = mi.load_dict({"type": "aov", "aovs": "t:depth"})
+        depth_aov = mi.load_dict({"type": "aov", "aovs": "t:depth"})
         for view in capture.of_split("train"):
-            t = render_view(street, view.c2w, WIDTH, HEIGHT, 1, 0, asked)[..., -1]
+            t = render_view(street, view.c2w, WIDTH, HEIGHT, 1, 0, depth_aov)[..., -1]
             hit = np.flatnonzero(t > 0)  # 0 in the sky
-            some = random.choice(hit, min(each, len(hit)), replace=False)
-            rays = pixel_rays(view.c2w, WIDTH, HEIGHT).reshape(-1, 3)[some]
-            points.append(view.c2w[:3, 3] + t.reshape(-1)[some, None] * rays)
-            views.append(replace(view, seen=np.arange(count, count + len(some))))
-            count += len(some)
+            pixels = random.choice(hit, min(each, len(hit)), replace=False)
+            rays = pixel_rays(view.c2w, WIDTH, HEIGHT).reshape(-1, 3)[pixels]
+            points.append(view.c2w[:3, 3] + t.reshape(-1)[pixels, None] * rays)
+            views.append(replace(view, seen=np.arange(count, count + len(pixels))))
+            count += len(pixels)
     heldout = (replace(view, seen=None) for view in capture.of_split("heldout"))
     return replace(capture, points=np.concatenate(points), views=(*views, *heldout))
 
 
 def main() -> None:
-    """Makes the fits asked for, and prints the scores of each."""
+    """Make the fits and print the scores of each."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=900)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument(
-        "--fits", nargs="+", default=["sparse", "1"], help="sparse, or true points so many times"
+        "--fits",
+        nargs="+",
+        default=["sparse", "1"],
+        help="sparse, or weight factors",
     )
-    parser.add_argument("--points", type=int, default=3000, help="true points of each photo")
+    parser.add_argument("--points", type=int, default=3000, help="exact points per photo")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     capture = read_scene(REFERENCE)
@@ -89,7 +92,7 @@ def main() -> None:
             run = EvaluatedRun(load_field(folder), load_scene(folder), read_reference(REFERENCE))
             found[fit], _ = score_row(run, settings, False)
             print(fit, found[fit], file=sys.stderr, flush=True)
-    common.report("floaters with sparse and with true points", found, options.seed)
+    common.report("floaters with sparse and with exact points", found, options.seed)
 
 
 if __name__ == "__main__":
