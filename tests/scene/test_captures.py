@@ -2,12 +2,9 @@
 
 import numpy as np
 import pytest
+from support.scene_builders import angle
 
 from climatenerf.scene import load_image, read_scene
-
-
-def degrees(a, b):
-    return np.degrees(np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1)))
 
 
 @pytest.mark.parametrize(
@@ -25,7 +22,7 @@ def test_colmap_captures(captures, name, views, size, up, tolerance, height):
     assert {(c.width, c.height) for c in scene.cameras} == {size}
     assert [i for i, v in enumerate(scene.views) if v.split == "heldout"] == [*range(0, views, 8)]
     assert all(v.label_path is not None for v in scene.views)
-    assert degrees(scene.world_from_input[2, :3], np.array(up)) < tolerance
+    assert angle(scene.world_from_input[2, :3], np.array(up)) < tolerance
     assert height[0] < 1.6 / scene.scale < height[1]
     # A view in the middle shows a good part of the sparse points.
     view, points = scene.views[views // 2], scene.points
@@ -59,5 +56,5 @@ def test_fox_capture(captures):
     camera = scene.cameras[0]
     assert (camera.width, camera.height, camera.k1) == (270, 480, 0.0578421)
     assert len(scene.of_split("heldout")) == 7 and scene.views[0].name == "0001.jpg"
-    assert degrees(scene.world_from_input[2, :3], np.array([0, 0, 1.0])) < 12
+    assert angle(scene.world_from_input[2, :3], np.array([0, 0, 1.0])) < 12
     assert all(scene.c2w_world(v)[2, 3] > 0 for v in scene.views)

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
-from support.scene_builders import look_at, pinhole, seen_at, write_images
+from support.scene_builders import look_at, pinhole, pixel_of, write_images
 
 from climatenerf.core.errors import UserError
 from climatenerf.scene import load_image, read_scene, save_scene
@@ -92,7 +92,7 @@ def test_points_project_to_their_true_pixels(tmp_path, package):
         ahead = true_pose(camera, frame) @ np.array([0.7, -0.3, 9.0, 1.0])
         # Pixel (0, 0) of the data set is the centre of the first pixel; ours is its corner.
         expected = pinhole(K[camera], true_pose(camera, frame), ahead[:3]) + 0.5
-        np.testing.assert_allclose(seen_at(scene, view, ahead[:3]), expected, atol=1e-4)
+        np.testing.assert_allclose(pixel_of(scene, view, ahead[:3]), expected, atol=1e-4)
         np.testing.assert_allclose(view.c2w, true_pose(camera, frame), atol=1e-8)
 
 
@@ -104,7 +104,7 @@ def test_principal_point_is_the_centre_of_its_pixel(tmp_path):
     Image.fromarray(dot).save(path)
     scene = read_scene(tmp_path)
     view = next(v for v in scene.views if v.path == path)
-    x, y = seen_at(scene, view, view.c2w[:3, 3] + 5 * view.c2w[:3, 2]).astype(int)
+    x, y = pixel_of(scene, view, view.c2w[:3, 3] + 5 * view.c2w[:3, 2]).astype(int)
     assert load_image(view, scene)[y, x].tolist() == [255, 255, 255]
 
 

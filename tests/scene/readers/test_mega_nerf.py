@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from support.scene_builders import look_at, pinhole, seen_at, write_images
+from support.scene_builders import look_at, pinhole, pixel_of, write_images
 
 from climatenerf.core.errors import UserError
 from climatenerf.scene import read_scene
@@ -67,7 +67,7 @@ def test_points_project_to_their_true_pixels(tmp_path, suffix):
     for view in scene.views:
         true = poses()[int(view.path.stem)]
         np.testing.assert_allclose(view.c2w, true, atol=2e-5)
-        np.testing.assert_allclose(seen_at(scene, view, POINT), pinhole(K, true, POINT), atol=1e-4)
+        np.testing.assert_allclose(pixel_of(scene, view, POINT), pinhole(K, true, POINT), atol=1e-4)
 
 
 def test_rays_match_the_formula_of_mega_nerf(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
-from support.scene_builders import names_of, ring, seen_at, write_colmap, write_images
+from support.scene_builders import names_of, pixel_of, ring, write_colmap, write_images
 
 from climatenerf.scene import load_image, read_scene
 from climatenerf.scene.images import load_labels
@@ -43,7 +43,7 @@ def test_downscaled_images_scale_the_intrinsics(tmp_path, model):
     assert [(c.width, c.height) for c in scene.cameras] == [QUARTER]
     for pose, view in zip(ring(9), scene.views, strict=True):
         expected = projected(pose, MODELS[model][1]) * np.array(QUARTER) / FULL
-        np.testing.assert_allclose(seen_at(scene, view, POINT), expected, atol=1e-6)
+        np.testing.assert_allclose(pixel_of(scene, view, POINT), expected, atol=1e-6)
         assert view.path.parent.name == "images_4"
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.scene_builders import pinhole, ring, seen_at, write_images
+from support.scene_builders import pinhole, pixel_of, ring, write_images
 
 from climatenerf.core.errors import UserError
 from climatenerf.scene import read_scene
@@ -34,7 +34,7 @@ def test_points_project_to_their_true_pixels(tmp_path, folder):
     assert scene.source == "tanks-temples" and len(scene.views) == 9
     for view in scene.views:
         expected = pinhole(K, poses[view.path.stem], POINT)
-        np.testing.assert_allclose(seen_at(scene, view, POINT), expected, atol=1e-9)
+        np.testing.assert_allclose(pixel_of(scene, view, POINT), expected, atol=1e-9)
         assert view.path.parent.name == folder and view.path.is_file()
 
 
