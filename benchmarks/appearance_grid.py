@@ -17,10 +17,11 @@ from pathlib import Path
 
 from common import CAPTURES, report
 
+from climatenerf.evaluation.heldout import evaluate
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.presets import PRESETS
 from climatenerf.scene import load_scene, read_scene
-from climatenerf.training.run import evaluate, fit_scene
+from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings
 
 
@@ -42,9 +43,9 @@ def main() -> None:
             folder = Path(capture) if Path(capture).is_dir() else CAPTURES / capture
             for decay, log2_rows in product(options.decays, options.rows):
                 run = Path(work) / f"{folder.name}-{decay:g}-{log2_rows}"
-                PRESETS["cpu"] = replace(PRESETS["cpu"], appearance_log2_rows=log2_rows)
+                size = replace(PRESETS["cpu"], appearance_log2_rows=log2_rows)
                 settings = FitSettings(
-                    minutes=None, steps=options.steps, decay=decay, seed=options.seed
+                    size=size, minutes=None, steps=options.steps, decay=decay, seed=options.seed
                 )
                 scores = fit_scene(
                     read_scene(folder),
@@ -52,8 +53,8 @@ def main() -> None:
                     settings,
                     options.downscale,
                     resume=False,
-                    report=lambda _: None,
-                    evaluated=lambda *_: None,
+                    after_step=lambda _: None,
+                    after_view=lambda *_: None,
                 )
                 in_mean = evaluate(
                     load_field(run), load_scene(run), options.downscale, lambda *_: None, False

@@ -34,6 +34,7 @@ from climatenerf.core.classes import SOLID
 from climatenerf.core.device import uniform
 from climatenerf.core.samples import Samples
 from climatenerf.core.vectors import unit
+from climatenerf.evaluation.heldout import evaluate
 from climatenerf.field import activations
 from climatenerf.field import spherical_harmonics as directions
 from climatenerf.field.checkpoint import load_field
@@ -43,9 +44,9 @@ from climatenerf.scene import load_scene, read_scene
 from climatenerf.training import losses
 from climatenerf.training.dataset import Batch
 from climatenerf.training.optimiser import GridAdam
-from climatenerf.training.run import begin, evaluate
+from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.trainer import Fitting, Report
+from climatenerf.training.trainer import Report, Trainer
 
 GOALS = (20, 22, 24)  # dB
 STEPS = 5  # steps of our kernels per step of a twin
@@ -140,7 +141,7 @@ class RayBatch:
     """Grid units."""
 
 
-def draw_batch(fitting: Fitting, samples: int) -> RayBatch:
+def draw_batch(fitting: Trainer, samples: int) -> RayBatch:
     """Draw rays that have about `samples` samples in total."""
     field, rays = fitting.field, 512
     for _ in range(50):  # rays differ, so that the target may not be reached
@@ -217,7 +218,7 @@ def twin_step(field: Field, at: RayBatch, compiled: bool) -> Callable[[], None]:
     return step
 
 
-def steps(fitting: Fitting, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
+def steps(fitting: Trainer, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
     """Measure samples per second of our kernels and the twins on the same field and rays.
 
     Measurements alternate, so that a change of the machine's load affects all of them.

@@ -17,9 +17,9 @@ from pathlib import Path
 
 from common import CAPTURES, command, report
 
+from climatenerf.evaluation.heldout import evaluate
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene
-from climatenerf.training.run import evaluate
 
 KEYS = ("psnr", "psnr_cc", "ssim", "seconds", "steps", "samples")
 

@@ -21,42 +21,35 @@ from support.toy_scene import CAMERA, TINY, make_scene  # noqa: E402
 
 from climatenerf.evaluation.metrics import psnr  # noqa: E402
 from climatenerf.field.normalisation import find_extent  # noqa: E402
-from climatenerf.field.presets import PRESETS  # noqa: E402
 from climatenerf.render.volume import render_view  # noqa: E402
 from climatenerf.scene import Scene, load_image  # noqa: E402
-from climatenerf.training import sample_selection as choosing  # noqa: E402
-from climatenerf.training import trainer as fit  # noqa: E402
 from climatenerf.training.run import load_pixels  # noqa: E402
-from climatenerf.training.settings import Losses  # noqa: E402
+from climatenerf.training.schedule import Schedule  # noqa: E402
+from climatenerf.training.settings import FitSettings, Losses  # noqa: E402
+from climatenerf.training.trainer import make_trainer  # noqa: E402
 
 VARIANTS = {
     "default": {},
-    "inclusion probability at least 0.1": {"MIN_CHANCE": 0.1},
-    "inclusion probability at least 0.1, 16 samples": {"MIN_CHANCE": 0.1, "CHOSEN": 16},
-    "inclusion probability at least 0.5": {"MIN_CHANCE": 0.5},
-    "near density from the start": {"FIRST_NEAR": 0.0},
+    "inclusion probability at least 0.1": {"schedule": Schedule(min_inclusion_probability=0.1)},
+    "inclusion probability at least 0.1, 16 samples": {
+        "schedule": Schedule(min_inclusion_probability=0.1, selected_per_ray=16)
+    },
+    "inclusion probability at least 0.5": {"schedule": Schedule(min_inclusion_probability=0.5)},
+    "near density from the start": {"schedule": Schedule(first_near=0.0)},
     "no below-horizon opacity": {"losses": Losses(below_horizon_opacity=0.0)},
-    "view-dependent colour from the start": {"VIEW_SHARES": (1.0, 1.0)},
+    "view-dependent colour from the start": {"schedule": Schedule(view=(1.0, 1.0))},
 }
 
 
 def heldout_psnr(scene: Scene, seed: int, variant: dict) -> float:
     """Fit a variant; return the mean PSNR of the held-out views. Capitals are module constants."""
-    capitals = [name for name in variant if name.isupper()]
-    of = {name: choosing if name in vars(choosing) else fit for name in capitals}
-    before = {name: getattr(module, name) for name, module in of.items()}
-    for name, module in of.items():
-        setattr(module, name, variant[name])
-    overrides = {name: value for name, value in variant.items() if not name.isupper()}
-    settings = fit.FitSettings(
-        preset="tiny", minutes=None, steps=400, samples_per_step=2**15, seed=seed, **overrides
+    settings = FitSettings(
+        size=TINY, minutes=None, steps=400, samples_per_step=2**15, seed=seed, **variant
     )
     views = scene.of_split("train")
     extent = find_extent(np.stack([scene.c2w_world(view) for view in views]), None)
-    fitting = fit.Fitting(load_pixels(scene, 1), len(views), extent, settings)
+    fitting = make_trainer(load_pixels(scene, 1), extent, settings)
     fitting.run(lambda _: None)
-    for name, value in before.items():
-        setattr(of[name], name, value)
     found = []
     for view in scene.of_split("heldout"):
         photo = load_image(view, scene).astype(np.float32) / 255
@@ -68,7 +61,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=3)
     options = parser.parse_args()
-    PRESETS["tiny"] = TINY
     with tempfile.TemporaryDirectory() as folder:
         scene = make_scene(Path(folder))
         rows = {}

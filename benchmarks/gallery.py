@@ -29,7 +29,7 @@ from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_image
 from climatenerf.studies.ablation import depth_picture, normal_picture
 from climatenerf.training.folder import OPTIMISER
-from climatenerf.training.transients import MASKED, TransientMasks
+from climatenerf.training.transients import MASK_THRESHOLD, TransientMasks
 from climatenerf.weather.world import World
 
 # Cityscapes' colours of road, building, vegetation, terrain, sky, person and vehicle.
@@ -89,14 +89,17 @@ def passers_by(run: Path, columns: int) -> Rows:
     masks = TransientMasks(len(views))
     weights = {key.removeprefix("masks."): value for key, value in state.items() if "masks." in key}
     masks.load_state_dict({key: torch.as_tensor(value) for key, value in weights.items()})
-    most = np.argsort(-masks.shares().numpy())[:12]
+    most = np.argsort(-masks.masked_fractions().numpy())[:12]
     rows: Rows = [("photo", []), ("masked", []), ("field", [])]
     for i in np.sort(most)[:: max(1, 12 // columns)][:columns]:
         view, photo = views[i], load_image(views[i], scene)
         y, x = ((np.arange(side) + 0.5) / side for side in photo.shape[:2])
         position = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)
         with torch.no_grad():
-            mask = masks(torch.full((len(position),), int(i)), torch.from_numpy(position)) > MASKED
+            mask = (
+                masks(torch.full((len(position),), int(i)), torch.from_numpy(position))
+                > MASK_THRESHOLD
+            )
         marked = photo.copy()
         marked[mask.view(photo.shape[:2]).numpy()] = (220, 20, 60)
         world = World(field, appearance=field.embeddings[[int(i)]].detach())

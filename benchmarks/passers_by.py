@@ -20,14 +20,15 @@ from jaxtyping import Bool
 from PIL import Image
 
 from climatenerf.core.classes import MERGED, PERSON, UNKNOWN
+from climatenerf.evaluation.heldout import evaluate
 from climatenerf.scene import read_scene
 from climatenerf.scene.images import load_labels
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene
-from climatenerf.training.run import begin, evaluate
+from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.trainer import Fitting
-from climatenerf.training.transients import MASKED
+from climatenerf.training.trainer import Trainer
+from climatenerf.training.transients import MASK_THRESHOLD
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 ROWS = ("named", "unnamed", "quiet")
@@ -52,7 +53,7 @@ def people(scene: Scene) -> list[Bool[np.ndarray, "h w"]]:
     return [np.equal(MERGED[each], PERSON) for each in labels]
 
 
-def fit(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
+def fit(scene: Scene, settings: FitSettings, downscale: int) -> Trainer:
     """Fit a scene like `climatenerf fit`."""
     fitting = begin(scene, settings, downscale)
     fitting.run(lambda _: None)
@@ -60,14 +61,14 @@ def fit(scene: Scene, settings: FitSettings, downscale: int) -> Fitting:
     return fitting
 
 
-def masked(fitting: Fitting, image: int, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+def masked(fitting: Trainer, image: int, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Evaluate the mask of a photo at its pixel centres."""
     y, x = ((np.arange(side) + 0.5) / side for side in shape)
     position = torch.tensor(
         np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), dtype=torch.float32
     )
     with torch.no_grad():
-        found = fitting.masks(torch.full((len(position),), image), position) > MASKED
+        found = fitting.masks(torch.full((len(position),), image), position) > MASK_THRESHOLD
     return found.view(shape).numpy()
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import common
 
+from climatenerf.evaluation.heldout import evaluate
 from climatenerf.field.checkpoint import load_field
 from climatenerf.render import volume as view
 from climatenerf.scene import load_scene
-from climatenerf.training.run import evaluate
 
 
 def main() -> None:

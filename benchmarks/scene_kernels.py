@@ -108,7 +108,9 @@ def main() -> None:
     size = options.size
     jobs = {
         "metaball sums": snow_sums(random, int(2**18 * size)),
-        "plane sweep": windows(random, fitting.pixels, fitting.points, int(2**14 * size)),
+        "plane sweep": windows(
+            random, fitting.pixels, fitting.evidence.free_space.sparse, int(2**14 * size)
+        ),
         "visual hull": hull_points(random, fitting.pixels, int(2**18 * size)),
     }
     best = bounds(options.repeats, 2**17)

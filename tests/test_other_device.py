@@ -17,7 +17,6 @@ from climatenerf.core.storage import read_json
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
-from climatenerf.field.presets import PRESETS
 from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.render.session import RenderSession
 from climatenerf.scene import load_image
@@ -27,7 +26,7 @@ from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
-from climatenerf.training.trainer import Fitting
+from climatenerf.training.trainer import make_trainer
 from climatenerf.weather.description import weather_from_table
 
 WEATHER = {
@@ -53,24 +52,22 @@ def runs(tmp_path_factory):
     """A run of each device, both stopped and resumed."""
     folder = tmp_path_factory.mktemp("runs")
     scene = make_scene(folder)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", TINY)
-        for name, device in (("cpu", contextlib.nullcontext()), ("toy", on_toy())):
-            with device:
-                # Few: sooner or later a rounding decides whether a ray has one sample more, and
-                # Adam, whose steps know no size of gradients, makes another fit of it.
-                for steps in (12, 24):
-                    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**12}
-                    settings = FitSettings(steps=steps, refine_poses=True, **chosen)
-                    fit_scene(
-                        scene,
-                        folder / name,
-                        settings,
-                        1,
-                        steps > 12,
-                        lambda _: None,
-                        lambda *_: None,
-                    )
+    for name, device in (("cpu", contextlib.nullcontext()), ("toy", on_toy())):
+        with device:
+            # Few: sooner or later a rounding decides whether a ray has one sample more, and
+            # Adam, whose steps know no size of gradients, makes another fit of it.
+            for steps in (12, 24):
+                chosen = {"size": TINY, "minutes": None, "samples_per_step": 2**12}
+                settings = FitSettings(steps=steps, refine_poses=True, **chosen)
+                fit_scene(
+                    scene,
+                    folder / name,
+                    settings,
+                    1,
+                    steps > 12,
+                    lambda _: None,
+                    lambda *_: None,
+                )
     return scene, folder
 
 
@@ -95,14 +92,13 @@ def test_a_fit_is_the_same_on_both(runs):
 
 
 @pytest.mark.slow
-def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
+def test_a_step_with_every_loss_stays_on_its_device(runs):
     """Sky, ground, points, relative depth, moving cameras, normals that move matter."""
     scene, _ = runs
     place = np.random.default_rng(0).uniform(-2, 2, (200, 2))
     points = np.concatenate([place, np.zeros((200, 1))], axis=1)
     views = [replace(view, seen=np.arange(200)) for view in scene.views]
     scene = replace(scene, views=tuple(views), points=points)
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
     with on_toy():
         train = scene.of_split("train")
         images = [load_image(view, scene) for view in train]
@@ -114,7 +110,7 @@ def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
             scene.cameras, [0] * len(train), poses, images, labels, None, relative
         )
         settings = FitSettings(
-            preset="tiny",
+            size=TINY,
             minutes=None,
             steps=8,
             samples_per_step=2**12,
@@ -122,10 +118,10 @@ def test_a_step_with_every_loss_stays_on_its_device(runs, monkeypatch):
             refine_poses=True,
         )
         extent = find_extent(poses, None)
-        fitting = Fitting(pixels, len(train), extent, settings, read_sparse_depth(scene))
-        assert fitting.knows_sky and fitting.carving.ground is not None
-        fitting.run(nothing)
-        assert fitting.field.embeddings.device == TOY and fitting.poses.shift.device == TOY
+        trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene))
+        assert trainer.evidence.knows_sky and trainer.evidence.free_space.ground is not None
+        trainer.run(nothing)
+        assert trainer.field.embeddings.device == TOY and trainer.poses.shift.device == TOY
 
 
 def test_photos_are_matched_alike_on_both():

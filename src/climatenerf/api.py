@@ -313,8 +313,8 @@ def evaluate(run: Run | PathText, *, progress: Progress | None = None) -> dict[s
     Raises:
         UserError: a photo cannot be read.
     """
+    from climatenerf.evaluation.heldout import evaluate as measure
     from climatenerf.training.folder import check_config
-    from climatenerf.training.run import evaluate as measure
 
     run = run if isinstance(run, Run) else load_run(run)
     downscale = int(check_config(run.folder).get("downscale", 1))

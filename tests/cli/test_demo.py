@@ -23,8 +23,7 @@ def small(monkeypatch):
     tiny = dataclasses.replace(
         PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
     )
-    monkeypatch.setitem(PRESETS, "cpu", tiny)
-    settings = functools.partial(FitSettings, samples_per_step=2**14)
+    settings = functools.partial(FitSettings, samples_per_step=2**14, size=tiny)
     monkeypatch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 64)
     monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))
@@ -60,16 +59,16 @@ def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
 
 
 def test_ctrl_c_while_fitting_names_the_way_to_resume(tmp_path, capsys, monkeypatch):
-    from climatenerf.training.trainer import Fitting
+    from climatenerf.training.trainer import Trainer
 
-    step = Fitting.step
+    step = Trainer.step
 
     def stopped(self, batch):
         if self.steps == 3:
             raise KeyboardInterrupt
         return step(self, batch)
 
-    monkeypatch.setattr(Fitting, "step", stopped)
+    monkeypatch.setattr(Trainer, "step", stopped)
     assert cli.main(["demo", "-o", str(tmp_path / "demo"), "--size", "64x36"]) == 2
     assert "re-run the same command to resume" in capsys.readouterr().err
     assert (tmp_path / "demo" / "run" / "field.safetensors").exists()

@@ -81,10 +81,9 @@ def run_folder(tmp_path_factory):
     small = dataclasses.replace(
         PRESETS["cpu"], geometry_log2_rows=14, appearance_log2_rows=14, cascades=4
     )
-    settings = functools.partial(FitSettings, samples_per_step=2**14)
+    settings = functools.partial(FitSettings, samples_per_step=2**14, size=small)
     words = ["fit", str(REFERENCE), "-o", str(folder), "--steps", "400", "--downscale", "4"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "cpu", small)
         patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0

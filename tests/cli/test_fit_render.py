@@ -24,7 +24,7 @@ from climatenerf.output.job import appearance_index
 from climatenerf.output.video import write_png
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import read_rgb
-from climatenerf.training.settings import PAPER, Losses
+from climatenerf.training.settings import PAPER, FitSettings, Losses
 from climatenerf.weather.registry import layer_table
 
 STREET = Path(str(files("climatenerf") / "assets" / "street"))
@@ -39,13 +39,11 @@ def run_folder(tmp_path_factory):
     """A short fit in small steps with small grids: a blurred street in some haze."""
     from climatenerf.cli import fit as cli_fit
     from climatenerf.training import run as run_module
-    from climatenerf.training.settings import FitSettings
 
     folder = tmp_path_factory.mktemp("street") / "run"
-    settings = functools.partial(FitSettings, samples_per_step=2**14)
+    settings = functools.partial(FitSettings, samples_per_step=2**14, size=FEW_ROWS)
     words = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "cpu", FEW_ROWS)
         patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
         assert cli.main(words) == 0
@@ -126,7 +124,8 @@ def kept(folder):
 def test_a_run_is_resumed_as_it_was_begun_or_not_at_all(
     run_folder, capsys, monkeypatch, words, expected
 ):
-    monkeypatch.setitem(PRESETS, "cpu", FEW_ROWS)
+    settings = FitSettings(size=FEW_ROWS)
+    monkeypatch.setattr("climatenerf.cli.fit.settings_of", lambda preset, device: settings)
     before = kept(run_folder)
     said = complaint(capsys, "fit", STREET, "-o", run_folder, "--resume", *words)
     assert expected in said

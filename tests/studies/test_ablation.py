@@ -24,7 +24,7 @@ REFERENCE = Path(__file__).parents[2] / "reference" / "street"
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    monkeypatch.setitem(PRESETS, "cpu", TINY)
+    monkeypatch.setattr(ablation, "settings_of", lambda preset: FitSettings(size=TINY))
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
 
 
@@ -66,7 +66,7 @@ def test_density_normals_are_taken_at_the_surfaces_in_camera_axes():
 def test_each_row_leaves_out_one_part():
     rows = ablation.rows(4.0)
     full = rows["full"]
-    assert full == FitSettings(minutes=4.0)
+    assert full == FitSettings(minutes=4.0, size=TINY)
     assert {name: differences(full, row) for name, row in rows.items() if name != "plain NGP"} == {
         "no appearance": {"appearance"},
         "no distortion": {"distortion"},
@@ -92,7 +92,7 @@ def test_each_row_leaves_out_one_part():
 def test_rows_are_selected_by_name_in_table_order():
     assert list(ablation.select_rows(4.0, ())) == list(ablation.rows(4.0))
     two = ablation.select_rows(2.0, ("full", "plain NGP"))
-    assert list(two) == ["plain NGP", "full"] and two["full"] == FitSettings(minutes=2.0)
+    assert list(two) == ["plain NGP", "full"] and two["full"] == ablation.rows(2.0)["full"]
     with pytest.raises(UserError, match="'no sun'; choose from: plain NGP, no appearance"):
         ablation.select_rows(4.0, ("full", "no sun"))
 
@@ -116,7 +116,7 @@ def test_the_paper_preset_has_surface_heads_on_the_appearance_grid():
 
 def test_finished_rows_are_kept_and_other_settings_refused(tmp_path):
     scene = make_scene(tmp_path / "toy")
-    settings = FitSettings(minutes=None, steps=2, samples_per_step=2**12)
+    settings = FitSettings(size=TINY, minutes=None, steps=2, samples_per_step=2**12)
     run, steps = tmp_path / "run", []
     ablation.fit_row(scene, run, settings, 1, lambda state: steps.append(state.step))
     assert steps == [1, 2]
@@ -130,7 +130,7 @@ def test_finished_rows_are_kept_and_other_settings_refused(tmp_path):
 
 def test_an_interrupted_row_is_resumed(tmp_path):
     scene = make_scene(tmp_path / "toy")
-    settings = FitSettings(minutes=None, steps=6, samples_per_step=2**12)
+    settings = FitSettings(size=TINY, minutes=None, steps=6, samples_per_step=2**12)
     run, steps = tmp_path / "run", []
 
     def stop(state):
@@ -171,7 +171,7 @@ def test_depth_and_normal_pictures_have_known_values():
 
 @pytest.mark.slow
 def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
-    full = FitSettings(minutes=None, steps=250, samples_per_step=2**14)
+    full = FitSettings(size=TINY, minutes=None, steps=250, samples_per_step=2**14)
     bare = ablation.rows(1.0)["no sky"]
     bare = dataclasses.replace(bare, minutes=None, steps=250, samples_per_step=2**14)
     chosen = {"no sky": bare, "full": full}

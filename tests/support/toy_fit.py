@@ -11,16 +11,16 @@ from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.trainer import Fitting
+from climatenerf.training.trainer import make_trainer
 from climatenerf.weather.world import World
-from support.toy_scene import CAMERA, FIELD
+from support.toy_scene import CAMERA, FIELD, TINY
 
 
 def begin(scene, **settings):
     views = scene.of_split("train")
-    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**15, **settings}
+    chosen = {"size": TINY, "minutes": None, "samples_per_step": 2**15, **settings}
     extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
-    return Fitting(load_pixels(scene, 1), len(views), extent, FitSettings(**chosen))
+    return make_trainer(load_pixels(scene, 1), extent, FitSettings(**chosen))
 
 
 def labelled(scene):
@@ -60,8 +60,8 @@ def with_labels(scene, relabel, **settings):
     known, labels = labelled(scene)
     views = known.of_split("train")
     extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)
-    chosen = FitSettings(preset="tiny", minutes=None, steps=1000, **settings)
+    chosen = FitSettings(size=TINY, minutes=None, steps=1000, **settings)
     pixels = labelled_pixels(known, [relabel(each) for each in labels])
-    fitting = Fitting(pixels, len(views), extent, chosen, read_sparse_depth(known))
-    fitting.reached = 0.5
-    return fitting
+    trainer = make_trainer(pixels, extent, chosen, read_sparse_depth(known))
+    trainer.resumed_progress = 0.5
+    return trainer

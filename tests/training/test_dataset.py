@@ -48,7 +48,7 @@ def test_what_a_picture_lacks_is_unknown_there_alone():
     assert (pixels.label[:n] == UNKNOWN).all() and (pixels.label[n:] != UNKNOWN).all()
     known = torch.isfinite(pixels.relative.float())
     assert known[2 * n : 3 * n].all() and known.sum() == n
-    assert pixels.usable[n:].all() and pixels.share == pytest.approx(1 - 94 / (4 * n))
+    assert pixels.usable[n:].all() and pixels.usable_fraction == pytest.approx(1 - 94 / (4 * n))
 
 
 def test_the_kinds_of_labels_are_counted_piece_by_piece(monkeypatch):
@@ -105,11 +105,11 @@ def test_colours_nearby_are_the_least_and_largest_of_a_window():
     pixels = made()
     start = pixels.pixel_start.tolist()
     batch = pixels.draw(3000, torch.Generator().manual_seed(0))
-    low, high = pixels.colours_nearby(batch.image, batch.place)
+    low, high = pixels.colours_nearby(batch.image, batch.xy)
     for i, camera in enumerate(pixels.cameras):
         rgb = pixels.rgb[start[i] : start[i + 1]].numpy().reshape(camera.height, camera.width, 3)
         some = batch.image == i
-        x, y = (batch.place[some].numpy() * (camera.width, camera.height)).astype(int).T
+        x, y = (batch.xy[some].numpy() * (camera.width, camera.height)).astype(int).T
         side = 2 * module.NEARBY + 1
         for found, filtered in ((low, minimum_filter), (high, maximum_filter)):
             expected = filtered(rgb, (side, side, 1), mode="nearest")[y, x] / 255

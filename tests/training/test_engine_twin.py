@@ -29,17 +29,17 @@ def learned(field, at, plain):
 
 
 def test_the_measured_step_and_its_twin_have_one_loss_and_the_same_gradients(scene):
-    fitting = begin(scene, steps=10)
-    field = fitting.field
+    trainer = begin(scene, steps=10)
+    field = trainer.field
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():  # as after some steps: structure in the grids, matter in sight
         for name, parameter in field.named_parameters():
             if name.endswith("_grid"):
                 parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
         field.geometry_net[-1].add_(2.0)
-    for table in fitting.grid_adam.tables:
+    for table in trainer.grid_adam.tables:
         del table.grad_buffer  # gradients are to be seen
-    at = engine.drawn(fitting, 30_000)
+    at = engine.drawn(trainer, 30_000)
     ours, gradients = learned(field, at, False)
     twin, wanted = learned(field, at, True)
     assert abs(ours - twin) < 1e-5 * abs(twin)

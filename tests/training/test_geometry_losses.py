@@ -35,9 +35,11 @@ def test_ground_loss_is_the_mean_distance_from_the_ground_up_to_a_bound():
     weights = torch.tensor([0.5, 0.5, 0.2], requires_grad=True)
     t, goal = torch.tensor([0.5, 0.9, 1.0]), torch.tensor([0.53, 0.89, 4.0])
     loss = losses.ground_height_loss(weights, t, goal, 4)
-    assert loss.item() == pytest.approx((0.5 * 0.03 + 0.5 * 0.01 + 0.2 * losses.FAR) / 4)
+    assert loss.item() == pytest.approx(
+        (0.5 * 0.03 + 0.5 * 0.01 + 0.2 * losses.MAX_GROUND_ERROR) / 4
+    )
     (gradient,) = torch.autograd.grad(loss, weights)
-    assert torch.allclose(gradient, torch.tensor([0.03, 0.01, losses.FAR]) / 4)
+    assert torch.allclose(gradient, torch.tensor([0.03, 0.01, losses.MAX_GROUND_ERROR]) / 4)
     nothing = torch.zeros(0)
     assert losses.ground_height_loss(nothing, nothing, nothing, 4) == 0
 
@@ -96,7 +98,7 @@ def test_triples_lie_in_a_line_at_equal_distances_in_one_image():
     middle, left, right = (
         part[batch.in_line]
         for part in (slice(0, m), slice(n - 2 * m, n - m), slice(n - m, n))
-        for part in [batch.place[part] * torch.tensor([20.0, 14.0])]
+        for part in [batch.xy[part] * torch.tensor([20.0, 14.0])]
     )
     assert 0.2 < batch.in_line.float().mean() < 1
     assert torch.allclose((left + right) / 2, middle, atol=1e-4)
@@ -105,7 +107,7 @@ def test_triples_lie_in_a_line_at_equal_distances_in_one_image():
     for some in (slice(n - 2 * m, n - m), slice(n - m, n)):
         assert torch.equal(batch.image[some], batch.image[:m])
     outside = ~batch.in_line
-    assert torch.equal(batch.place[n - m :][outside], batch.place[:m][outside])
+    assert torch.equal(batch.xy[n - m :][outside], batch.xy[:m][outside])
     # Colours belong to the pixels: each image is of one colour.
     assert torch.allclose(batch.rgb[:, 0] * 255, batch.image.float(), atol=1e-3)
 
@@ -145,7 +147,7 @@ def test_no_side_of_a_triple_is_a_masked_pixel():
     image = np.where(mask, 0, 255).astype(np.uint8)[..., None].repeat(3, -1)
     pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image], None, [mask])
     batch = pixels.draw(900, torch.Generator().manual_seed(0), 250)
-    assert batch.rgb.max() == 0 and batch.place[:, 0].max() < 0.5
+    assert batch.rgb.max() == 0 and batch.xy[:, 0].max() < 0.5
     assert 0.1 < batch.in_line.float().mean() < 0.9
 
 

@@ -1,4 +1,4 @@
-"""Each loss by known values, and that the fit adds it with its weight."""
+"""Values of each loss, and that the objective adds it with its weight."""
 
 import dataclasses
 import math
@@ -11,9 +11,10 @@ from support.toy_fit import begin
 from climatenerf.core.classes import ROAD, SKY, UNKNOWN
 from climatenerf.ops import compositing
 from climatenerf.training import losses
-from climatenerf.training import trainer as fit
+from climatenerf.training.losses import scale_gradient
+from climatenerf.training.objective import RenderedRays
+from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import Losses
-from climatenerf.training.trainer import scale_gradient
 
 
 def test_colour_loss_is_the_error_of_display_values():
@@ -22,7 +23,7 @@ def test_colour_loss_is_the_error_of_display_values():
     assert losses.colour_error(linear, torch.tensor([[0.2, 0.0, 1.0]])) == pytest.approx(0.03)
 
 
-def test_distances_are_bounded_smooth_and_plain_when_near():
+def test_distance_measure_is_the_identity_near_and_bounded_far():
     t = torch.tensor([0.0, 0.5, 1.0, 2.0, 1e9])
     measure = losses.distance_measure(t)
     assert torch.allclose(measure, torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0]))
@@ -41,101 +42,105 @@ def test_distortion_of_known_weights():
     assert losses.distortion_loss(gathered, t, dt, offsets) < found
 
 
-def test_light_left_below_the_horizon_counts_squared_and_above_not_at_all():
-    left = torch.tensor([0.5, 0.5, 0.0, 1.0], requires_grad=True)
+def test_below_horizon_loss_is_the_mean_squared_transmittance():
+    transmittance = torch.tensor([0.5, 0.5, 0.0, 1.0], requires_grad=True)
     below = torch.tensor([True, False, True, True])
-    loss = losses.below_horizon_loss(left, below)
+    loss = losses.below_horizon_loss(transmittance, below)
     assert loss.item() == pytest.approx((0.25 + 0.0 + 0.0 + 1.0) / 4)
-    (gradient,) = torch.autograd.grad(loss, left)
+    (gradient,) = torch.autograd.grad(loss, transmittance)
     assert torch.allclose(gradient, torch.tensor([0.25, 0.0, 0.0, 0.5]))
 
 
-def test_depth_loss_is_the_mean_distance_of_weight_from_the_point():
+def test_sparse_depth_loss_is_the_mean_distance_of_the_weights_from_the_point():
     weights = torch.tensor([0.25, 0.5, 0.5], requires_grad=True)
-    left = torch.tensor([0.25, 0.5])
+    transmittance = torch.tensor([0.25, 0.5])
     t, depth = torch.tensor([0.5, 1.0, 4.0]), torch.tensor([0.75, 2.0])
     ray = torch.tensor([0, 0, 1])
     # Bounded: 2 -> 1.5, 4 -> 1.75, infinity -> 2.
     first = 0.25 * 0.25 + 0.5 * 0.25 + 0.25 * 1.25
     second = 0.5 * 0.25 + 0.5 * 0.5
-    loss = losses.sparse_depth_loss(weights, left, t, depth, ray)
+    loss = losses.sparse_depth_loss(weights, transmittance, t, depth, ray)
     assert loss.item() == pytest.approx((first + second) / 2)
     (gradient,) = torch.autograd.grad(loss, weights)
     assert torch.allclose(gradient, torch.tensor([0.25, 0.25, 0.25]) / 2)
 
 
-def test_opacity_is_pushed_to_none_or_all():
-    left = torch.tensor([0.0, 1.0], requires_grad=True)
-    loss = losses.opacity_entropy_loss(left)
+def test_opacity_entropy_vanishes_at_0_and_1_with_finite_gradients():
+    transmittance = torch.tensor([0.0, 1.0], requires_grad=True)
+    loss = losses.opacity_entropy_loss(transmittance)
     assert abs(loss.item()) < 2e-5
     loss.backward()
-    assert torch.isfinite(left.grad).all()
+    assert torch.isfinite(transmittance.grad).all()
     half = losses.opacity_entropy_loss(torch.tensor([0.5]))
     assert half == pytest.approx(0.5 * math.log(2))
 
 
-def test_sky_loss_is_the_weight_in_the_sky_over_all_rays():
+def test_sky_loss_is_the_weight_in_the_sky_over_the_number_of_rays():
     assert losses.sky_loss(torch.tensor([0.5, 0.25]), 3) == pytest.approx(0.25)
 
 
 def only(scene, weight=1.0, **settings):
-    """A fit with one loss alone, half way, and the arguments of its `geometry_loss`."""
+    """A fit with one loss alone, half way, and a batch with its rendered rays."""
     nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
     name = settings.pop("loss")
-    fitting = begin(scene, steps=1000, losses=Losses(**{**nothing, name: weight}), **settings)
-    fitting.reached = 0.5
-    field, batch = fitting.field, fitting.pixels.draw(900, torch.Generator().manual_seed(0), 150)
+    trainer = begin(scene, steps=1000, losses=Losses(**{**nothing, name: weight}), **settings)
+    field, batch = trainer.field, trainer.pixels.draw(900, torch.Generator().manual_seed(0), 150)
     near, far = torch.full((900,), field.near), torch.full((900,), 1e9)
     samples = field.march(batch.rays_o, batch.rays_d, near, far)
-    dense = 100 * samples.sigma * samples.dt  # an untrained field is haze; flat is what is solid
-    weights, left = compositing.render_weights(dense, samples.offsets)
-    return fitting, (batch, samples, weights, left, samples.t / field.unit, samples.dt / field.unit)
+    dense = 100 * samples.sigma * samples.dt  # an untrained field is haze; planarity needs matter
+    weights, transmittance = compositing.render_weights(dense, samples.offsets)
+    t, dt = samples.t / field.unit, samples.dt / field.unit
+    return trainer, batch, RenderedRays(samples, t, dt, weights, transmittance)
 
 
-def test_surfaces_that_no_label_names_are_flattened_less(scene):
-    fitting, (batch, *rest) = only(scene, loss="planarity")
+def geometry(trainer, batch, rays):
+    """The terms on the density, half way through a fit."""
+    return trainer.objective.geometry(trainer.field, batch, rays, 0.5)
+
+
+def test_unlabelled_surfaces_have_a_smaller_planarity_weight(scene):
+    trainer, batch, rays = only(scene, loss="planarity")
     found = {
         kind: float(
-            fitting.geometry_loss(replace(batch, label=torch.full_like(batch.label, kind)), *rest)
+            geometry(trainer, replace(batch, label=torch.full_like(batch.label, kind)), rays)
         )
         for kind in (UNKNOWN, ROAD, SKY)
     }
+    factor = Schedule().unlabelled_planarity
     assert found[ROAD] > 0 and found[SKY] == 0
-    assert found[UNKNOWN] == pytest.approx(fit.UNSURE_FLAT * found[ROAD], rel=1e-4)
-    assert fit.UNSURE_FLAT < 1
+    assert found[UNKNOWN] == pytest.approx(factor * found[ROAD], rel=1e-4) and factor < 1
 
 
-def test_distortion_and_opacity_of_a_step_are_the_functions_of_their_names(scene):
-    fitting, (batch, samples, weights, left, t, dt) = only(scene, loss="distortion", weight=3.0)
-    found = fitting.geometry_loss(batch, samples, weights, left, t, dt)
-    wanted = losses.distortion_loss(weights, t, dt, samples.offsets)
-    assert wanted > 0 and found == pytest.approx(3.0 * wanted)
-    fitting, (batch, samples, weights, _, t, dt) = only(scene, loss="opacity_entropy", weight=3.0)
-    left = torch.linspace(0.0, 1.0, 900)
-    found = fitting.geometry_loss(batch, samples, weights, left, t, dt)
-    wanted = losses.opacity_entropy_loss(left)
-    assert wanted > 0 and found == pytest.approx(3.0 * wanted)
+def test_distortion_and_opacity_entropy_of_a_step_are_the_formulas_times_their_weights(scene):
+    trainer, batch, rays = only(scene, loss="distortion", weight=3.0)
+    wanted = losses.distortion_loss(rays.weights, rays.t, rays.dt, rays.samples.offsets)
+    assert wanted > 0 and geometry(trainer, batch, rays) == pytest.approx(3.0 * wanted)
+    trainer, batch, rays = only(scene, loss="opacity_entropy", weight=3.0)
+    rays = replace(rays, transmittance=torch.linspace(0.0, 1.0, 900))
+    wanted = losses.opacity_entropy_loss(rays.transmittance)
+    assert wanted > 0 and geometry(trainer, batch, rays) == pytest.approx(3.0 * wanted)
 
 
-def test_an_opaque_sky_is_asked_to_be_far(scene):
-    """The paper's form: exp(-distance) of sky rays, by their composited distance."""
-    fitting, (batch, samples, weights, left, t, dt) = only(scene, loss="sky", opaque_sky=True)
-    fitting.knows_sky = True
+def test_an_opaque_sky_is_penalised_by_its_composited_distance(scene):
+    """The paper's form: exp(-distance) of sky rays."""
+    trainer, batch, rays = only(scene, loss="sky", opaque_sky=True)
+    trainer.objective.evidence = replace(trainer.evidence, knows_sky=True)
     label = torch.where(torch.arange(900) % 2 == 0, SKY, UNKNOWN).to(torch.uint8)
     batch = replace(batch, label=label)
-    weights, left = 0.5 * weights, 0.5 + 0.5 * left  # thin: no mean distance of what is there
-    found = fitting.geometry_loss(batch, samples, weights, left, t, dt)
-    distance = torch.zeros(900).index_add(0, samples.ray_index(), weights * t)
-    assert found == pytest.approx(float(torch.exp(-distance)[::2].sum() / 900), rel=1e-4)
+    # Translucent rays: their composited distance is not the mean distance of their matter.
+    thin = replace(rays, weights=0.5 * rays.weights, transmittance=0.5 + 0.5 * rays.transmittance)
+    distance = torch.zeros(900).index_add(0, rays.samples.ray_index(), thin.weights * thin.t)
+    wanted = float(torch.exp(-distance)[::2].sum() / 900)
+    assert geometry(trainer, batch, thin) == pytest.approx(wanted, rel=1e-4)
 
 
-def test_relative_depth_counts_by_its_weight_where_it_is_known(scene):
+def test_monocular_depth_counts_by_its_weight_where_it_is_known(scene):
     found = []
     for weight, known in ((1.0, True), (2.0, True), (1.0, False)):
-        fitting, (batch, *rest) = only(scene, loss="monocular_depth", weight=weight)
+        trainer, batch, rays = only(scene, loss="monocular_depth", weight=weight)
         relative = torch.rand(900, generator=torch.Generator().manual_seed(1))
         batch = replace(batch, relative=relative if known else relative * torch.nan)
-        found.append(float(fitting.geometry_loss(batch, *rest)))
+        found.append(float(geometry(trainer, batch, rays)))
     assert found[0] > 0 and found[1] == pytest.approx(2 * found[0], rel=1e-5) and found[2] == 0
 
 

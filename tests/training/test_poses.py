@@ -6,16 +6,10 @@ import torch
 from support.toy_scene import TINY, make_scene
 
 from climatenerf.field.normalisation import find_extent
-from climatenerf.field.presets import PRESETS
 from climatenerf.training.poses import PoseCorrections, rotations
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.trainer import Fitting
-
-
-@pytest.fixture(autouse=True)
-def tiny(monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
+from climatenerf.training.trainer import make_trainer
 
 
 @pytest.mark.slow
@@ -32,18 +26,18 @@ def test_perturbed_poses_come_back(tmp_path):
     pixels.c2w = given
     extent = find_extent(true.numpy().astype(float), None)
     settings = FitSettings(
-        preset="tiny", minutes=None, steps=400, samples_per_step=2**14, refine_poses=True
+        size=TINY, minutes=None, steps=400, samples_per_step=2**14, refine_poses=True
     )
-    fitting = Fitting(pixels, len(views), extent, settings)
-    fitting.run(lambda _: None)
-    found = fitting.poses.corrected(given, fitting.field.unit).detach()
+    trainer = make_trainer(pixels, extent, settings)
+    trainer.run(lambda _: None)
+    found = trainer.poses.corrected(given, trainer.field.unit).detach()
     left = [
         (poses[:, :3, :3] @ true[:, :3, :3].transpose(1, 2)).diagonal(dim1=1, dim2=2).sum(-1)
         for poses in (given, found)
     ]
     before, after = (torch.rad2deg(torch.acos(((t - 1) / 2).clamp(-1, 1))).median() for t in left)
     assert after < 0.75 * before, (before, after)
-    still = Fitting(pixels, len(views), extent, replace(settings, refine_poses=False, steps=100))
+    still = make_trainer(pixels, extent, replace(settings, refine_poses=False, steps=100))
     still.run(lambda _: None)
     assert torch.equal(still.poses.turn, torch.zeros_like(still.poses.turn))
 

@@ -12,21 +12,22 @@ from support.toy_scene import CAMERA, TINY, make_scene
 from climatenerf.core.classes import BUILDING, SKY, VEGETATION
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json, read_safetensors, write_json, write_safetensors
+from climatenerf.evaluation.heldout import evaluate
 from climatenerf.evaluation.metrics import psnr_cc
 from climatenerf.field.checkpoint import load_field
-from climatenerf.field.presets import PRESETS
 from climatenerf.field.sampler import Sampler
 from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.volume import render_view
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import with_split
 from climatenerf.training import run as run_module
+from climatenerf.training.checkpoint import checkpoint, restore
 from climatenerf.training.evidence import free_space as carving_module
 from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.evidence.visual_hull import VisualHull
 from climatenerf.training.folder import check_config
 from climatenerf.training.optimiser import GridAdam
-from climatenerf.training.run import checkpoint, evaluate, fit_scene, load_pixels, restore
+from climatenerf.training.run import fit_scene, load_pixels
 from climatenerf.training.settings import (
     PAPER,
     RENAMED_LOSSES,
@@ -34,6 +35,7 @@ from climatenerf.training.settings import (
     FitSettings,
     Losses,
 )
+from climatenerf.training.trainer import make_trainer
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,6 @@ def scene(toy):
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
     """Small sizes; a field of a few steps is thick haze, in which full pictures take seconds."""
-    monkeypatch.setitem(PRESETS, "tiny", TINY)
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
     mark_seen = Sampler.mark_seen
     monkeypatch.setattr(Sampler, "mark_seen", lambda self, o, d: mark_seen(self, o[:50], d[:50]))
@@ -61,7 +62,7 @@ def nothing(*_):
 
 
 def fitted(scene, folder, steps=6, resume=False, report=nothing, evaluated=nothing, **settings):
-    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
+    chosen = {"size": TINY, "minutes": None, "samples_per_step": 2**13, **settings}
     settings = FitSettings(steps=steps, **chosen)
     return fit_scene(scene, folder, settings, 1, resume, report, evaluated)
 
@@ -169,10 +170,13 @@ def test_nothing_held_out_means_no_quality(scene, tmp_path):
 
 def test_heads_on_the_appearance_grid_learn_and_come_back(scene, tmp_path, monkeypatch):
     """As in the paper's preset: no grid of their own, the paper's weights, an opaque sky."""
-    monkeypatch.setitem(PRESETS, "tiny-paper", dataclasses.replace(TINY, surface_levels=0))
     view = scene.of_split("train")[0]
     settings = dataclasses.replace(
-        PAPER, preset="tiny-paper", minutes=None, steps=40, samples_per_step=2**12
+        PAPER,
+        size=dataclasses.replace(TINY, surface_levels=0),
+        minutes=None,
+        steps=40,
+        samples_per_step=2**12,
     )
     pixels = load_pixels(scene, 1)
     pixels.label = torch.full((len(pixels.rgb),), BUILDING, dtype=torch.uint8)
@@ -205,26 +209,26 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(scene, tmp_path):
 # --- resuming ---------------------------------------------------------------------------------
 
 
-def state_of(fitting):
+def state_of(trainer):
     """All that a step reads or changes."""
-    state = {f"field.{k}": v for k, v in fitting.field.state_dict().items()}
-    state |= {f"grid.{k}": v for k, v in fitting.grid_adam.state().items()}
-    for index, moments in fitting.net_adam.state_dict()["state"].items():
+    state = {f"field.{k}": v for k, v in trainer.field.state_dict().items()}
+    state |= {f"grid.{k}": v for k, v in trainer.grid_adam.state().items()}
+    for index, moments in trainer.net_adam.state_dict()["state"].items():
         state |= {f"net.{index}.{k}": torch.as_tensor(v) for k, v in moments.items()}
-    state["generator"] = fitting.generator.get_state()
-    counters = (fitting.steps, fitting.samples, fitting.rays)
-    floats = (fitting.seconds, fitting.step_scale, fitting.error)
+    state["generator"] = trainer.generator.get_state()
+    counters = (trainer.steps, trainer.samples, trainer.rays)
+    floats = (trainer.seconds, trainer.step_scale, trainer.error)
     return {k: v.clone() for k, v in state.items()}, counters, floats
 
 
 def begin(scene, **settings):
     views = scene.of_split("train")
     poses = np.stack([scene.c2w_world(v) for v in views])
-    chosen = {"preset": "tiny", "minutes": None, "samples_per_step": 2**13, **settings}
+    chosen = {"size": TINY, "minutes": None, "samples_per_step": 2**13, **settings}
     extent = run_module.find_extent(poses, None)
     pixels, settings = load_pixels(scene, 1), FitSettings(**chosen)
     points = run_module.unmasked_sparse_depth(scene, pixels)
-    return run_module.Fitting(pixels, len(views), extent, settings, points)
+    return make_trainer(pixels, extent, settings, points)
 
 
 def assert_same(a, b):
@@ -245,64 +249,66 @@ def stop_at(step):
     return report
 
 
-def stop_half_way(fitting, run):
+def stop_half_way(trainer, run):
     """Leaves what a fit of 40 steps that is stopped after 20 leaves."""
     with pytest.raises(KeyboardInterrupt):
-        fitting.run(stop_at(20))
-    write_json(run / "config.json", run_module._config(fitting.settings, 1, fitting.field))
-    checkpoint(fitting, run)
+        trainer.run(stop_at(20))
+    write_json(run / "config.json", run_module._config(trainer.settings, 1, trainer.field))
+    checkpoint(trainer, run)
 
 
 def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
-    fitting = begin(scene, steps=40)
-    fitting.field.pruning_threshold = 0.004
-    stop_half_way(fitting, tmp_path)
+    trainer = begin(scene, steps=40)
+    trainer.field.pruning_threshold = 0.004
+    stop_half_way(trainer, tmp_path)
     again = begin(scene, steps=40)
     restore(again, tmp_path)
-    assert again.field.pruning_threshold == fitting.field.pruning_threshold
-    assert_same(fitting, again)
-    fitting.run(nothing)
+    assert again.field.pruning_threshold == trainer.field.pruning_threshold
+    assert_same(trainer, again)
+    trainer.run(nothing)
     again.run(nothing)
-    fitting.seconds = again.seconds  # the one thing that may differ
-    assert fitting.steps == 40
-    assert_same(fitting, again)
+    trainer.seconds = again.seconds  # the one thing that may differ
+    assert trainer.steps == 40
+    assert_same(trainer, again)
 
 
-def labelled(fitting):
+def labelled(trainer):
     """A fit of the same pixels, bright ones sky, dark ones grown, the rest built."""
-    pixels = fitting.pixels
+    pixels = trainer.pixels
     grey = pixels.rgb.float().mean(-1)
     others = torch.where(grey > 100, BUILDING, VEGETATION)
     pixels.label = torch.where(grey > 128, SKY, others).to(torch.uint8)
     sizes = (pixels.pixel_start[1:] - pixels.pixel_start[:-1]).tolist()
     maps = [part.view(36, 48).numpy() for part in pixels.label.split(sizes)]
     pixels.sky_hull = VisualHull([CAMERA] * len(maps), pixels.c2w.numpy(), maps, [SKY], 0.1)
-    return run_module.Fitting(pixels, len(maps), fitting.extent, fitting.settings)
+    return make_trainer(pixels, trainer.extent, trainer.settings)
 
 
 def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
     """Masks, relative depth's sums and the cells that the sky bars are in the checkpoint."""
-    fitting = labelled(begin(scene, steps=40))
-    assert fitting.field.occupancy.forced_empty.any()
-    stop_half_way(fitting, tmp_path)
+    trainer = labelled(begin(scene, steps=40))
+    assert trainer.field.occupancy.forced_empty.any()
+    stop_half_way(trainer, tmp_path)
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
-    assert torch.equal(again.field.occupancy.forced_empty, fitting.field.occupancy.forced_empty)
-    assert again.field.knows_classes and again.classed_at == fitting.classed_at < 0.5
-    fitting.run(nothing)
+    assert torch.equal(again.field.occupancy.forced_empty, trainer.field.occupancy.forced_empty)
+    assert again.field.knows_classes and again.objective.classes_trusted_at < 0.5
+    assert again.objective.classes_trusted_at == trainer.objective.classes_trusted_at
+    trainer.run(nothing)
     again.run(nothing)
-    fitting.seconds = again.seconds
-    assert_same(fitting, again)
-    assert all(map(torch.equal, fitting.masks.parameters(), again.masks.parameters()))
+    trainer.seconds = again.seconds
+    assert_same(trainer, again)
+    assert all(map(torch.equal, trainer.masks.parameters(), again.masks.parameters()))
 
 
 def test_labels_that_come_with_a_resumed_run_are_not_believed_at_once(scene, tmp_path):
-    fitting = begin(scene, steps=40)
-    stop_half_way(fitting, tmp_path)
+    trainer = begin(scene, steps=40)
+    stop_half_way(trainer, tmp_path)
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
-    assert again.field.knows_classes and not fitting.field.knows_classes
-    assert again.classed_at == pytest.approx(0.5 + fitting.classed_at)
+    assert again.field.knows_classes and not trainer.field.knows_classes
+    wanted = 0.5 + trainer.objective.classes_trusted_at
+    assert again.objective.classes_trusted_at == pytest.approx(wanted)
 
 
 def test_refined_poses_are_kept_and_not_left_behind(scene, tmp_path):
@@ -353,16 +359,16 @@ def test_a_run_that_is_resumed_for_longer_stays_as_far_as_it_was(scene, tmp_path
     """Nothing that a later stage has found is believed less again: near matter, masks, steps."""
     fitted(scene, tmp_path / "run", steps=8)
     again = begin(scene, steps=800)
-    assert again.stage == 0 and again.near() > again.field.near
+    assert again.progress == 0 and again.near > again.field.near
     restore(again, tmp_path / "run")
-    assert again.progress < 0.02 and again.stage == 1 and again.near() == again.field.near
+    assert again.elapsed < 0.02 and again.progress == 1 and again.near == again.field.near
     arrays, head = read_safetensors(tmp_path / "run" / "optimiser.safetensors", "state")
     state = {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
     state["floats"] = state["floats"][:3]  # as earlier versions left it
     write_safetensors(tmp_path / "run" / "optimiser.safetensors", state, {})
     before = begin(scene, steps=800)
     restore(before, tmp_path / "run")
-    assert before.steps == 8 and before.stage == before.progress
+    assert before.steps == 8 and before.progress == before.elapsed
 
 
 def test_photos_from_one_spot_are_refused(scene, tmp_path):
@@ -393,19 +399,17 @@ def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     points = np.array([[0.0, -0.6, 0.6], [0.6, 0.0, 0.8]])
     views = [dataclasses.replace(view, seen=np.arange(2)) for view in scene.views]
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
-    fitting = begin(scene, steps=4)
-    fitting.field.occupancy.refine()
-    fitting.carving.force_empty(everywhere=False)
-    assert (
-        fitting.carving.protected.shape == fitting.field.occupancy.occupied.shape
-        and fitting.carving.protected.any()
-    )
+    trainer = begin(scene, steps=4)
+    trainer.field.occupancy.refine()
+    trainer.evidence.free_space.force_empty(everywhere=False)
+    protected = trainer.evidence.free_space.protected
+    assert protected.shape == trainer.field.occupancy.occupied.shape and protected.any()
     fitted(scene, tmp_path / "run", steps=2)  # its other files
-    checkpoint(fitting, tmp_path / "run")
+    checkpoint(trainer, tmp_path / "run")
     again = begin(scene, steps=4)
     restore(again, tmp_path / "run")
-    assert torch.equal(again.carving.protected, fitting.carving.protected)
-    assert torch.equal(again.field.occupancy.forced_empty, fitting.field.occupancy.forced_empty)
+    assert torch.equal(again.evidence.free_space.protected, protected)
+    assert torch.equal(again.field.occupancy.forced_empty, trainer.field.occupancy.forced_empty)
 
 
 def test_a_resumed_fit_draws_the_ground_in_the_units_of_the_run(scene, tmp_path, monkeypatch):
@@ -426,10 +430,11 @@ def test_a_resumed_fit_draws_the_ground_in_the_units_of_the_run(scene, tmp_path,
         lambda *a: dataclasses.replace(find_extent(*a), unit=1.7 * find_extent(*a).unit),
     )
     again = begin(scene, steps=4)
-    assert not torch.equal(again.carving.ground.height, first.carving.ground.height)
+    wanted = first.evidence.free_space.ground.height
+    assert not torch.equal(again.evidence.free_space.ground.height, wanted)
     restore(again, tmp_path / "run")
     assert again.field.unit == first.field.unit
-    assert torch.allclose(again.carving.ground.height, first.carving.ground.height, atol=1e-5)
+    assert torch.allclose(again.evidence.free_space.ground.height, wanted, atol=1e-5)
 
 
 def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):
@@ -444,17 +449,17 @@ def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):
 
 def test_a_checkpoint_in_the_middle_knows_what_photos_see(scene, tmp_path):
     """A run left by a crash must carry snow and light like a finished one."""
-    fitting = begin(scene, steps=40)
+    trainer = begin(scene, steps=40)
     with pytest.raises(KeyboardInterrupt):
-        fitting.run(stop_at(20))
-    checkpoint(fitting, tmp_path)
+        trainer.run(stop_at(20))
+    checkpoint(trainer, tmp_path)
     early = load_field(tmp_path)
     assert early.observed_only().occupancy.occupied.any(), (
         "all is haze: nothing is seen, all is trusted"
     )
     with torch.no_grad():
-        fitting.field.geometry_net[-1].add_(8.0)  # surfaces, as a longer fit would find
-    checkpoint(fitting, tmp_path)
+        trainer.field.geometry_net[-1].add_(8.0)  # surfaces, as a longer fit would find
+    checkpoint(trainer, tmp_path)
     field = load_field(tmp_path)
     assert field.occupancy.seen.sum() > 10
     assert 0 < field.observed_only().occupancy.occupied.sum() < field.occupancy.occupied.sum()
@@ -507,13 +512,12 @@ def test_resuming_with_other_photos_is_refused(scene, tmp_path, heldout):
 
 def test_resuming_with_another_size_is_refused(scene, tmp_path, monkeypatch):
     fitted(scene, tmp_path / "run", steps=2)
-    monkeypatch.setitem(PRESETS, "tiny", dataclasses.replace(TINY, geometry_levels=5))
+    other = dataclasses.replace(TINY, geometry_levels=5)
     monkeypatch.setattr(run_module, "load_pixels", None)  # photos are not read for nothing
     with pytest.raises(UserError, match="earlier version; it can be rendered but not resumed"):
-        fitted(scene, tmp_path / "run", steps=4, resume=True)
-    monkeypatch.setitem(PRESETS, "small", PRESETS["tiny"])
-    with pytest.raises(UserError, match="with --preset tiny; resume it with the same"):
-        fitted(scene, tmp_path / "run", steps=4, resume=True, preset="small")
+        fitted(scene, tmp_path / "run", steps=4, resume=True, size=other)
+    with pytest.raises(UserError, match="with --preset cpu; resume it with the same"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True, preset="gpu", size=other)
 
 
 def test_a_run_from_a_newer_program_is_left_alone(scene, tmp_path):
@@ -589,19 +593,19 @@ def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
         )
 
     measured = []
-    began = run_module.Fitting
+    began = run_module.make_trainer
 
     def begin(*words):
-        fitting = began(*words)
-        measured.append(len(fitting.measured))
-        return fitting
+        trainer = began(*words)
+        measured.append(len(trainer.evidence.depths))
+        return trainer
 
     monkeypatch.setattr(run_module, "plane_sweep_depth", plane_sweep_depth)
-    monkeypatch.setattr(run_module, "Fitting", begin)
+    monkeypatch.setattr(run_module, "make_trainer", begin)
     for index, chosen in enumerate(
         ({}, {"multiview_stereo": False}, {"losses": Losses(sparse_depth=0.0)})
     ):
-        settings = FitSettings(preset="tiny", minutes=None, steps=1, seed=5, **chosen)
+        settings = FitSettings(size=TINY, minutes=None, steps=1, seed=5, **chosen)
         run = tmp_path / str(index)
         run_module.fit_scene(scene, run, settings, 1, False, lambda _: None, lambda *_: None)
     assert asked == [5] and measured == [1, 0, 0]

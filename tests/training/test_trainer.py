@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 from support.toy_fit import begin, labelled, labelled_pixels
-from support.toy_scene import CAMERA, FIELD, make_scene, picture
+from support.toy_scene import CAMERA, FIELD, TINY, make_scene, picture
 
 from climatenerf.core.classes import ROAD, SKY, VEHICLE
 from climatenerf.core.colour import decode_srgb, encode_srgb
@@ -18,11 +18,13 @@ from climatenerf.ops import compositing
 from climatenerf.render.volume import camera_rays, render_view
 from climatenerf.scene import load_image
 from climatenerf.training import losses
-from climatenerf.training import trainer as fit
+from climatenerf.training import trainer as module
+from climatenerf.training.dataset import HORIZON
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import load_pixels
+from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import FitSettings, Losses
-from climatenerf.training.trainer import Fitting
+from climatenerf.training.trainer import make_trainer
 
 
 def heldout_psnr(scene, render):
@@ -50,17 +52,17 @@ def test_a_fit_shows_views_it_has_not_seen(scene):
     Without points or labels a start can go wrong (seeds 0, 1, 2 end at 18.1, 22.9 and 23.4 dB);
     this is about one that does not.
     """
-    fitting = begin(scene, steps=400, seed=2)
+    trainer = begin(scene, steps=400, seed=2)
     reports = []
-    fitting.run(reports.append)
-    colour = fitting.pixels.rgb.float().mean(0).numpy() / 255
+    trainer.run(reports.append)
+    colour = trainer.pixels.rgb.float().mean(0).numpy() / 255
     flat = np.broadcast_to(colour.astype(np.float32), (CAMERA.height, CAMERA.width, 3))
     baseline = heldout_psnr(scene, lambda pose: flat)
-    fitted = heldout_psnr(scene, lambda pose: render_view(fitting.field, CAMERA, pose))
+    fitted = heldout_psnr(scene, lambda pose: render_view(trainer.field, CAMERA, pose))
     assert fitted > baseline + 8, (fitted, baseline)
     assert reports[-1].psnr > reports[20].psnr + 4
     # Matter is where it is in truth, and most of space is empty.
-    field = fitting.field
+    field = trainer.field
     pose = scene.c2w_world(scene.of_split("heldout")[0])
     found, truth = depth_of(field, pose), depth_of(FIELD, pose)
     hit = truth < 6.0
@@ -70,16 +72,16 @@ def test_a_fit_shows_views_it_has_not_seen(scene):
 
 def test_reports_count_and_rise_to_the_end(scene):
     reports = []
-    fitting = begin(scene, steps=25, samples_per_step=2**16)
-    fitting.run(reports.append)
+    trainer = begin(scene, steps=25, samples_per_step=2**16)
+    trainer.run(reports.append)
     assert [r.step for r in reports] == [*range(1, 26)]
     assert [r.progress for r in reports] == pytest.approx([i / 25 for i in range(1, 26)])
     samples = np.array([r.samples for r in reports])
-    assert (np.diff(samples) > 0).all() and samples[-1] == fitting.samples
+    assert (np.diff(samples) > 0).all() and samples[-1] == trainer.samples
     for r in reports:
         assert math.isfinite(r.psnr) and r.rays_per_second > 0 and r.samples_per_ray > 0
     # The budget of samples is kept, whatever the rays meet (the first step goes in blind).
-    assert np.diff(samples).max() < 2.5 * fitting.settings.samples_per_step
+    assert np.diff(samples).max() < 2.5 * trainer.settings.samples_per_step
 
 
 class Clock:
@@ -94,23 +96,23 @@ class Clock:
 
 
 def test_the_time_bound_ends_the_fit_with_the_first_step_beyond_it(scene, monkeypatch):
-    monkeypatch.setattr(fit, "time", Clock())
+    monkeypatch.setattr(module, "time", Clock())
     reports = []
-    fitting = begin(scene, minutes=0.1)
-    fitting.run(reports.append)
+    trainer = begin(scene, minutes=0.1)
+    trainer.run(reports.append)
     seconds = [r.seconds for r in reports]
     assert all(s < 6 for s in seconds[:-1]) and seconds[-1] >= 6
     assert len(seconds) > 2 and reports[-1].progress == 1
-    monkeypatch.setattr(fit, "time", Clock())
+    monkeypatch.setattr(module, "time", Clock())
     both = begin(scene, minutes=0.1, steps=3)
     both.run(lambda _: None)
     assert both.steps == 3, "whichever comes first"
 
 
 def parameters_after(scene, seed, steps=40):
-    fitting = begin(scene, steps=steps, seed=seed)
-    fitting.run(lambda _: None)
-    return fitting.field.state_dict()
+    trainer = begin(scene, steps=steps, seed=seed)
+    trainer.run(lambda _: None)
+    return trainer.field.state_dict()
 
 
 def test_the_same_seed_gives_the_same_field_and_another_seed_another(scene):
@@ -124,44 +126,44 @@ def test_all_parameters_learn_and_stay_finite(scene):
     labelled = begin(scene, steps=20)
     bright = labelled.pixels.rgb.float().mean(-1) > 128
     labelled.pixels.label = torch.where(bright, SKY, ROAD).to(torch.uint8)
-    fitting = Fitting(labelled.pixels, 20, labelled.extent, labelled.settings)
-    before = {k: v.clone() for k, v in fitting.field.named_parameters()}
-    fitting.run(lambda _: None)
-    for name, parameter in fitting.field.named_parameters():
+    trainer = make_trainer(labelled.pixels, labelled.extent, labelled.settings)
+    before = {k: v.clone() for k, v in trainer.field.named_parameters()}
+    trainer.run(lambda _: None)
+    for name, parameter in trainer.field.named_parameters():
         assert torch.isfinite(parameter).all(), name
         assert not torch.equal(parameter, before[name]), name
 
 
 def test_space_outside_every_picture_stays_empty(scene):
-    fitting = begin(scene, steps=40)
-    occupancy = fitting.field.occupancy
+    trainer = begin(scene, steps=40)
+    occupancy = trainer.field.occupancy
     ring = torch.tensor([[0.0, 0.0, 8.0], [0.0, 0.0, 0.5]])  # above all cameras; on the box
     for again in range(2):
-        cells, inside = fitting.field.occupancy.cell_index(fitting.field.to_grid(ring))
+        cells, inside = trainer.field.occupancy.cell_index(trainer.field.to_grid(ring))
         assert inside.all() and occupancy.forced_empty.view(-1)[cells].tolist() == [True, False]
-        occupancy.update(fitting.field.grid_density, 1.0, 0.9, fitting.generator)
+        occupancy.update(trainer.field.grid_density, 1.0, 0.9, trainer.generator)
         assert occupancy.occupied.view(-1)[cells][0] == 0
         if not again:
             occupancy.refine()
-            fitting.carving.force_empty(everywhere=False)
+            trainer.evidence.free_space.force_empty(everywhere=False)
 
 
 def test_a_fit_that_stops_early_does_not_claim_normals(scene):
-    fitting = begin(scene, steps=100)
+    trainer = begin(scene, steps=100)
 
     def report(state):
         if state.step == 20:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fitting.run(report)
-    assert not fitting.field.knows_normals
-    fitting.run(lambda _: None)
-    assert fitting.field.knows_normals
+        trainer.run(report)
+    assert not trainer.field.knows_normals
+    trainer.run(lambda _: None)
+    assert trainer.field.knows_normals
 
 
 def test_colours_are_alike_from_all_sides_until_surfaces_are_found(scene):
-    fitting = begin(scene, steps=40)
+    trainer = begin(scene, steps=40)
     seen = []
 
     def look(report):
@@ -169,33 +171,33 @@ def test_colours_are_alike_from_all_sides_until_surfaces_are_found(scene):
         d = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
         with torch.no_grad():
             colours = [
-                fitting.field.colour_at(
-                    u, torch.arange(50), side, fitting.field.mean_embedding.expand(50, -1)
+                trainer.field.colour_at(
+                    u, torch.arange(50), side, trainer.field.mean_embedding.expand(50, -1)
                 )
                 for side in (d, -d)
             ]
         seen.append((report.progress, float((colours[0] - colours[1]).abs().max())))
 
-    fitting.run(look)
-    assert all(change == 0 for progress, change in seen if progress <= fit.REFINE_AT)
+    trainer.run(look)
+    assert all(change == 0 for progress, change in seen if progress <= Schedule().refine_at)
     assert seen[-1][1] > 0
 
 
 def test_colours_come_back_from_black(scene):
     """In haze before a bright sky they darken for a while, and without slope they stayed so."""
-    fitting = begin(scene, steps=150)
+    trainer = begin(scene, steps=150)
     with torch.no_grad():
-        fitting.field.colour_net[-1].fill_(-4.0)
-    fitting.run(lambda _: None)
-    assert heldout_psnr(scene, lambda c2w: render_view(fitting.field, CAMERA, c2w)) > 14
+        trainer.field.colour_net[-1].fill_(-4.0)
+    trainer.run(lambda _: None)
+    assert heldout_psnr(scene, lambda c2w: render_view(trainer.field, CAMERA, c2w)) > 14
 
 
 def test_near_matter_is_believed_later(scene):
-    fitting = begin(scene, steps=100)
-    assert fitting.near() == pytest.approx(fit.FIRST_NEAR * fitting.field.unit)
-    fitting.steps = 50
-    assert fitting.near() == fitting.field.near
-    assert begin(scene, steps=100, warm_up=False).near() == fitting.field.near
+    trainer = begin(scene, steps=100)
+    assert trainer.near == pytest.approx(Schedule().first_near * trainer.field.unit)
+    trainer.steps = 50
+    assert trainer.near == trainer.field.near
+    assert begin(scene, steps=100, warm_up=False).near == trainer.field.near
 
 
 @pytest.mark.parametrize("steps", [100, 5000])
@@ -204,29 +206,29 @@ def test_thin_matter_counts_as_empty_once_light_ends_on_dense(scene, steps):
     generator = torch.Generator().manual_seed(0)
     ends = {}
     for kind, dense in (("surfaces", 0.97), ("haze", 0.0)):
-        fitting = begin(scene, steps=steps)
-        field = fitting.field
+        trainer = begin(scene, steps=steps)
+        field = trainer.field
         tau = 10 ** (-3 + 2 * torch.rand(4000, generator=generator))  # up to .1
         surface = torch.rand(4000, generator=generator) < dense
         tau = torch.where(surface, tau + 0.5, tau)
         for step in range(steps):
-            fitting.steps = step
+            trainer.steps = step
             met = tau[tau > field.pruning_threshold]
-            fitting.thin_out(met, torch.ones_like(met))
-            if step < fit.THIN_FROM * steps:
+            trainer.raise_pruning_threshold(met, torch.ones_like(met))
+            if step < Schedule().prune_from * steps:
                 assert field.pruning_threshold == MIN_TAU
         ends[kind] = field.pruning_threshold
-    assert ends["surfaces"] == pytest.approx(fitting.settings.pruning_threshold)
-    assert ends["haze"] < 0.5 * fitting.settings.pruning_threshold
+    assert ends["surfaces"] == pytest.approx(trainer.settings.pruning_threshold)
+    assert ends["haze"] < 0.5 * trainer.settings.pruning_threshold
 
 
 def test_colours_may_depend_on_the_view_from_the_first_step(scene):
     """As in a plain NGP, which the ablation compares with and the paper starts from."""
-    for cautious in (True, False):
-        fitting = begin(scene, steps=100, warm_up=cautious)
-        before = fitting.field.view_net[0].detach().clone()
-        fitting.step(fitting.pixels.draw(256, fitting.generator))
-        assert torch.equal(fitting.field.view_net[0].detach(), before) == cautious
+    for warm_up in (True, False):
+        trainer = begin(scene, steps=100, warm_up=warm_up)
+        before = trainer.field.view_net[0].detach().clone()
+        trainer.step(trainer.pixels.draw(256, trainer.generator))
+        assert torch.equal(trainer.field.view_net[0].detach(), before) == warm_up
 
 
 @pytest.mark.slow
@@ -234,13 +236,13 @@ def test_rays_below_the_horizon_end_on_matter(scene):
     """They do even where nothing else asks for it: with no colour to explain."""
     left = {}
     for weight in (0.0, 1.0):
-        fitting = begin(scene, steps=100, losses=Losses(below_horizon_opacity=weight))
-        fitting.run(lambda _: None)
-        batch = fitting.pixels.draw(2000, torch.Generator().manual_seed(0))
-        below = batch.rays_d[:, 2] < fit.HORIZON
+        trainer = begin(scene, steps=100, losses=Losses(below_horizon_opacity=weight))
+        trainer.run(lambda _: None)
+        batch = trainer.pixels.draw(2000, torch.Generator().manual_seed(0))
+        below = batch.rays_d[:, 2] < HORIZON
         o, d = batch.rays_o[below], batch.rays_d[below]
-        near, far = torch.full((len(o),), fitting.field.near), torch.full((len(o),), 1e9)
-        samples = fitting.field.march(o, d, near, far)
+        near, far = torch.full((len(o),), trainer.field.near), torch.full((len(o),), 1e9)
+        samples = trainer.field.march(o, d, near, far)
         tau = samples.sigma * samples.dt
         left[weight] = float(compositing.render_weights(tau, samples.offsets)[1].mean())
     assert left[1.0] < 0.5 * left[0.0], left
@@ -263,30 +265,31 @@ def test_points_put_matter_where_they_are(scene):
     known = replace(scene, points=points, views=tuple(views))
     off = {}
     for name, given in (("with", known), ("without", scene)):
-        fitting = begin(scene, steps=150)
+        trainer = begin(scene, steps=150)
         found = read_sparse_depth(given)
-        fitting.measured = [] if found is None else [found]
-        fitting.run(lambda _: None)
+        depths = () if found is None else (found,)
+        trainer.objective.evidence = replace(trainer.evidence, depths=depths)
+        trainer.run(lambda _: None)
         rays = read_sparse_depth(known)
         assert rays is not None
-        near = torch.full_like(rays.depth, fitting.field.near)
-        samples = fitting.field.march(rays.rays_o, rays.rays_d, near, 2 * rays.depth)
+        near = torch.full_like(rays.depth, trainer.field.near)
+        samples = trainer.field.march(rays.rays_o, rays.rays_d, near, 2 * rays.depth)
         tau = samples.sigma * samples.dt
         weights, left = compositing.render_weights(tau, samples.offsets)
-        unit = fitting.field.unit
+        unit = trainer.field.unit
         off[name] = losses.sparse_depth_loss(
             weights, left, samples.t / unit, rays.depth / unit, samples.ray_index()
         )
     assert off["with"] < 0.6 * off["without"], off
 
 
-def test_what_rays_meet_is_occupied_from_the_first_step_on(scene, monkeypatch):
-    """Nothing else has told the occupancy of density yet: `update_occupancy` is not called here."""
-    monkeypatch.setattr(fit, "SEEN_WEIGHT", 1e-4)  # an untrained field is haze
-    fitting = begin(scene, steps=1000)
-    assert not (fitting.field.occupancy.density > 0).any()
-    fitting.step(fitting.pixels.draw(1024, fitting.generator))
-    assert (fitting.field.occupancy.density > 0).sum() > 100
+def test_cells_that_rays_hit_are_occupied_from_the_first_step_on(scene):
+    """Nothing else has updated the occupancy: `update_occupancy` is not called here."""
+    schedule = Schedule(occupied_weight=1e-4)  # an untrained field is haze
+    trainer = begin(scene, steps=1000, schedule=schedule)
+    assert not (trainer.field.occupancy.density > 0).any()
+    trainer.step(trainer.pixels.draw(1024, trainer.generator))
+    assert (trainer.field.occupancy.density > 0).sum() > 100
 
 
 def lost_before_surfaces(field, scene):
@@ -326,9 +329,9 @@ def test_exposures_do_not_become_floaters(tmp_path):
     def start(**settings):
         views = scene.of_split("train")
         extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
-        chosen = FitSettings("tiny", None, 300, samples_per_step=2**15, **settings)
+        chosen = FitSettings(size=TINY, minutes=None, steps=300, samples_per_step=2**15, **settings)
         pixels = labelled_pixels(scene, labels)
-        return Fitting(pixels, len(views), extent, chosen, read_sparse_depth(scene))
+        return make_trainer(pixels, extent, chosen, read_sparse_depth(scene))
 
     plain = start()
     gains = 1.5 ** np.random.default_rng(0).uniform(-1, 1, len(labels))
@@ -338,9 +341,9 @@ def test_exposures_do_not_become_floaters(tmp_path):
         shown = encode_srgb(linear * float(gain)).clamp(0, 1)
         Image.fromarray((shown.numpy() * 255 + 0.5).astype(np.uint8)).save(view.path)
     exposed = start()
-    for fitting in (plain, exposed):
-        fitting.run(lambda _: None)
-    lost = [lost_before_surfaces(fitting.field, scene) for fitting in (plain, exposed)]
+    for trainer in (plain, exposed):
+        trainer.run(lambda _: None)
+    lost = [lost_before_surfaces(trainer.field, scene) for trainer in (plain, exposed)]
     assert lost[1] < 1.5 * lost[0] + 0.01, lost
     learned = exposures_learned(exposed.field, scene)
     assert np.corrcoef(np.log(learned), np.log(gains))[0, 1] > 0.8, (learned, gains)
@@ -361,21 +364,21 @@ def test_someone_in_one_photo_leaves_the_scene(tmp_path):
     Image.fromarray(values).save(view.path)
     views = scene.of_split("train")
     extent = find_extent(np.stack([scene.c2w_world(v) for v in views]), None)
-    settings = FitSettings("tiny", None, 500, samples_per_step=2**15)
+    settings = FitSettings(size=TINY, minutes=None, steps=500, samples_per_step=2**15)
     pixels = labelled_pixels(scene, labels)
-    fitting = Fitting(pixels, len(views), extent, settings, read_sparse_depth(scene))
-    fitting.run(lambda _: None)
+    trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene))
+    trainer.run(lambda _: None)
     x, y = (np.arange(48) + 0.5) / 48, (np.arange(36) + 0.5) / 36
     place = torch.tensor(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).float()
     with torch.no_grad():
-        own = fitting.masks(torch.full((len(place),), 3), place).view(36, 48)
-        others = [fitting.masks(torch.full((len(place),), i), place) for i in (1, 5, 9)]
+        own = trainer.masks(torch.full((len(place),), 3), place).view(36, 48)
+        others = [trainer.masks(torch.full((len(place),), i), place) for i in (1, 5, 9)]
     assert own[14:26, 22:26].mean() > 0.8, own[14:26, 22:26].mean()
     assert torch.cat(others).gt(0.5).float().mean() < 0.02
     assert own[:, :14].gt(0.5).float().mean() < 0.05
     # And hardly any magenta (1, 0, 1) is left in the scene where the figure stood.
     place = np.s_[12:28, 21:27]
-    shown = render_view(fitting.field, CAMERA, scene.c2w_world(view))[place]
+    shown = render_view(trainer.field, CAMERA, scene.c2w_world(view))[place]
     truth = picture(scene.c2w_world(view))[place] / 255
     tint = np.array([1.0, -2.0, 1.0])
     assert ((shown - truth) @ tint).mean() < 0.35 * (2 - truth @ tint).mean()
@@ -389,26 +392,26 @@ def test_a_step_has_every_loss_and_all_gradients_are_finite(scene):
     pixels.label = torch.where(grey > 128, SKY, others).to(torch.uint8)
     pixels.relative = torch.rand(len(pixels.rgb)).half()
     settings = FitSettings(
-        preset="tiny",
+        size=TINY,
         minutes=None,
         steps=60,
         samples_per_step=2**13,
         losses=Losses(normal_consistency=0.01),
         refine_poses=True,
     )
-    fitting = Fitting(pixels, 20, begin(scene).extent, settings)
-    fitting.run(lambda _: None)
-    grads = [p.grad for p in [*fitting.masks.parameters(), *fitting.poses.parameters()]]
+    trainer = make_trainer(pixels, begin(scene).extent, settings)
+    trainer.run(lambda _: None)
+    grads = [p.grad for p in [*trainer.masks.parameters(), *trainer.poses.parameters()]]
     assert all(grad is not None and torch.isfinite(grad).all() for grad in grads)
-    assert any((grad != 0).any() for grad in grads[-2:]) and (fitting.poses.turn != 0).any()
-    assert (fitting.relative.sums[:, 0] > 0).any()
-    assert fitting.field.knows_classes and fitting.field.knows_normals
+    assert any((grad != 0).any() for grad in grads[-2:]) and (trainer.poses.turn != 0).any()
+    assert (trainer.objective.depth_alignment.sums[:, 0] > 0).any()
+    assert trainer.field.knows_classes and trainer.field.knows_normals
 
 
 def test_switched_off_losses_have_no_part(scene):
     """Without any of them the fit is the plain one: masks, classes and normals stay untouched."""
     nothing = Losses(**{each.name: 0.0 for each in dataclasses.fields(Losses)})
-    fitting = begin(
+    trainer = begin(
         scene,
         steps=40,
         losses=nothing,
@@ -416,11 +419,11 @@ def test_switched_off_losses_have_no_part(scene):
         free_space=False,
         near_camera_gradient_scaling=0.0,
     )
-    before = {k: v.clone() for k, v in fitting.field.named_parameters()}
-    masks = [p.clone() for p in fitting.masks.parameters()]
-    fitting.run(lambda _: None)
-    for name, parameter in fitting.field.named_parameters():
+    before = {k: v.clone() for k, v in trainer.field.named_parameters()}
+    masks = [p.clone() for p in trainer.masks.parameters()]
+    trainer.run(lambda _: None)
+    for name, parameter in trainer.field.named_parameters():
         idle = name.startswith(("surface", "embeddings", "sky_grid"))
         assert torch.equal(parameter, before[name]) == idle, name
-    assert all(map(torch.equal, masks, fitting.masks.parameters()))
-    assert not fitting.field.knows_normals and not fitting.field.knows_classes
+    assert all(map(torch.equal, masks, trainer.masks.parameters()))
+    assert not trainer.field.knows_normals and not trainer.field.knows_classes

@@ -1,12 +1,12 @@
 import torch
 
 from climatenerf.training import losses
+from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import FitSettings, Losses
-from climatenerf.training.trainer import MASK_SHARES
 from climatenerf.training.transients import TransientMasks
 
 PRICE = Losses().transient
-RATE = MASK_SHARES[1] * FitSettings().net_rate
+RATE = Schedule().masks[1] * FitSettings().net_rate
 
 
 def train(error_at, images=4, steps=600):
@@ -39,7 +39,7 @@ def test_what_one_photo_shows_is_masked_there_and_nowhere_else():
     assert m[there].mean() > 0.8, m[there].mean()
     assert m[~there].mean() < 0.03, m[~there].mean()
     assert m[image != 1].max() < 0.2  # images do not leak into each other
-    shares = masks.shares()
+    shares = masks.masked_fractions()
     assert shares[1].isclose(torch.tensor(0.2 * 0.7), atol=0.03) and not shares[[0, 2, 3]].any()
 
 
@@ -65,7 +65,7 @@ def test_a_capture_without_anything_amiss_does_not_wear_masks_out():
 def test_masked_loss_is_lowest_at_the_price():
     """Turning M on pays exactly where the unexplained error is above the price."""
     price, m = torch.tensor([PRICE]), torch.linspace(0.001, 0.999, 999)[:, None]
-    for unexplained, best in ((2 * PRICE, 0.999), (0.5 * PRICE, 2 * losses.FAINT)):
+    for unexplained, best in ((2 * PRICE, 0.999), (0.5 * PRICE, 2 * losses.RESTING_MASK)):
         off = torch.tensor([unexplained])
         found = [losses.masked_colour_loss(off * 0, off, each, price) for each in m]
         assert abs(float(m[int(torch.stack(found).argmin())]) - best) < 1e-3
@@ -79,7 +79,7 @@ def test_colours_learn_from_their_error_and_masks_from_what_is_unexplained():
     losses.masked_colour_loss(error, unexplained, mask, price).backward()
     assert error.grad is not None and torch.allclose(error.grad, torch.full((2,), 0.75 / 2))
     assert unexplained.grad is None
-    expected = PRICE - unexplained.detach() - PRICE * losses.FAINT / 0.25
+    expected = PRICE - unexplained.detach() - PRICE * losses.RESTING_MASK / 0.25
     assert mask.grad is not None and torch.allclose(mask.grad, expected / 2)
 
 

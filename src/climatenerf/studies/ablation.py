@@ -5,7 +5,6 @@ sampling, and scored like any run (`evaluation.scores`).
 """
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
 from climatenerf.training.folder import OPTIMISER, check_config
 from climatenerf.training.run import fit_scene
-from climatenerf.training.settings import FitSettings, Losses
+from climatenerf.training.settings import FitSettings, Losses, as_config, settings_of
 from climatenerf.training.trainer import Report
 
 SCHEMA_VERSION = 1
@@ -65,7 +64,7 @@ COLUMNS = {
 
 def rows(minutes: float) -> dict[str, FitSettings]:
     """Return the settings of each row; the first has photometric losses alone, like plain NGP."""
-    full = FitSettings(minutes=minutes)
+    full = dataclasses.replace(settings_of("cpu"), minutes=minutes)
 
     def without(**weights: float) -> FitSettings:
         return dataclasses.replace(full, losses=dataclasses.replace(full.losses, **weights))
@@ -214,7 +213,7 @@ def fit_row(
         UserError: the folder holds a fit of other settings.
         KeyboardInterrupt: the fit was interrupted; the folder holds what is needed to resume.
     """
-    expected = json.loads(json.dumps(dataclasses.asdict(settings)))
+    expected = as_config(settings)
     begun = (run / "config.json").is_file() and (run / OPTIMISER).is_file()
     if begun:
         config = check_config(run)

@@ -48,8 +48,8 @@ class Batch:
     """Display sRGB in [0,1]."""
     label: UInt8[Tensor, "n"]
     """Merged class of the image's label, 255 unknown."""
-    place: Float[Tensor, "n 2"]
-    """Where in the image, (x, y) in (0,1)."""
+    xy: Float[Tensor, "n 2"]
+    """Position in the image, (x, y) in (0,1)."""
     cosine: Float[Tensor, "n"]
     """Of the angle between the ray and the optical axis."""
     in_line: Bool[Tensor, "m"]
@@ -93,14 +93,14 @@ class TrainingPixels:
         shapes = [(camera.height, camera.width) for camera in self.cameras]
         rgb, _ = in_one_row(shapes, images, np.uint8, 0, channels=3)
         self.rgb = to_device(rgb)
-        self.usable, self.drawable, self.share = None, None, 1.0
+        self.usable, self.drawable, self.usable_fraction = None, None, 1.0
         self.spacings = torch.tensor(SPACINGS)
         self.axes = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
         usable = (None if mask is None else mask > 0 for mask in masks or ())
         flat, shown = in_one_row(shapes, usable, np.bool_, True)
         if flat.size:
             self.usable, self.drawable = to_device(flat), torch.from_numpy(flat)
-            self.share = int(flat.sum()) / flat.size
+            self.usable_fraction = int(flat.sum()) / flat.size
         self.label = None
         self.sky_hull = None
         self.edge = torch.zeros(0, dtype=torch.long)
@@ -140,7 +140,7 @@ class TrainingPixels:
             other.label = torch.where(self.label == SKY, UNKNOWN, self.label).to(torch.uint8)
         return other
 
-    def place_towards(
+    def xy_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 2"]:
         """Where in its picture, (x, y) in (0,1), an image shows a direction; NaN outside it."""
@@ -159,7 +159,7 @@ class TrainingPixels:
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> tuple[Bool[Tensor, "n"], Int[Tensor, "k"]]:
         """Whether images show directions at all, and the pixels of those that they show."""
-        place = self.place_towards(image, rays_d)
+        place = self.xy_towards(image, rays_d)
         inside = ~place[:, 0].isnan()
         image, place = image[inside], place[inside]
         width, height = self.width[image], self.height[image]
@@ -245,13 +245,7 @@ class TrainingPixels:
             pixel = self.pixel_start[image] + within
         width = self.width[image]
         column, row = within % width, within.div(width, rounding_mode="floor")
-        place = torch.stack(
-            [
-                (column + 0.5) / width,
-                (row + 0.5) / self.height[image],
-            ],
-            dim=-1,
-        )
+        xy = torch.stack([(column + 0.5) / width, (row + 0.5) / self.height[image]], dim=-1)
         c2w = self.c2w[image]
         d = self.directions.of(self.camera[image], column, row)
         unknown = torch.full((n,), UNKNOWN, dtype=torch.uint8)
@@ -261,7 +255,7 @@ class TrainingPixels:
             image=image,
             rgb=self.rgb[pixel].float() / 255.0,
             label=unknown if self.label is None else self.label[pixel],
-            place=place,
+            xy=xy,
             cosine=d[:, 2],
             in_line=in_line,
             relative=None if self.relative is None else self.relative[pixel].float(),
@@ -277,7 +271,7 @@ class TrainingPixels:
             return integers(generator, 0, total, n)
         found = torch.zeros(0, dtype=torch.long, device="cpu")
         while found.shape[0] < n:
-            more = min(int((n - found.shape[0]) / self.share) + 1, AT_MOST)
+            more = min(int((n - found.shape[0]) / self.usable_fraction) + 1, AT_MOST)
             pixel = torch.randint(0, total, (more,), generator=generator, device="cpu")
             found = torch.cat([found, pixel[self.drawable[pixel]]])
         return upload(found[:n])

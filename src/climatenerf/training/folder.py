@@ -5,7 +5,6 @@ from pathlib import Path
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import check_schema, read_json
-from climatenerf.field.presets import PRESETS
 from climatenerf.scene.scene import Scene
 from climatenerf.training.settings import FitSettings, with_present_names
 
@@ -54,7 +53,7 @@ def check_resumable(run: Path, settings: FitSettings) -> None:
         UserError: in one sentence, what to do instead.
     """
     config = check_config(run)
-    before, size = config.get("settings") or {}, PRESETS[settings.preset]
+    before, size = config.get("settings") or {}, settings.size
     if "losses" in before and before.get("preset", settings.preset) != settings.preset:
         raise UserError(
             f"{run} was fitted with --preset {before['preset']}; resume it with the same"

@@ -1,6 +1,6 @@
-"""Losses of the paper (supplement, "Training Details") and some more, each a pure function.
+"""Formulas of the losses of the paper (supplement, "Training Details") and of further ones.
 
-Their weights are in `settings.Losses`.
+Each is a pure function; `objective.py` applies them and `settings.Losses` holds their weights.
 """
 
 import torch
@@ -11,14 +11,18 @@ from torch import Tensor
 from climatenerf.core.colour import encode_srgb
 from climatenerf.ops import compositing
 
+MAX_GROUND_ERROR = 0.05  # of `distance_measure`
+CREASE = 0.03  # second difference from which a change of depth is an edge rather than noise
+RESTING_MASK = 0.018  # value of a mask where nothing is wrong; at 0 it would learn no more
+
 
 def colour_error(linear: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-    """Squared error of display values; `linear` is radiance, `target` display sRGB."""
+    """Return the squared error of display values; `linear`: radiance, `target`: display sRGB."""
     return (encode_srgb(linear) - target).square().mean(-1)
 
 
 def distance_measure(t: Float[Tensor, "s"]) -> Float[Tensor, "s"]:
-    """Bounded measure of distance for the distortion loss: t up to 1, then 2 - 1/t.
+    """Return a bounded measure of a ray length in grid units: t up to 1, then 2 - 1/t.
 
     In plain t, two samples on a far background would outweigh everything near.
     """
@@ -31,9 +35,13 @@ def distortion_loss(
     dt: Float[Tensor, "s"],
     offsets: Int[Tensor, "rays+1"],
 ) -> Float[Tensor, ""]:
-    """Mean distortion (mip-NeRF 360, Eq. 15): weight along a ray gathers at one place.
+    """Return the mean distortion of rays (mip-NeRF 360, Eq. 15): the spread of their weights.
 
-    t and dt in field units.
+    Args:
+        weights: of the samples.
+        t: ray length of each sample's middle, grid units.
+        dt: extent of each sample, grid units.
+        offsets: samples of ray r are offsets[r]:offsets[r + 1].
     """
     start, end = distance_measure(t - dt / 2), distance_measure(t + dt / 2)
     return compositing.distortion(weights, (start + end) / 2, end - start, offsets).mean()
@@ -41,35 +49,48 @@ def distortion_loss(
 
 def sparse_depth_loss(
     weights: Float[Tensor, "s"],
-    left: Float[Tensor, "n"],
+    transmittance: Float[Tensor, "n"],
     t: Float[Tensor, "s"],
     depth: Float[Tensor, "n"],
     ray: Int[Tensor, "s"],
 ) -> Float[Tensor, ""]:
-    """Mean distance of rays' matter from where it was measured, in `distance_measure`.
+    """Return the mean distance of rays' matter from the measured one, in `distance_measure`.
 
-    The mean of |s - s_measured| over the weights, not the error of the mean: it gathers them at
-    the point. Light left counts as matter at infinity. t and depth in field units.
+    It is the mean of |s - s_measured| over the weights, not the error of the mean, so it gathers
+    the weights at the point. Transmitted light counts as matter at infinity.
+
+    Args:
+        weights: of the samples.
+        transmittance: of the rays.
+        t: ray length of each sample, grid units.
+        depth: measured ray length, grid units.
+        ray: of each sample.
     """
-    goal = distance_measure(depth)
-    off = weights * (distance_measure(t) - goal[ray]).abs()
-    return (off.sum() + (left * (2.0 - goal)).sum()) / depth.shape[0]
+    target = distance_measure(depth)
+    error = weights * (distance_measure(t) - target[ray]).abs()
+    return (error.sum() + (transmittance * (2.0 - target)).sum()) / depth.shape[0]
 
 
 def ground_height_loss(
-    weights: Float[Tensor, "k"], t: Float[Tensor, "k"], goal: Float[Tensor, "k"], rays: int
+    weights: Float[Tensor, "k"], t: Float[Tensor, "k"], target: Float[Tensor, "k"], rays: int
 ) -> Float[Tensor, ""]:
-    """Mean over rays of their matter's distance from the ground at `goal`, as in `depth_loss`.
+    """Return the mean over rays of their matter's distance from the ground, in `distance_measure`.
 
-    At most `FAR` counts: lumps are near the ground, and the rim of a tree before a far lawn must
-    not outweigh its colours.
+    A sample's error is at most `MAX_GROUND_ERROR`: clutter is near the ground, and the rim of a
+    tree in front of a far lawn must not outweigh its colours.
+
+    Args:
+        weights: of the samples.
+        t: their ray lengths, grid units.
+        target: ray lengths at which their rays meet the ground, grid units.
+        rays: number of rays of the step.
     """
-    off = (distance_measure(t) - distance_measure(goal)).abs().clamp_max(FAR)
-    return (weights * off).sum() / rays
+    error = (distance_measure(t) - distance_measure(target)).abs().clamp_max(MAX_GROUND_ERROR)
+    return (weights * error).sum() / rays
 
 
 def opacity_entropy_loss(transmittance: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Mean of -o·log o of the rays' opacity o: rays see matter or sky, not half of each."""
+    """Return the mean of -o·log o over the rays' opacities o."""
     opacity = (1.0 - transmittance).clamp(1e-6, 1.0)  # log 0
     return -(opacity * opacity.log()).mean()
 
@@ -77,40 +98,43 @@ def opacity_entropy_loss(transmittance: Float[Tensor, "n"]) -> Float[Tensor, ""]
 def below_horizon_loss(
     transmittance: Float[Tensor, "n"], below: Bool[Tensor, "n"]
 ) -> Float[Tensor, ""]:
-    """Mean squared transmittance of the rays that point below the horizon.
+    """Return the mean squared transmittance of the rays that point below the horizon.
 
-    They end on something. Its expectation is that of a random colour behind them (variance 1/12
-    over [0,1]; Müller et al. 2022 train so), without the noise: a sky that is free to learn
-    paints the ground, and haze in front of it suffices.
+    Such rays end on matter. The loss is the expectation of the error that a random colour behind
+    them makes (variance 1/12 over [0,1]; Müller et al. 2022 train so), without its noise. A sky
+    that is free to learn would paint the ground, with haze in front of it.
     """
     return (transmittance.square() * below).mean()
 
 
 def sky_loss(weights: Float[Tensor, "k"], rays: int) -> Float[Tensor, ""]:
-    """Mean over rays of the weights of matter that stands in the sky: the sky has no density."""
+    """Return the mean over rays of the weights of samples in the sky, which has no density."""
     return weights.sum() / rays
 
 
 def far_sky_loss(distance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Float[Tensor, ""]:
-    """The paper's form, exp(-distance) on sky rays: an opaque sky, far away.
+    """Return the paper's sky loss, the mean of exp(-distance) on sky rays: an opaque, far sky.
 
-    `distance` is the composited one, in grid units: 0 where nothing is.
+    `distance` is the composited one, in grid units; 0 on a ray without matter.
     """
     return ((-distance).exp() * is_sky).mean()
 
 
 def second_difference(z: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
-    """Relative second difference of 1/z over pixels in a line: middle, left, right.
+    """Return the relative second difference of 1/z over pixels in a line: middle, left, right.
 
-    The inverse z-depth of a plane is affine in pixel coordinates, so planes bend by 0 however
-    they are tilted.
+    The inverse z-depth of a plane is affine in pixel coordinates, so a plane gives 0 whatever its
+    tilt.
     """
     middle, left, right = z.unbind(-1)
     return middle / left + middle / right - 2.0
 
 
 def planarity_loss(z: Float[Tensor, "m 3"], counts: Float[Tensor, "m"]) -> Float[Tensor, ""]:
-    """Mean of e² / (e² + `CREASE`²), e the bending (Geman & McClure): edges of depth go free."""
+    """Return the mean of e² / (e² + `CREASE`²), e the second difference (Geman & McClure).
+
+    Its gradient vanishes at edges of depth. `counts`: weight of each triple, [0,1].
+    """
     squared = second_difference(z).square()
     return (counts * squared / (squared + CREASE**2)).mean()
 
@@ -118,9 +142,9 @@ def planarity_loss(z: Float[Tensor, "m 3"], counts: Float[Tensor, "m"]) -> Float
 def class_loss(
     logits: Float[Tensor, "n c"], target: Int[Tensor, "n"], known: Bool[Tensor, "n"]
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of composited logits where the class is known, a mean over all rays."""
+    """Return the cross-entropy of composited logits where the class is known, over all rays."""
     counted = torch.where(known, target, -1)
-    # Each class in a row: a softmax over six numbers side by side takes five times as long.
+    # One row a class: a softmax over six adjacent numbers takes five times as long.
     rows, goal = logits.T[None], counted[None]
     return F.cross_entropy(rows, goal, reduction="sum", ignore_index=-1) / logits.shape[0]
 
@@ -131,12 +155,8 @@ def normal_loss(
     target: Float[Tensor, "s 3"],
     rays: int,
 ) -> Float[Tensor, ""]:
-    """Mean over rays of the weighted squared distance of unit normals (Verbin et al. 2022)."""
+    """Return the weighted squared distance of unit normals a ray (Verbin et al. 2022)."""
     return (weights * (predicted - target).square().sum(-1)).sum() / rays
-
-
-# M that costs least where nothing is amiss: at 0 it would learn no more. Such are M's first values.
-FAINT = 0.018
 
 
 def masked_colour_loss(
@@ -145,17 +165,37 @@ def masked_colour_loss(
     mask: Float[Tensor, "n"],
     price: Float[Tensor, "n"],
 ) -> Float[Tensor, ""]:
-    """(1 - M)·error + price·(M - `FAINT` log M): see `transients.py`. Meant for its gradients.
+    """Return (1 - M)·error + price·(M - `RESTING_MASK` log M), for its gradients.
 
-    Colours learn from their error, as far as M lets them; M from the error that no pixel nearby
-    explains, (1 - M)·unexplained. The value is the mean of both and of what M costs. The logarithm
-    holds an M that nothing pulls at near `FAINT`: at 0 it would learn no more.
+    Colours learn from their error, weighted with 1 - M. M learns from the error that no
+    neighbouring pixel explains, (1 - M)·unexplained. The value is the mean of both and of the price
+    of M. The logarithm keeps an M without gradients near `RESTING_MASK`: at 0 it would learn no
+    more. See `transients.py`.
+
+    Args:
+        error: squared colour error of each pixel.
+        unexplained: the error that remains if the pixel may have a neighbour's colour.
+        mask: M, (0,1).
+        price: of masking each pixel, in squared display values.
     """
-    trusted = 1.0 - mask
-    # 1e-6: of an M that is 0 in 32 bits, log 0 and in its gradient 0/0.
-    paid = price * (mask - FAINT * mask.clamp_min(1e-6).log())
-    return (trusted.detach() * error + trusted * unexplained.detach() + paid).mean()
+    unmasked = 1.0 - mask
+    # 1e-6: if M underflows to 0, log 0 and in its gradient 0/0.
+    cost = price * (mask - RESTING_MASK * mask.clamp_min(1e-6).log())
+    return (unmasked.detach() * error + unmasked * unexplained.detach() + cost).mean()
 
 
-FAR = 0.05  # of `distance_measure`
-CREASE = 0.03  # bending that counts as an edge rather than as noise
+class _ScaledGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value, factor):
+        ctx.save_for_backward(factor)
+        return value.view_as(value)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (factor,) = ctx.saved_tensors
+        return grad * factor, None
+
+
+def scale_gradient(value: Float[Tensor, "*n"], factor: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Return the value itself, with its gradient multiplied by a factor."""
+    return _ScaledGradient.apply(value, factor)

@@ -1,8 +1,8 @@
-"""Which samples get colour and gradients.
+"""Importance sampling: which samples of a ray get colour and gradients.
 
-Early on rays cross haze, with hundreds of samples that hardly weigh: about `CHOSEN` a ray are drawn
-in proportion to their weights, each standing for those like it. Where surfaces are found all that
-weigh are taken.
+Early in a fit rays cross haze, with hundreds of samples of small weight. A few of them a ray are
+selected with probabilities proportional to their weights. Where surfaces are found, all samples of
+any weight are selected.
 """
 
 import torch
@@ -10,26 +10,30 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.core.device import uniform
-from climatenerf.training.static_shapes import Rooms
-
-CHOSEN = 32  # samples of a ray, about
-MIN_CHANCE = 0.25  # of any sample; with less, the noise lets walls grow before the cameras
+from climatenerf.training.schedule import Schedule
+from climatenerf.training.static_shapes import Buffers
 
 
-def choose(
-    weights: Float[Tensor, "s"], there: Bool[Tensor, "s"], rooms: Rooms, generator: torch.Generator
+def select_samples(
+    weights: Float[Tensor, "s"],
+    valid: Bool[Tensor, "s"],
+    schedule: Schedule,
+    buffers: Buffers,
+    generator: torch.Generator,
 ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"]]:
-    """Indices of the chosen samples, and the chance that each had.
+    """Return the indices of selected samples, and the inclusion probability of each.
 
     Args:
-        weights: of all samples.
-        there: which are samples, and not what fills a room.
-        rooms: for the list.
-        generator: of randomness.
+        weights: of all samples, [0,1].
+        valid: False for the unused entries of a fixed-capacity buffer.
+        schedule: number of samples a ray, and the smallest probability.
+        buffers: for the list of indices.
+        generator: source of random numbers, on the CPU.
     """
-    chance = (CHOSEN * weights).clamp(MIN_CHANCE, 1.0) * there
-    # Systematic sampling: drawn ones are spread evenly among those like them.
-    passed = chance.double().cumsum(0) + uniform(generator, 1).double()
-    kept = rooms.chosen("kept", passed.floor() > (passed - chance).floor())
-    # What fills a room has no chance, 0/0.
-    return kept, chance[kept].clamp_min(MIN_CHANCE)
+    least = schedule.min_inclusion_probability
+    probability = (schedule.selected_per_ray * weights).clamp(least, 1.0) * valid
+    # Systematic sampling: selected samples are spread evenly among those of similar weight.
+    passed = probability.double().cumsum(0) + uniform(generator, 1).double()
+    selected = buffers.indices("selected", passed.floor() > (passed - probability).floor())
+    # Unused entries of a buffer have probability 0: 0/0.
+    return selected, probability[selected].clamp_min(least)

@@ -1,6 +1,9 @@
 """Settings of a fit, as plain values. Imports no torch."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+
+from climatenerf.field.presets import PRESETS, FieldSize
+from climatenerf.training.schedule import Schedule
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,9 @@ class FitSettings:
     """Settings of a fit."""
 
     preset: str = "cpu"
+    """Name of the preset that the settings come from."""
+    size: FieldSize = field(default_factory=FieldSize)
+    """Sizes of the field's grids and networks."""
     minutes: float | None = 5.0
     """Stop after this many minutes, above 0; None: `steps` alone limits the fit."""
     steps: int | None = None
@@ -60,6 +66,7 @@ class FitSettings:
     decay: float = 0.5
     """Weight decay of the appearance grid, times its learning rate a step; 0: none."""
     losses: Losses = field(default_factory=Losses)
+    schedule: Schedule = field(default_factory=Schedule)
     appearance: bool = True
     """Learn a vector for each image that holds its exposure and light."""
     sky_labels: bool = True
@@ -86,6 +93,7 @@ class FitSettings:
 
 PAPER = FitSettings(
     preset="paper",
+    size=PRESETS["paper"],
     losses=Losses(
         distortion=3e-4,
         opacity_entropy=2e-4,
@@ -112,7 +120,7 @@ PAPER = FitSettings(
 
 def settings_of(preset: str, device: str = "cpu") -> FitSettings:
     """Return the settings of a preset of `field.presets` on a device, "cpu" or "cuda"."""
-    settings = PAPER if preset == "paper" else FitSettings(preset=preset)
+    settings = PAPER if preset == "paper" else FitSettings(preset=preset, size=PRESETS[preset])
     # A GPU takes as long for a small step as for a large one.
     return replace(settings, samples_per_step=2**20) if device == "cuda" else settings
 
@@ -136,6 +144,18 @@ RENAMED_SETTINGS = {
     "thin": "pruning_threshold",
 }
 """Names of settings in the `config.json` of earlier runs, and their present names."""
+
+
+def as_config(settings: FitSettings) -> dict:
+    """Return the `settings` of a run's `config.json`; the field's size has its own entry there."""
+    config = asdict(settings)
+    del config["size"]
+    # JSON has no tuples.
+    config["schedule"] = {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in config["schedule"].items()
+    }
+    return config
 
 
 def with_present_names(settings: dict) -> dict:

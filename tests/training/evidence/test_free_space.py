@@ -13,9 +13,9 @@ from climatenerf.training.evidence import ground_height
 from climatenerf.training.evidence.free_space import FreeSpace
 from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.static_shapes import Rooms
+from climatenerf.training.static_shapes import ExactBuffers
 
-EXACT = Rooms(fixed=False)
+EXACT = ExactBuffers()
 TRAIN_ID = {BUILDING: 2, TERRAIN: 9, SKY: 10}
 
 

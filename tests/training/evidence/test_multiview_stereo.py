@@ -64,7 +64,7 @@ def test_ambiguous_stripes_are_rejected():
     stripes = photos(PINHOLE, lambda i, t, x: 0.5 + 0.4 * np.sin(2 * np.pi * x[..., 0] / 0.25))
     found = plane_sweep_depth(stripes, None, DEFAULT_RANGE, 0)
     if found is not None:  # near the sides most depths project outside the neighbours
-        uv = stripes.place_towards(found.image, found.rays_d)
+        uv = stripes.xy_towards(found.image, found.rays_d)
         assert ((uv[:, 0] > 0.3) & (uv[:, 0] < 0.7)).sum() < 0.01 * WINDOWS
 
 
@@ -77,7 +77,7 @@ def test_sky_and_masked_pixels_are_skipped():
     pixels = photos(PINHOLE, lambda i, t, x: grey(x), labels=labels, masks=masks)
     found = plane_sweep_depth(pixels, None, DEFAULT_RANGE, 0)
     assert found is not None
-    uv = pixels.place_towards(found.image, found.rays_d)
+    uv = pixels.xy_towards(found.image, found.rays_d)
     assert uv[:, 0].min() > 0.5 and uv[:, 1].min() > 1 / 3
     assert len(found.depth) > 0.05 * WINDOWS
     pictures = build_pictures(pixels, np.full((5, 9), 1.5), np.full((5, 9), 4.0))
@@ -227,7 +227,7 @@ def test_depth_of_the_reference_street(monkeypatch):
     for i, view in enumerate(scene.of_split("heldout")):
         truth = next(truth for truth in truths if truth.name == Path(view.name).name)
         of_view = found.select(found.image == i)
-        uv = pixels.place_towards(of_view.image, of_view.rays_d).numpy()
+        uv = pixels.xy_towards(of_view.image, of_view.rays_d).numpy()
         height, width = truth.depth.shape
         true = truth.depth[(uv[:, 1] * height).astype(int), (uv[:, 0] * width).astype(int)]
         off.append(np.abs(of_view.depth.numpy() / true - 1))

@@ -24,7 +24,7 @@ from climatenerf.training.evidence.frusta import intersects_frustum, within_came
 from climatenerf.training.evidence.ground_height import fit_ground_height
 from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.static_shapes import Rooms
+from climatenerf.training.static_shapes import Buffers
 
 CHUNK = 2**18  # cells looked up at once, to bound the memory of their centres
 SAME_POINT = 1e-4  # grid units within which two measurements are of one point
@@ -217,7 +217,7 @@ class FreeSpace:
         q: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         t: Float[Tensor, "n"],
-        rooms: Rooms,
+        buffers: Buffers,
         use_classes: bool = False,
     ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Bool[Tensor, "k"]]:
         """Find samples of rays labelled ground that lie off the ground, and their target depth.
@@ -229,7 +229,7 @@ class FreeSpace:
             q: Sample positions, grid units.
             rays_d: Unit directions of their rays.
             t: Ray length of the samples, grid units.
-            rooms: Fixed-capacity buffers of the step.
+            buffers: Index lists of the step.
             use_classes: Whether the field's own classes are reliable yet.
 
         Returns:
@@ -243,12 +243,12 @@ class FreeSpace:
         height_ahead, _ = self.ground.height_above(q + STEP * rays_d)
         approach = (height - height_ahead) / STEP
         excess = height.sign() * (height.abs() - self.ground.tolerance).clamp_min(0.0)
-        off = rooms.chosen("far", valid & (approach > MIN_APPROACH) & (excess != 0))
+        off = buffers.indices("off ground", valid & (approach > MIN_APPROACH) & (excess != 0))
         cells, _ = self.field.occupancy.cell_index(q[off])
         penalised = torch.zeros(off.shape[0], dtype=torch.bool)
         if use_classes:
             penalised = self.classified_as_ground(q[off]) & ~self.near_step.view(-1)[cells]
-        rest = rooms.chosen("rest", ~penalised & ~self.obstacle.view(-1)[cells])
+        rest = buffers.indices("ground hull", ~penalised & ~self.obstacle.view(-1)[cells])
         penalised[rest] = self.in_ground_hull(q[off[rest]], torch.zeros(rest.shape[0]))
         # The filler of a buffer may be a ray that does not approach the ground: 0/0.
         to_ground = excess[off] / approach[off].clamp_min(MIN_APPROACH)

@@ -1,0 +1,143 @@
+"""Checkpoints of a fit: the field, and in `optimiser.safetensors` all else that continues it."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from climatenerf.core.device import to_numpy
+from climatenerf.core.errors import UserError
+from climatenerf.core.storage import read_safetensors, write_safetensors
+from climatenerf.field.checkpoint import load_field, save_field
+from climatenerf.scene.scene import Scene, load_scene
+from climatenerf.training.folder import OPTIMISER, check_config
+from climatenerf.training.trainer import Trainer
+
+OBSERVED_BATCHES, OBSERVED_RAYS = 4, 16384  # that find the cells which training photos show
+
+
+def checkpoint(trainer: Trainer, run: Path) -> None:
+    """Save the field and all that continues the fit, each file atomically."""
+    mark_observed_cells(trainer)
+    save_field(trainer.field, run)
+    state = {f"grid.{k}": v for k, v in trainer.grid_adam.state().items()}
+    for index, moments in trainer.net_adam.state_dict()["state"].items():
+        state |= {f"net.{index}.{k}": torch.as_tensor(v) for k, v in moments.items()}
+    for name, module in (("masks", trainer.masks), ("poses", trainer.poses)):
+        state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
+    state["relative"] = trainer.objective.depth_alignment.sums
+    state["barred"] = torch.from_numpy(np.packbits(to_numpy(trainer.field.occupancy.forced_empty)))
+    state["generator"] = trainer.generator.get_state()
+    counters = [trainer.steps, trainer.samples, trainer.rays]
+    state["counters"] = torch.tensor(counters)
+    floats = [trainer.seconds, trainer.step_scale, trainer.error, trainer.progress]
+    state["floats"] = torch.tensor(floats, dtype=torch.float64)
+    write_safetensors(run / OPTIMISER, state, {})
+
+
+def mark_observed_cells(trainer: Trainer) -> None:
+    """Mark the cells in which training photos show matter now; snow and light ask for them."""
+    field = trainer.field
+    field.occupancy.seen.zero_()
+    generator = torch.Generator(device="cpu").manual_seed(trainer.settings.seed)
+    for _ in range(OBSERVED_BATCHES):
+        batch = trainer.pixels.draw(OBSERVED_RAYS, generator)
+        with torch.no_grad():
+            rays = trainer.poses.rays(batch.rays_o, batch.rays_d, batch.image, field.unit)
+        field.sampler.mark_seen(*rays)
+
+
+def restore(trainer: Trainer, run: Path) -> None:
+    """Load a checkpoint into a trainer of the same scene and settings.
+
+    Raises:
+        UserError: the checkpoint is of another fit, or damaged.
+    """
+    saved, field = load_field(run), trainer.field
+    if saved.embeddings.shape != field.embeddings.shape or saved.size != field.size:
+        raise UserError(
+            f"{run / 'field.safetensors'} is of another fit than its config.json; fit anew into"
+            " another folder"
+        )
+    field.occupancy = saved.occupancy
+    learned = field.learned.clone()
+    with torch.no_grad():
+        field.load_state_dict(saved.state_dict())
+    field.learned |= learned
+    trainer.objective.learns_classes = field.knows_classes
+    field.unit, field.near, field.pruning_threshold = (
+        saved.unit,
+        saved.near,
+        saved.pruning_threshold,
+    )
+    arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    try:
+        _restore_state(trainer, arrays)
+    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+        raise UserError(
+            f"{run / OPTIMISER} is damaged ({type(error).__name__}: {error}); the run can be"
+            " rendered but not resumed, fit anew into another folder"
+        ) from error
+    if not saved.knows_classes:  # the labels are new, so the class head begins to learn now
+        objective = trainer.objective
+        objective.classes_trusted_at = trainer.progress + trainer.schedule.refine_at
+
+
+def _restore_state(trainer: Trainer, arrays: dict) -> None:
+    state = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}
+
+    def part(prefix: str) -> dict:
+        return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+
+    trainer.grid_adam.load(part("grid."))
+    moments: dict[int, dict] = {}
+    for key, value in part("net.").items():
+        index, name = key.split(".")
+        moments.setdefault(int(index), {})[name] = value
+    groups = trainer.net_adam.state_dict()["param_groups"]
+    trainer.net_adam.load_state_dict({"state": moments, "param_groups": groups})
+    trainer.masks.load_state_dict(part("masks."))
+    trainer.poses.load_state_dict(part("poses."))
+    trainer.objective.depth_alignment.sums.copy_(state["relative"])
+    barred = trainer.field.occupancy.forced_empty
+    bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())
+    barred.copy_(torch.from_numpy(bits.astype(bool)).view(barred.shape))
+    trainer.evidence.free_space.fit_ground()  # in the units of the run
+    trainer.evidence.free_space.rasterise_points()
+    trainer.generator.set_state(state["generator"])
+    trainer.steps, trainer.samples, trainer.rays = state["counters"].tolist()
+    floats = state["floats"].tolist()
+    trainer.seconds, trainer.step_scale, trainer.error = floats[:3]
+    trainer.resumed_progress = floats[3] if len(floats) > 3 else 0.0  # absent in earlier versions
+
+
+def in_frame_of(scene: Scene, run: Path, downscale: int) -> Scene:
+    """Return the scene in the metric frame of a run that is to be resumed.
+
+    Raises:
+        UserError: the run is of other photos (appearance belongs to photos, and held-out photos
+            must not have been trained on), of another size of them, or from a newer version.
+    """
+    config = check_config(run)
+    if config.get("downscale") != downscale:
+        raise UserError(
+            f"{run} was fitted at --downscale {config.get('downscale')}; resume it with the same"
+        )
+    before = load_scene(run)
+    names = [view.name for view in before.of_split("train")]
+    if names != [view.name for view in scene.of_split("train")]:
+        raise UserError(
+            f"{run} was fitted to other photos; resume it with the same scene and --holdout"
+        )
+    return dataclasses.replace(
+        scene,
+        world_from_input=before.world_from_input,
+        scale_source=before.scale_source,
+        scale_error=before.scale_error,
+        ground_z=before.ground_z,
+        lowest_ground_z=before.lowest_ground_z,
+        up_report=before.up_report,
+        scale_report=before.scale_report,
+        georeference=before.georeference,
+    )
