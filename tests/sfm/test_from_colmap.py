@@ -99,7 +99,7 @@ def test_a_second_run_may_bring_labels_later(posed, tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda root, here: (here / "no-model", root / "photos"), "holds no COLMAP model"),
+        (lambda root, here: (here / "no-model", root / "photos"), "contains no COLMAP model"),
         (lambda root, here: (root, here / "photos"), "0 of the 11 pictures"),
         (lambda root, here: (root, root / "photos" / "none.jpg"), "does not exist"),
     ],
