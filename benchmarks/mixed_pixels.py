@@ -81,13 +81,13 @@ def main() -> None:
     options = parser.parse_args()
     rays = options.rays
     sys.path.insert(0, str(ROOT))
-    from tools.reference_street.layout import build_scene, measuring_poses
+    from tools.reference_street.layout import build_scene, heldout_poses
     from tools.reference_street.render import load
 
     truths = read_reference(ROOT / "reference" / "street").truths
     with tempfile.TemporaryDirectory() as scratch:
         scene = load(build_scene(), Path(scratch), threads=2)
-    poses = dict(measuring_poses())
+    poses = dict(heldout_poses())
     absorbed, skyward = [], []
     for truth in truths:
         t = depths(scene, poses[truth.name], truth.depth.shape[::-1], rays)

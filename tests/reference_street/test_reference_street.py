@@ -19,8 +19,8 @@ from tools.reference_street.layout import (  # noqa: E402
     build_scene,
     camera_poses,
     ground_datum,
+    heldout_poses,
     look,
-    measuring_poses,
     passers_by,
 )
 from tools.reference_street.mirror import mirrored_view  # noqa: E402
@@ -153,7 +153,7 @@ def test_test_views_are_clear_of_objects_and_water():
     )
     near = solid[np.abs(solid[:, :2]).max(1) < 18]
     photos = np.stack([pose[:3, 3] for _, pose in camera_poses()])
-    for name, pose in measuring_poses():
+    for name, pose in heldout_poses():
         assert np.linalg.norm(near - pose[:3, 3], axis=-1).min() > 0.3, name
         assert pose[2, 3] > ground_datum()[0] + 0.6 + 0.3, "above the high flood"
         distance = np.linalg.norm(photos - pose[:3, 3], axis=-1).min()
@@ -191,8 +191,8 @@ REFERENCE = ROOT / "reference" / "street"
 def test_the_set_on_disk_matches_its_checksums():
     for folder in (
         REFERENCE,
-        publish.beside(REFERENCE, "busy"),
-        publish.beside(REFERENCE, "turned"),
+        publish.variant_folder(REFERENCE, "busy"),
+        publish.variant_folder(REFERENCE, "turned"),
     ):
         lines = (folder / "SHA256SUMS").read_text().splitlines()
         assert len(lines) >= 3
@@ -235,7 +235,7 @@ def test_gravity_alignment_and_scale_of_the_rotated_variant():
     from climatenerf.scene import read_scene
     from climatenerf.scene.alignment.known_length import apply_known_lengths, measure
 
-    scene = read_scene(publish.beside(REFERENCE, "turned"))
+    scene = read_scene(publish.variant_folder(REFERENCE, "turned"))
     turn = np.eye(4)
     turn[:3, :3] = publish.SHRUNK * publish._rotation(*publish.TURN)
     turn[:3, 3] = publish.SHIFT
@@ -279,7 +279,7 @@ def test_layers_agree_with_the_ground_function_and_each_other(tmp_path):
 
     meshes = build_scene()
     scene = load(meshes, tmp_path, named=True)
-    name, pose = measuring_poses()[5]
+    name, pose = heldout_poses()[5]
     truth = layers(scene, meshes, pose, 96, 54)
     focal = 48 / np.tan(np.deg2rad(34.0))
     x, y = np.meshgrid(np.arange(96) + 0.5, np.arange(54) + 0.5)
@@ -388,7 +388,7 @@ def test_smog_transmittance_agrees_with_a_path_traced_absorbing_medium(tmp_path)
     extent = mi.ScalarTransform4f().scale([500, 500, 300])
     box = {"type": "cube", "to_world": extent, "bsdf": {"type": "null"}, "interior": air}
     smoky = mi.load_dict(content | {"air": box})
-    pose = measuring_poses()[0][1]
+    pose = heldout_poses()[0][1]
     dry = render.render_view(clear, pose, width, height, samples, 0)[..., :3]
     seen = render.render_view(smoky, pose, width, height, samples, 1, air=air)[..., :3]
     fine = layers(render.load(meshes, tmp_path, named=True), meshes, pose, width, height)

@@ -1,1 +1,1 @@
-"""A small street modelled in code, and its path-traced pictures (the embedded scene)."""
+"""A small street modelled in code, and its path-traced pictures and ground truth."""

@@ -1,4 +1,4 @@
-"""Triangle meshes and the few solids the street is made of (numpy only; metres, z up)."""
+"""Triangle meshes and the solids of the street (NumPy only; metres, z up)."""
 
 from dataclasses import dataclass
 
@@ -20,31 +20,31 @@ class Mesh:
     faces: Int[np.ndarray, "m 3"]
     uv: Float[np.ndarray, "n 2"]
     name: str = ""
-    texture: str = ""  # a name textures.make knows
+    texture: str = ""  # one of textures.NAMES
     label: str = ""  # one of LABELS
-    smooth: bool = False  # shade with interpolated vertex normals
+    smooth: bool = False  # shaded with interpolated vertex normals
 
     def tagged(self, name: str, texture: str, label: str, smooth: bool = False) -> "Mesh":
-        """The same triangles with a name, a texture and a label."""
+        """Return the same triangles with a name, a texture and a label."""
         if label not in LABELS:
             raise ValueError(f"unknown label {label!r}")
         return Mesh(self.vertices, self.faces, self.uv, name, texture, label, smooth)
 
     def moved(self, rotation_degrees: float, offset: tuple[float, float, float]) -> "Mesh":
-        """Turned about z by `rotation_degrees` (counter-clockwise from above), then shifted."""
+        """Rotate about z by `rotation_degrees` (counter-clockwise from above), then translate."""
         a = np.deg2rad(rotation_degrees)
-        turn = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
-        vertices = self.vertices @ turn.T + np.asarray(offset)
+        rotation = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        vertices = self.vertices @ rotation.T + np.asarray(offset)
         return Mesh(vertices, self.faces, self.uv, self.name, self.texture, self.label, self.smooth)
 
     def scaled_uv(self, su: float, sv: float) -> "Mesh":
-        """The same triangles with uv multiplied by (su, sv)."""
+        """Return the same triangles with uv multiplied by (su, sv)."""
         uv = self.uv * np.array([su, sv])
         return Mesh(self.vertices, self.faces, uv, self.name, self.texture, self.label, self.smooth)
 
 
 def merge(parts: list[Mesh]) -> Mesh:
-    """One untagged mesh from many (tags are dropped)."""
+    """Join meshes into one without name, texture and label."""
     counts = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
     return Mesh(
         np.concatenate([p.vertices for p in parts]),
@@ -65,7 +65,7 @@ def grid(points: Float[np.ndarray, "r c 3"], uv: Float[np.ndarray, "r c 2"]) -> 
 
 
 def quad(corner, edge_u, edge_v, uv_origin=(0.0, 0.0)) -> Mesh:
-    """A parallelogram; uv in metres along the two edges, starting at `uv_origin`."""
+    """Return a parallelogram; uv in metres along the two edges, starting at `uv_origin`."""
     corner, edge_u, edge_v = (np.asarray(a, float) for a in (corner, edge_u, edge_v))
     vertices = np.stack([corner, corner + edge_u, corner + edge_u + edge_v, corner + edge_v])
     w, h = np.linalg.norm(edge_u), np.linalg.norm(edge_v)
@@ -74,12 +74,12 @@ def quad(corner, edge_u, edge_v, uv_origin=(0.0, 0.0)) -> Mesh:
 
 
 def triangle(a, b, c, uv) -> Mesh:
-    """One triangle with given uv (three pairs)."""
+    """Return one triangle with given uv (three pairs)."""
     return Mesh(np.array([a, b, c], float), np.array([[0, 1, 2]]), np.asarray(uv, float))
 
 
 def hexahedron(bottom: Float[np.ndarray, "4 3"], top: Float[np.ndarray, "4 3"]) -> Mesh:
-    """A solid with four-cornered bottom and top (same turning sense); uv in metres."""
+    """Return a solid with quadrilateral bottom and top (same orientation); uv in metres."""
     bottom, top = np.asarray(bottom, float), np.asarray(top, float)
     sides = []
     for i in range(4):
@@ -98,14 +98,14 @@ def _patch(a, b, c, d) -> Mesh:
 
 
 def box(lower, upper) -> Mesh:
-    """An axis-aligned box; uv in metres on every face."""
+    """Return an axis-aligned box; uv in metres on every face."""
     (x0, y0, z0), (x1, y1, z1) = lower, upper
     ring = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
     return hexahedron(np.c_[ring, np.full(4, z0)], np.c_[ring, np.full(4, z1)])
 
 
 def cylinder(start, end, r_start: float, r_end: float, sides: int = 16, cap: bool = True) -> Mesh:
-    """A cone frustum from `start` to `end`; u goes once around, v in metres along it."""
+    """Return a cone frustum from `start` to `end`; u goes once around, v is in metres along it."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     axis = end - start
     length = np.linalg.norm(axis)
@@ -135,7 +135,7 @@ def cylinder(start, end, r_start: float, r_end: float, sides: int = 16, cap: boo
 
 
 def blob(centre, radii, rng: np.random.Generator, bump: float = 0.0, cells: int = 20) -> Mesh:
-    """A closed ellipsoid with smooth random bumps of relative size `bump`; uv in metres."""
+    """Return an ellipsoid with smooth random bumps of relative size `bump`; uv in metres."""
     theta = np.linspace(0, np.pi, cells + 1)
     phi = np.linspace(0, 2 * np.pi, 2 * cells + 1)
     th, ph = np.meshgrid(theta, phi, indexing="ij")
@@ -159,9 +159,10 @@ def leaves(
     rng: np.random.Generator,
     shade: Float[np.ndarray, " n"] | None = None,
 ) -> Mesh:
-    """One pointed leaf (two triangles, folded) per centre; u picks its colour in a palette row.
+    """Return one pointed leaf (two folded triangles) per centre; u selects its palette colour.
 
-    Leaves face `outward` loosely. `shade` in [0, 1] is the palette position (random if absent).
+    Leaf normals scatter around `outward`. `shade` in [0, 1] is the palette position (default
+    random).
     """
     n = len(centres)
     normal = outward + 0.9 * rng.normal(size=(n, 3))

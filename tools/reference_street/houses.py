@@ -10,7 +10,7 @@ from tools.reference_street.terrain import ground_height
 
 @dataclass(frozen=True)
 class Opening:
-    """A window or door in a wall: lower left corner along the wall and above the floor, metres."""
+    """A window or door: lower left corner along the wall and above the floor, m; size, m."""
 
     along: float
     up: float
@@ -21,7 +21,7 @@ class Opening:
 
 @dataclass(frozen=True)
 class House:
-    """A house in its own frame: front wall on local y = 0 facing -y, x to the right along it."""
+    """A house in its local frame: front wall on y = 0 facing -y, x to the right along it."""
 
     name: str
     width: float  # m, along the front
@@ -38,7 +38,7 @@ class House:
 
     @property
     def floor(self) -> float:
-        """Floor height in world metres: 0.25 m above the ground by the middle of the front."""
+        """Floor height, world m: 0.25 m above the ground at the middle of the front."""
         a = np.deg2rad(self.turn)
         x = self.corner[0] + 0.5 * self.width * np.cos(a)
         y = self.corner[1] + 0.5 * self.width * np.sin(a)
@@ -73,11 +73,11 @@ HOUSES = (
 )  # fmt: skip
 _TEXTURE_SIZE = {"brick": (3.84, 3.2), "plaster": (6.0, 6.0), "boards": (2.0, 2.0)}
 _RECESS = 0.13  # m, glass behind the wall face
-_BASEMENT = -0.9  # m, walls go down below the floor
+_BASEMENT = -0.9  # m, lower end of the walls relative to the floor
 
 
 def _wall(start, along, inward, width, eaves, openings) -> dict[str, list[Mesh]]:
-    """One wall from `start`, running `along` (unit), with recessed openings."""
+    """Return one wall from `start` along the unit vector `along`, with recessed openings."""
     start, along, inward = (np.asarray(a, float) for a in (start, along, inward))
     up = np.array([0, 0, 1.0])
     parts: dict[str, list[Mesh]] = {k: [] for k in ("wall", "white", "glass", "door", "stone")}
@@ -114,11 +114,11 @@ def _wall(start, along, inward, width, eaves, openings) -> dict[str, list[Mesh]]
         ):
             parts["white"].append(quad(corner, edge, deep))
         pane = quad(at(u0, v0, _RECESS), (u1 - u0) * along, (v1 - v0) * up)
-        pane = pane.scaled_uv(1 / (u1 - u0), 1 / (v1 - v0))  # one picture per pane
+        pane = pane.scaled_uv(1 / (u1 - u0), 1 / (v1 - v0))  # one texture per pane
         parts["door" if o.kind == "door" else "glass"].append(pane)
         front, back = _RECESS - 0.05, _RECESS - 0.005
         w = 0.07
-        # The frame and lintel keep 3 mm off the reveal: faces in one plane would shade each other.
+        # 3 mm between frame and reveal: coplanar faces would shadow each other.
         u0, u1, v0, v1 = u0 + 0.003, u1 - 0.003, v0 + 0.003, v1 - 0.003
         parts["white"] += [
             bar(u0, u0 + w, v0, v1, front, back),
@@ -140,7 +140,7 @@ def _wall(start, along, inward, width, eaves, openings) -> dict[str, list[Mesh]]
 
 
 def _roof(span, length, eaves, pitch, roof_texture) -> dict[str, list[Mesh]]:
-    """A gabled roof over local x in [0, span] (slopes) and y in [0, length] (ridge)."""
+    """Return a gabled roof over local x in [0, span] (slopes) and y in [0, length] (ridge)."""
     slope = np.tan(np.deg2rad(pitch))
     over, gable_over, thick = 0.5, 0.35, 0.14
     ridge_z = eaves + 0.5 * span * slope
@@ -152,7 +152,7 @@ def _roof(span, length, eaves, pitch, roof_texture) -> dict[str, list[Mesh]]:
         low, top = np.array([x_low, y0, low_z]), np.array([0.5 * span, y0, ridge_z])
         lift = np.array([0, 0, thick])
         edge = np.array([0, y1 - y0, 0])
-        # uv: u along the ridge, v up the slope, in metres.
+        # u along the ridge, v up the slope, in metres.
         upper = quad(low + lift, edge, top - low).scaled_uv(1 / 3.52, 1 / 3.52)
         parts[roof_texture].append(upper)
         under = quad(low, edge, top - low)
@@ -181,7 +181,7 @@ def _add(into: dict, parts: dict) -> None:
 
 
 def house_meshes(house: House) -> list[Mesh]:
-    """All parts of one house in world metres, one mesh a texture, labelled "building"."""
+    """Return all parts of one house in world metres, one mesh per texture."""
     w, d, e = house.width, house.depth, house.eaves
     ground = house.floor
     parts: dict[str, list[Mesh]] = {}
@@ -193,7 +193,7 @@ def house_meshes(house: House) -> list[Mesh]:
     }
     for name, (start, along, inward, length) in walls.items():
         _add(parts, _wall(start, along, inward, length, e, house.openings.get(name, ())))
-    # The roof is built with its ridge along local y, then swapped if the ridge runs along x.
+    # The roof is built with its ridge along local y; x and y are swapped for a ridge along x.
     span, length = (d, w) if house.ridge_along_front else (w, d)
     roof = _roof(span, length, e, house.pitch, house.roof)
     rise = 0.5 * span * np.tan(np.deg2rad(house.pitch))

@@ -1,4 +1,4 @@
-"""The whole street, and where the pictures are taken from. No Mitsuba here."""
+"""The whole street and the camera poses. Does not need Mitsuba."""
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ FIELD_OF_VIEW = 68.0  # degrees, horizontal
 
 
 def build_scene() -> list[Mesh]:
-    """Every mesh of the street, each with a texture and a class label, in world metres."""
+    """Return every mesh of the street with texture and class label, world metres."""
     meshes = ground_meshes()
     for house in HOUSES:
         meshes += house_meshes(house)
@@ -27,10 +27,10 @@ def build_scene() -> list[Mesh]:
 
 
 def passers_by(view: int) -> list[Mesh]:
-    """Who is in the street when picture `view` (from 0) of the walk is taken; often nobody.
+    """Return the people in picture `view` (from 0) of the walk; often none.
 
-    One walks up the left pavement while the first pictures are taken, another crosses the road
-    later: each is somewhere else in every picture, as people are.
+    One person walks up the left pavement during the first pictures, another crosses the road
+    later. Both move between pictures.
     """
     if 2 <= view <= 15:
         y = -6.0 + 1.15 * (view - 2)
@@ -45,7 +45,7 @@ def passers_by(view: int) -> list[Mesh]:
 def look(
     position: Float[np.ndarray, "3"], azimuth: float, pitch: float
 ) -> Float[np.ndarray, "4 4"]:
-    """OpenCV camera-to-world pose; azimuth from +y towards +x and pitch upwards, in degrees."""
+    """Return an OpenCV camera-to-world pose; azimuth from +y to +x and pitch up, degrees."""
     a, p = np.deg2rad([azimuth, pitch])
     forward = np.array([np.sin(a) * np.cos(p), np.cos(a) * np.cos(p), np.sin(p)])
     right = np.array([np.cos(a), -np.sin(a), 0.0])
@@ -95,7 +95,7 @@ def _arc() -> list[tuple[float, float, float, float, float]]:
 
 
 def camera_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """Image name and camera-to-world pose (OpenCV axes, metres) of every view, in order."""
+    """Return image name and camera-to-world pose (OpenCV axes, m) of every view, in order."""
     out = []
     for index, (x, y, height, azimuth, pitch) in enumerate(_walk() + _arc(), start=1):
         position = np.array([x, y, float(ground_height(x, y)) + height])
@@ -103,11 +103,11 @@ def camera_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
     return out
 
 
-def measuring_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """Image name and pose of the six views that are for measuring: t01.jpg to t06.jpg.
+def heldout_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
+    """Return image name and pose of the six test views, t01.jpg to t06.jpg.
 
-    House and bench from the road, the other house, across to the first one, bench and table from
-    near, the street from above its pavement, and the hollow in the road.
+    They show house A and the bench from the road, house B, house A from across the road, bench and
+    table from near, the street from above the pavement, and the hollow in the road.
     """
     rows = (
         (-0.6, -7.5, 1.6, -22.0, -5.0),
@@ -125,7 +125,7 @@ def measuring_poses() -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
 
 
 def ground_datum() -> tuple[float, float]:
-    """Median and lowest ground height under the cameras, metres."""
+    """Return the median and lowest ground height below the cameras, m."""
     positions = np.array([pose[:3, 3] for _, pose in camera_poses()])
     heights = ground_height(positions[:, 0], positions[:, 1])
     return float(np.median(heights)), float(np.min(heights))

@@ -1,8 +1,7 @@
-"""What a perfect mirror lying over the street would show, without the light that it would throw.
+"""Trace the street with a perfect horizontal mirror that does not change its illumination.
 
-A mirror that the path tracer knew of would light the houses. Here the camera's rays alone are
-turned at the plane; what they then meet is the dry street in its own light, as mirrored cameras
-see it.
+A mirror in the path tracer's scene would reflect light onto the houses. Here only camera rays are
+reflected at the plane; the reflected rays then see the dry street, like a mirrored camera.
 """
 
 import numpy as np
@@ -19,15 +18,15 @@ def mirrored_view(
     samples: int,
     seed: int,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of one view of a Mitsuba scene with a mirror at z = level.
+    """Return the linear radiance of one view of a Mitsuba scene with a mirror at z = level.
 
     Args:
         scene: the dry street.
         pose: camera to world, OpenCV axes.
-        level: height of the mirror, m, below the camera.
+        level: height of the mirror, m; must be below the camera.
         size: width and height, pixels.
-        samples: rays a pixel, spread over it by chance.
-        seed: of the rays and of the paths.
+        samples: rays per pixel, at random points of its area.
+        seed: random seed of rays and paths.
     """
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""What stands and walks in the street: car, bench, table, fence, lamp post, people."""
+"""Objects of the street: car, bench, table, fence, lamp post, people."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,9 +6,9 @@ from jaxtyping import Float
 from tools.reference_street.geometry import Mesh, blob, box, cylinder, grid, hexahedron, merge
 from tools.reference_street.terrain import ground_height
 
-CAR_AT = (1.93, 0.9)  # world x, y of the car's middle; it faces +y
+CAR_AT = (1.93, 0.9)  # world x, y of the car's centre, m; it faces +y
 _LENGTH, _WIDTH = 4.15, 1.74
-_AXLES = (-1.28, 1.26)  # m from the middle
+_AXLES = (-1.28, 1.26)  # m from the centre
 _WHEEL = 0.31
 _PAINT = np.array([176, 38, 40]) / 255.0
 
@@ -20,8 +20,8 @@ def _superellipse(u, a, b, power):
 
 
 def _body(u, v) -> Float[np.ndarray, "*n 3"]:
-    """Car body below the windows: u goes round it, v from the sill over the deck to the middle."""
-    # v in [0, 0.7]: the side from sill to shoulder; [0.7, 1]: inwards over bonnet and boot.
+    """Return the body below the windows: u around it, v from the sill to the centre line."""
+    # v in [0, 0.7] is the side from sill to shoulder, [0.7, 1] bonnet and boot.
     side = np.clip(v / 0.7, 0, 1)
     inward = np.clip((v - 0.7) / 0.3, 0, 1)
     bulge = 0.955 + 0.045 * np.sin(np.pi * np.clip(side * 0.9 + 0.1, 0, 1)) ** 0.7
@@ -36,7 +36,7 @@ def _body(u, v) -> Float[np.ndarray, "*n 3"]:
 
 
 def _cabin(u, v) -> Float[np.ndarray, "*n 3"]:
-    """Car cabin: v in [0, 0.6] up the windows, [0.6, 1] over the roof."""
+    """Return the cabin: v in [0, 0.6] along the windows, [0.6, 1] over the roof."""
     up = np.clip(v / 0.6, 0, 1)
     inward = np.clip((v - 0.6) / 0.4, 0, 1)
     half_x = 0.77 - 0.17 * up**1.2
@@ -48,7 +48,7 @@ def _cabin(u, v) -> Float[np.ndarray, "*n 3"]:
 
 
 def paint_car(part: str) -> Float[np.ndarray, "h w 3"]:
-    """Picture of the car's surface over (u, v): paint, doors, lights, plates; or the windows."""
+    """Draw the texture of the car's body (paint, doors, lights, plates) or cabin (windows)."""
     shape = (384, 1536)
     rows, columns = ((np.arange(n) + 0.5) / n for n in shape)
     u, v = np.meshgrid(columns, rows)
@@ -89,7 +89,7 @@ def paint_car(part: str) -> Float[np.ndarray, "h w 3"]:
 
 
 def car() -> list[Mesh]:
-    """The parked car, standing on the road's slope."""
+    """Return the parked car on the slope of the road."""
     u, v = np.meshgrid(np.linspace(0, 1, 161), np.linspace(0, 1, 57))
     uv = np.stack([u, v], -1)
     body, cabin = grid(_body(u, v), uv), grid(_cabin(u, v), uv)
@@ -119,7 +119,7 @@ def car() -> list[Mesh]:
     out = []
     for part in parts:
         vertices = part.vertices.copy()
-        vertices[:, 2] += slope * vertices[:, 1] + lift  # a shear: 2 %, too little to see
+        vertices[:, 2] += slope * vertices[:, 1] + lift  # a shear of 2 %, which is not visible
         vertices += [cx, cy, 0.0]
         out.append(
             Mesh(vertices, part.faces, part.uv, part.name, part.texture, part.label, part.smooth)
@@ -128,11 +128,11 @@ def car() -> list[Mesh]:
 
 
 def bench(x: float = -4.72, y: float = 0.6) -> list[Mesh]:
-    """A wooden bench facing the road (+x): slatted seat and back on two stone feet."""
+    """Return a wooden bench facing the road (+x): slatted seat and back on two stone feet."""
     z = float(ground_height(x, y))
     wood, feet = [], []
     half = 0.95
-    for k in range(4):  # seat slats with 1 cm gaps: the ground beneath is sheltered
+    for k in range(4):  # slats with gaps of 1 cm, which shelter the ground below
         x0 = x - 0.24 + 0.125 * k
         wood.append(box((x0, y - half, z + 0.42), (x0 + 0.115, y + half, z + 0.46)))
     for k in range(3):
@@ -149,7 +149,7 @@ def bench(x: float = -4.72, y: float = 0.6) -> list[Mesh]:
 
 
 def table(x: float = -6.35, y: float = 2.45) -> list[Mesh]:
-    """A garden table on the lawn: a closed top, so the ground beneath is sheltered."""
+    """Return a garden table on the lawn; its closed top shelters the ground below."""
     z = float(ground_height(x, y))
     top = [box((x - 0.42, y - 0.8, z + 0.70), (x + 0.42, y + 0.8, z + 0.745))]
     rails = [box((x - 0.36, y - 0.72, z + 0.60), (x + 0.36, y - 0.68, z + 0.70))]
@@ -164,7 +164,7 @@ def table(x: float = -6.35, y: float = 2.45) -> list[Mesh]:
 
 
 def fence(x: float = 5.55, y_range: tuple[float, float] = (-5.6, 3.0)) -> list[Mesh]:
-    """A white picket fence along the right pavement: thin parts with air between."""
+    """Return a white picket fence along the right pavement: thin parts with gaps."""
     y0, y1 = y_range
     parts = []
     for y in np.arange(y0, y1 + 1e-6, 0.14):
@@ -173,7 +173,7 @@ def fence(x: float = 5.55, y_range: tuple[float, float] = (-5.6, 3.0)) -> list[M
         half, out, tall = (0.045, 0.045, 1.0) if post else (0.028, 0.011, 0.85)
         bottom = z - 0.15 if post else z + 0.06
         parts.append(box((x - out, y - half, bottom), (x + out, y + half, z + tall)))
-    for low in (0.25, 0.62):  # rails, from post to post so that they follow the ground
+    for low in (0.25, 0.62):  # rails from post to post, following the ground
         for a in np.arange(y0, y1 - 0.7, 1.4):
             ends = [float(ground_height(x, v)) + low for v in (a, a + 1.4)]
             ring = [(x + 0.012, a), (x + 0.04, a), (x + 0.04, a + 1.4), (x + 0.012, a + 1.4)]
@@ -186,7 +186,7 @@ def fence(x: float = 5.55, y_range: tuple[float, float] = (-5.6, 3.0)) -> list[M
 def person(
     name: str, at: tuple[float, float], heading: float, stride: float, coat: str
 ) -> list[Mesh]:
-    """Somebody walking, 1.75 m: legs apart by `stride` m, `heading` in degrees from +y to +x."""
+    """Return a walking person of 1.75 m; stride in m, heading in degrees from +y to +x."""
     rng = np.random.default_rng(17)
     z = float(ground_height(*at))
     half = 0.5 * stride
@@ -216,7 +216,7 @@ def person(
 
 
 def lamp(x: float = 4.75, y: float = 10.6) -> list[Mesh]:
-    """A lamp post with a short arm over the road."""
+    """Return a lamp post with a short arm over the road."""
     z = float(ground_height(x, y))
     metal = [
         cylinder((x, y, z - 0.2), (x, y, z + 0.9), 0.085, 0.075, 14),

@@ -1,4 +1,4 @@
-"""Trees, hedges and the far tree line."""
+"""Trees, hedges, shrubs and the distant tree line."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,7 @@ def _on_sphere(n: int, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
 
 
 def _coat(solid: Mesh, count: int, size: tuple[float, float], rng: np.random.Generator) -> Mesh:
-    """`count` leaves spread evenly over a closed solid's surface, brighter towards its top."""
+    """Return `count` leaves spread evenly over a closed surface, brighter towards its top."""
     corners = solid.vertices[solid.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=-1)
@@ -36,16 +36,16 @@ def tree(
     leaf_texture: str,
     seed: int,
 ) -> list[Mesh]:
-    """A broad-leaved tree: trunk, branches, clumps of leaves round dark cores.
+    """Return a broad-leaved tree: trunk, branches, clumps of leaves around dark cores.
 
     Args:
         name: prefix of the mesh names.
         at: world x, y of the foot, metres.
         trunk: height to the first fork and radius at the foot, metres.
         crown: horizontal and vertical radius of the crown, metres.
-        leaf_count: leaves in all, spread over the clumps.
+        leaf_count: total number of leaves.
         leaf_texture: palette of the leaves.
-        seed: every random choice follows from it.
+        seed: random seed.
     """
     rng = np.random.default_rng(seed)
     x, y = at
@@ -64,10 +64,10 @@ def tree(
     clumps = []
     turn = rng.uniform(0, 2 * np.pi)
     rings = ((-0.42, 0.62, 6), (0.0, 0.66, 7), (0.45, 0.48, 5), (0.75, 0.0, 1), (0.1, 0.0, 1))
-    for height, reach, number in rings:
+    for height, radial, number in rings:
         for k in range(number):
             a = turn + 2 * np.pi * (k + 0.3 * rng.uniform(-1, 1)) / number
-            r = reach * wide * rng.uniform(0.85, 1.1)
+            r = radial * wide * rng.uniform(0.85, 1.1)
             lift = height * tall + 0.1 * tall * rng.uniform(-1, 1)
             clumps.append(centre + [r * np.cos(a), r * np.sin(a), lift])
         turn += 1.1
@@ -79,9 +79,9 @@ def tree(
     size = 0.42 * min(wide, tall) * rng.uniform(0.85, 1.15, size=len(clumps))
     which = rng.integers(len(clumps), size=leaf_count)
     out = _on_sphere(leaf_count, rng)
-    reach = size[which] * rng.uniform(0.55, 1.08, size=leaf_count)
-    centres = clumps[which] + out * reach[:, None] * [1, 1, 0.85]
-    # Leaves lower and deeper in a clump are darker; the palette does the rest.
+    distance = size[which] * rng.uniform(0.55, 1.08, size=leaf_count)
+    centres = clumps[which] + out * distance[:, None] * [1, 1, 0.85]
+    # Leaves at the bottom of a clump are darker.
     shade = 0.45 + 0.3 * out[:, 2] + 0.25 * rng.normal(size=leaf_count)
     leafage = leaves(centres, out + [0, 0, 0.4], (0.13, 0.22), rng, shade)
     cores = merge([blob(c, [0.72 * s] * 3, rng, 0.25, 12) for c, s in zip(clumps, size)])  # noqa: B905
@@ -95,7 +95,7 @@ def tree(
 def hedge(
     name: str, x_range: tuple[float, float], y_range: tuple[float, float], height: float, seed: int
 ) -> list[Mesh]:
-    """A clipped hedge along y that follows the ground: a dark core under a coat of leaves."""
+    """Return a clipped hedge along y that follows the ground: a dark core below leaves."""
     rng = np.random.default_rng(seed)
     (x0, x1), (y0, y1) = x_range, y_range
     ys = np.linspace(y0, y1, max(2, int((y1 - y0) / 0.5)) + 1)
@@ -140,17 +140,17 @@ def hedge(
 
 
 def far_trees(seed: int = 5) -> list[Mesh]:
-    """Rounded trees behind the gardens, over the meadow and where the road leaves the valley."""
+    """Return distant trees behind the gardens, on the meadow and at the ends of the road."""
     rng = np.random.default_rng(seed)
     crowns, trunks, coats = [], [], []
     spots = []
     for side in (-1, 1):
-        for y in np.arange(-66, 70, 4.2):  # a belt behind the gardens
+        for y in np.arange(-66, 70, 4.2):  # belt behind the gardens
             spots.append((side * (27 + rng.uniform(-2.5, 6)), y + rng.uniform(-2, 2)))
-        for x in np.arange(-26, 27, 4.0):  # two rows across the end of the street
+        for x in np.arange(-26, 27, 4.0):  # two rows across each end of the street
             spots.append((x + rng.uniform(-1, 1), side * rng.uniform(80, 88)))
             spots.append((x + 2, side * rng.uniform(92, 100)))
-    for _ in range(110):  # scattered further out
+    for _ in range(110):  # scattered farther away
         r, a = rng.uniform(52, 150), rng.uniform(0, 2 * np.pi)
         x, y = r * np.cos(a), r * np.sin(a)
         if abs(x) > 9:
@@ -160,7 +160,7 @@ def far_trees(seed: int = 5) -> list[Mesh]:
         radius = rng.uniform(2.0, 3.6)
         stem = rng.uniform(0.5, 1.4)
         if abs(y) > 75 and abs(x) < 30:
-            stem = 0.1  # no gap between the trunks at the end of the road
+            stem = 0.1  # no gap below the crowns at the ends of the road
         middle = (x, y, z + stem + radius * 1.05)
         radii = (radius, radius, radius * rng.uniform(1.0, 1.35))
         crown = blob(middle, radii, rng, 0.22, 14)
@@ -175,7 +175,7 @@ def far_trees(seed: int = 5) -> list[Mesh]:
 
 
 def shrubs(seed: int = 6) -> list[Mesh]:
-    """Rounded shrubs by the house walls and in the gardens."""
+    """Return shrubs at the house walls and in the gardens."""
     rng = np.random.default_rng(seed)
     cores, coats = [], []
     for x, y, r in (

@@ -1,6 +1,6 @@
-"""The reference set on disk: views, classes, truth, weather, its two variants, checksums.
+"""Write the reference set: views, classes, ground truth, weather, two variants, checksums.
 
-See docs/reference-scene.md for what lies where.
+docs/reference-scene.md describes the files.
 """
 
 import hashlib
@@ -15,7 +15,7 @@ from tools.reference_street.layout import (
     build_scene,
     camera_poses,
     ground_datum,
-    measuring_poses,
+    heldout_poses,
     passers_by,
 )
 from tools.reference_street.render import EXPOSURE, encode, load
@@ -32,16 +32,16 @@ from tools.reference_street.write import (
 
 SNOW = {"snow-thin": 0.03, "snow-deep": 0.15}  # m
 LEVELS = {"flood-low": 0.25, "flood-high": 0.6, "flood-waves": 0.6}  # m above the ground datum
-MOST = 3.0  # times the depth in the open: thicker snow is what hangs over an edge
+MAX_THICKNESS = 3.0  # times the depth in the open; overhanging snow is thicker
 WAVE_TIME = 1.0  # s
-EXPOSURE_SPREAD = 0.12  # of the busy variant's pictures, as the logarithm's deviation
-TURN = ((0.5, -0.7, 0.4), 40.0)  # axis and degrees of the turned variant
-SHRUNK, SHIFT = 0.37, (12.0, -5.0, 3.0)  # its units a metre, and where its origin lies
+EXPOSURE_SPREAD = 0.12  # standard deviation of the busy variant's log exposure
+TURN = ((0.5, -0.7, 0.4), 40.0)  # axis and angle (degrees) of the turned variant
+SHRUNK, SHIFT = 0.37, (12.0, -5.0, 3.0)  # its units per metre, and its translation, units
 
 
 def write_reference(store: Path, out: Path, width: int, height: int) -> None:
-    """Write `out`, `out`-busy and `out`-turned."""
-    walk, tests = camera_poses(), measuring_poses()
+    """Write the reference set to `out`, and its variants to `out`-busy and `out`-turned."""
+    walk, tests = camera_poses(), heldout_poses()
     poses = walk + tests
     write_pictures(store / "clean", out / "images", poses)
     known = truths(store, poses, width, height)
@@ -79,40 +79,41 @@ def write_reference(store: Path, out: Path, width: int, height: int) -> None:
     write_list(out, ".", [name for name, _ in tests])
     write_busy(store, out, known, width, height)
     write_turned(out)
-    for folder in (out, beside(out, "busy"), beside(out, "turned")):
+    for folder in (out, variant_folder(out, "busy"), variant_folder(out, "turned")):
         write_sums(folder)
 
 
-def beside(out: Path, variant: str) -> Path:
-    """Folder of a variant of the set in `out`."""
+def variant_folder(out: Path, variant: str) -> Path:
+    """Return the folder of a variant of the set in `out`."""
     return out.with_name(f"{out.name}-{variant}")
 
 
 def write_snow_truth(store: Path, out: Path, width: int, height: int) -> None:
-    """Depth and thickness of the snow in the test views, kept in the store too."""
+    """Write depth and thickness of the snow in the test views; the store caches them."""
     meshes = build_scene()
     for kind, depth in SNOW.items():
+        limit = MAX_THICKNESS * depth
         with tempfile.TemporaryDirectory() as scratch:
             scenes = None
-            for name, pose in measuring_poses():
-                kept = (store / "layers" / f"{kind}-{name}").with_suffix(".npz")
-                if not kept.exists():
+            for name, pose in heldout_poses():
+                cached = (store / "layers" / f"{kind}-{name}").with_suffix(".npz")
+                if not cached.exists():
                     if scenes is None:
                         whole = meshes + snow_meshes(meshes, depth)
                         snowy = load(whole, Path(scratch), named=True)
                         scenes = snowy, load(meshes, Path(scratch))
-                    np.savez(kept, **snow_layers(*scenes, pose, width, height))
-                with np.load(kept) as data:
+                    np.savez(cached, **snow_layers(*scenes, pose, width, height))
+                with np.load(cached) as data:
                     _save_arrays(
                         out / "weather" / kind / f"{Path(name).stem}.npz",
                         depth=data["depth"],
-                        # Over an edge the snow reaches half a cell beyond what it lies on.
-                        thickness=np.minimum(data["thickness"], MOST * depth).astype(np.float16),
+                        # At edges the snow overhangs its support by half a cell.
+                        thickness=np.minimum(data["thickness"], limit).astype(np.float16),
                     )
 
 
 def write_weather_files(out: Path) -> None:
-    """What the program is asked for to get each weather, in its own files."""
+    """Write the weather file of each weather."""
     for kind, visibility in smog.VISIBILITY.items():
         lines = ["[smog]", f'visibility = "{visibility:g} m"', f"colour = {list(smog.COLOUR)}"]
         if kind in smog.FALLOFF:
@@ -132,7 +133,7 @@ def write_weather_files(out: Path) -> None:
 
 
 def write_list(out: Path, truth: str, views: list[str]) -> None:
-    """reference.json: what is measured, and where its truth lies."""
+    """Write reference.json: the test views, the weathers and the folder of the truth."""
     kinds = [*smog.VISIBILITY, *LEVELS, *SNOW]
     data = {
         "schema_version": 1,
@@ -147,23 +148,23 @@ def write_list(out: Path, truth: str, views: list[str]) -> None:
 def write_busy(
     store: Path, out: Path, known: dict[str, dict[str, np.ndarray]], width: int, height: int
 ) -> None:
-    """The variant in which people pass and no two pictures are exposed alike."""
-    walk, tests = camera_poses(), measuring_poses()
-    busy, rng = beside(out, "busy"), np.random.default_rng(5)
+    """Write the variant with people and a random exposure of each picture."""
+    walk, tests = camera_poses(), heldout_poses()
+    busy, rng = variant_folder(out, "busy"), np.random.default_rng(5)
     meshes = build_scene()
     changed = set()
     for index, (name, pose) in enumerate(walk):
-        someone = passers_by(index)
-        linear = mean_of(store / ("people" if someone else "clean"), name)
+        people = passers_by(index)
+        linear = mean_of(store / ("people" if people else "clean"), name)
         gain = EXPOSURE * np.exp(EXPOSURE_SPREAD * rng.standard_normal())
         save_jpeg(gain * linear, busy / "images" / name)
-        if someone:
-            kept = (store / "layers" / f"people-{name}").with_suffix(".npz")
-            if not kept.exists():
+        if people:
+            cached = (store / "layers" / f"people-{name}").with_suffix(".npz")
+            if not cached.exists():
                 with tempfile.TemporaryDirectory() as scratch:
-                    scene = load(meshes + someone, Path(scratch), named=True)
-                    np.savez(kept, **layers(scene, meshes + someone, pose, width, height))
-            with np.load(kept) as data:
+                    scene = load(meshes + people, Path(scratch), named=True)
+                    np.savez(cached, **layers(scene, meshes + people, pose, width, height))
+            with np.load(cached) as data:
                 save_png(data["label"], busy / "labels" / f"{Path(name).stem}.png")
             changed.add(f"labels/{Path(name).stem}.png")
         changed.add(f"images/{name}")
@@ -177,11 +178,11 @@ def write_busy(
 
 
 def write_turned(out: Path) -> None:
-    """The variant without up and metres: transforms.json in a frame of its own."""
+    """Write the variant without known up and scale: transforms.json in a rotated frame."""
     from climatenerf.scene import load_scene
     from climatenerf.scene.readers.ply import write_points
 
-    turned = beside(out, "turned")
+    turned = variant_folder(out, "turned")
     scene = load_scene(out)
     camera = scene.cameras[0]
     similarity = np.eye(4)
@@ -213,7 +214,7 @@ def write_turned(out: Path) -> None:
 
 
 def write_sums(out: Path) -> None:
-    """SHA256SUMS of all files, as sha256sum writes it."""
+    """Write SHA256SUMS of all files in the format of sha256sum."""
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(out).as_posix()}"
         for path in sorted(out.rglob("*"))
@@ -223,7 +224,7 @@ def write_sums(out: Path) -> None:
 
 
 def _rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
-    """Rodrigues' formula."""
+    """Return the rotation matrix of an axis and an angle by Rodrigues' formula."""
     x, y, z = np.array(axis) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     a = np.deg2rad(degrees)

@@ -2,8 +2,9 @@
 
     python -m tools.reference_street.reference --out reference/street
 
-Every picture is one file of linear means in the store, so a run may be stopped and goes on; a pass
-adds samples to each. `--only flood-low` limits it to some groups. See docs/reference-scene.md.
+The store holds the linear mean of every picture in one file, and each pass adds samples to it:
+re-run the same command to resume. `--only flood-low` limits the run to some groups. See
+docs/reference-scene.md.
 """
 
 import argparse
@@ -20,7 +21,7 @@ from tools.reference_street.layout import (
     build_scene,
     camera_poses,
     ground_datum,
-    measuring_poses,
+    heldout_poses,
     passers_by,
 )
 from tools.reference_street.mirror import mirrored_view
@@ -38,13 +39,13 @@ Poses = list[tuple[str, Float[np.ndarray, "4 4"]]]
 
 @dataclass(frozen=True)
 class Group:
-    """Pictures that are traced alike.
+    """Pictures that are traced with the same settings.
 
     Attributes:
         name: folder in the store.
-        poses: the views.
-        samples: per pixel and pass; a square number.
-        passes: to average.
+        poses: names and poses of the views.
+        samples: samples per pixel and pass; a square number.
+        passes: number of passes to average.
     """
 
     name: str
@@ -54,8 +55,8 @@ class Group:
 
 
 def groups() -> list[Group]:
-    """All that is path traced, the dear ones last; samples for 37 to 42 dB of noise."""
-    test = measuring_poses()
+    """Return all groups, the expensive ones last; their samples give 37 to 42 dB of noise."""
+    test = heldout_poses()
     walk = [pose for i, pose in enumerate(camera_poses()) if passers_by(i)]
     return [
         Group("clean", test + camera_poses(), 49, 2),
@@ -72,7 +73,7 @@ def groups() -> list[Group]:
 
 
 def open_group(group: Group, view: int, folder: Path, threads: int):
-    """The group's Mitsuba scene, as it is for one of its views, and the medium of its air."""
+    """Return the Mitsuba scene of a group for one of its views, and the medium of its air."""
     mi.set_variant("scalar_rgb")
     meshes, water, air, datum = build_scene(), None, None, ground_datum()[0]
     if group.name in ("flood-low", "flood-high"):
@@ -90,7 +91,7 @@ def open_group(group: Group, view: int, folder: Path, threads: int):
 
 
 def trace(group: Group, store: Path, threads: int) -> None:
-    """Adds what is missing of a group's passes to the store."""
+    """Add the missing passes of a group to the store."""
     names = [name for name, _ in camera_poses()]
     folder = store / group.name
     folder.mkdir(parents=True, exist_ok=True)
@@ -114,12 +115,12 @@ def trace(group: Group, store: Path, threads: int) -> None:
                 else:
                     fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed, air=air)
                 add(path, fresh[..., :3])
-                took = time.monotonic() - start
-                print(f"{group.name} pass {number} {name} {took:.1f} s", flush=True)
+                seconds = time.monotonic() - start
+                print(f"{group.name} pass {number} {name} {seconds:.1f} s", flush=True)
 
 
 def main() -> None:
-    """Trace what is missing, group after group, and write what is wanted."""
+    """Trace the missing pictures of each group, and write the requested folders."""
     parser = argparse.ArgumentParser(
         prog="python -m tools.reference_street.reference", description=__doc__
     )

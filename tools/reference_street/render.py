@@ -1,4 +1,4 @@
-"""The street as Mitsuba sees it: meshes, textures, sky and camera; linear pictures."""
+"""The street as a Mitsuba scene: meshes, textures, sky, cameras; linear pictures."""
 
 from pathlib import Path
 
@@ -10,18 +10,18 @@ from tools.reference_street.layout import FIELD_OF_VIEW
 from tools.reference_street.sky import environment
 from tools.reference_street.textures import make
 
-EXPOSURE = 0.85  # one gain for all views: most pixels then lie in [0, 1]
+EXPOSURE = 0.85  # gain of all views, so that most pixels lie in [0, 1]
 
 
 def encode(linear: Float[np.ndarray, "h w 3"]) -> np.ndarray:
-    """Linear radiance → 8-bit sRGB."""
+    """Return linear radiance as 8-bit sRGB."""
     x = np.clip(linear, 0, 1)
     srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-8) ** (1 / 2.4) - 0.055)
     return np.round(255 * srgb).astype(np.uint8)
 
 
 def write_ply(mesh: Mesh, path: Path) -> None:
-    """Binary PLY with texture coordinates, and vertex normals where the mesh is smooth."""
+    """Write a binary PLY with texture coordinates, and with vertex normals if smooth."""
     fields = ["x", "y", "z"]
     columns = [mesh.vertices]
     if mesh.smooth:
@@ -41,7 +41,7 @@ def write_ply(mesh: Mesh, path: Path) -> None:
 
 
 def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-    """Area-weighted normals; vertices at one place (seams, poles) share theirs."""
+    """Return area-weighted vertex normals; coincident vertices (seams, poles) share one."""
     corners = mesh.vertices[mesh.faces]
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     _, group = np.unique(np.round(mesh.vertices, 5), axis=0, return_inverse=True)
@@ -50,7 +50,7 @@ def vertex_normals(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
     for k in range(3):
         np.add.at(total, group[mesh.faces[:, k]], face)
     normals = total[group]
-    # A vertex all of whose triangles are degenerate has no normal; up is as good as any.
+    # A vertex with degenerate triangles only has no normal: use up.
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return np.where(length > 1e-12, normals / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
 
@@ -62,14 +62,14 @@ def load(
     water: dict | None = None,
     named: bool = False,
 ):
-    """The Mitsuba scene of diffuse, textured meshes under the sky; PLY files go to `folder`.
+    """Return a Mitsuba scene of diffuse, textured meshes under the sky.
 
     Args:
-        meshes: what stands under the sky.
-        folder: for the PLY files; they are read at once.
-        threads: that render.
-        water: Mitsuba's description of a surface with or without a medium below it, if any.
-        named: keep every mesh apart under its name; else those of one texture are merged.
+        meshes: the meshes.
+        folder: folder for PLY files; they are read before the function returns.
+        threads: number of rendering threads.
+        water: Mitsuba's description of a water surface with or without a medium, if any.
+        named: keep every mesh as a shape with its name; otherwise meshes of a texture are merged.
     """
     import drjit as dr
     import mitsuba as mi
@@ -78,7 +78,7 @@ def load(
     dr.set_thread_count(threads)
     scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 5}}
     if water is not None:
-        # Through the surface, to the bed, back out: three bounces more, and those between.
+        # Paths through the surface to the bottom and back need at least three more bounces.
         scene["integrator"] = {"type": "volpath", "max_depth": 12, "rr_depth": 8}
         scene["water"] = water
     textures = {}
@@ -101,7 +101,7 @@ def load(
             "face_normals": not mesh.smooth,
             "bsdf": textures[mesh.texture],
         }
-    rotate = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # the sky's up is y; ours is z
+    rotate = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # y up to z up
     bitmap = mi.Bitmap(environment().astype(np.float32))
     scene["sky"] = {"type": "envmap", "bitmap": bitmap, "to_world": rotate}
     return mi.load_dict(scene, optimize=not named)
@@ -117,13 +117,13 @@ def render_view(
     integrator=None,
     air=None,
 ):
-    """Linear radiance of one view before exposure and coverage by matter, [height, width, 4].
+    """Return the linear radiance before exposure and the coverage of one view, [h, w, 4].
 
-    `air` is the medium that the camera stands in, if any.
+    `air` is the medium around the camera, if any.
     """
     import mitsuba as mi
 
-    # Mitsuba's camera looks along +z with +x to the left and +y up.
+    # Mitsuba's camera looks along +z, with +x to the left and +y up.
     to_world = mi.ScalarTransform4f((pose @ np.diag([-1.0, -1.0, 1.0, 1.0])).tolist())
     sensor = {
         "type": "perspective",

@@ -1,25 +1,25 @@
-"""The light: one equirectangular picture of a cloudy sky, bright where the sun is."""
+"""The illumination: an equirectangular picture of a cloudy sky with a broad sun."""
 
 import numpy as np
 from jaxtyping import Float
 
 from tools.reference_street.textures import noise
 
-SUN_AZIMUTH = 218.0  # degrees from +y towards +x: the sun stands over the left, behind the walk
+SUN_AZIMUTH = 218.0  # degrees from +y towards +x
 SUN_ELEVATION = 40.0  # degrees
-SUN_WIDTH = 24.0  # degrees to 1/e: the sun through thin cloud. Broad, so that light which finds it
-# by chance, through water, makes no fireflies at any affordable number of samples.
+SUN_WIDTH = 24.0  # degrees to 1/e, as through thin cloud. Paths through water hit the sun only by
+# chance; a narrow sun would give fireflies at any affordable number of samples.
 SUN_RADIANCE = 5.5  # relative to a cloudy sky of about 0.8
 
 
 def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
-    """Unit world vector towards an azimuth (from +y to +x) and elevation, in degrees."""
+    """Return the unit world vector of an azimuth (from +y to +x) and elevation, degrees."""
     a, e = np.deg2rad([azimuth, elevation])
     return np.array([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)])
 
 
 def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance; row 0 is the zenith, column 0 faces +y, and columns turn towards +x."""
+    """Return linear radiance; row 0 is the zenith, column 0 faces +y, columns go towards +x."""
     width = 2 * height
     rng = np.random.default_rng(11)
     azimuth = 2 * np.pi * (np.arange(width) + 0.5) / width
@@ -29,7 +29,7 @@ def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
     up = np.clip(d[..., 2], 0, 1)[..., None]
     zenith, horizon = np.array([0.66, 0.74, 0.86]), np.array([0.80, 0.84, 0.88])
     sky = horizon + (zenith - horizon) * up**0.5
-    # A flat cloud layer seen in perspective: look the noise up where the ray meets the layer.
+    # A flat cloud layer in perspective: noise at the intersection of each ray with the layer.
     tile = 1024
     layer = 0.75 * noise((tile, tile), 1.5, rng) + 0.25 * noise((tile, tile), 1.0, rng)
     plane = d[..., :2] / (up + 0.18) * 190.0
@@ -49,5 +49,5 @@ def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
     glow = SUN_RADIANCE * np.exp(-((angle / SUN_WIDTH) ** 2))
     sky += glow[..., None] * np.array([1.0, 0.95, 0.86])
     below = d[..., 2] < 0
-    sky[below] = np.array([0.16, 0.17, 0.12])  # never seen: the ground reaches past the hills
+    sky[below] = np.array([0.16, 0.17, 0.12])  # not visible: the ground extends beyond the hills
     return sky

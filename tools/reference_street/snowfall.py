@@ -1,11 +1,10 @@
-"""Snow on the street: flakes that fall from above on the true meshes, slide, and settle.
+"""Simulated snow on the street: flakes fall vertically onto the true meshes, slide and settle.
 
-Nothing here is shared with the program's own snow. A field of heights as seen from above is filled
-flake by flake. A flake stays on a bare surface with the probability that roofs of that pitch keep
-their snow (EN 1991-1-3, 5.3: all up to 30 degrees, none from 60), on snow up to its angle of
-repose, and else goes on to the lowest neighbour, over an edge if need be. What lies under a roof or
-a table is never reached by a flake from above. Leaves that are level enough keep their share of
-what falls on them; the rest falls through to what lies below the crown, and settles there.
+The code shares nothing with the program's own snow. It fills a height field flake by flake. A flake
+stays on a bare surface with the probability that roofs of that pitch keep their snow (EN 1991-1-3,
+5.3: all up to 30 degrees, none from 60), and on snow up to the angle of repose. Otherwise it moves
+to the lowest neighbour, also over an edge. Flakes never reach surfaces under a roof or a table.
+Leaves keep a fraction of the flakes that depends on their pitch; the rest falls through the crown.
 """
 
 from dataclasses import dataclass
@@ -16,25 +15,26 @@ from jaxtyping import Float
 
 from tools.reference_street.geometry import Mesh
 
-# (half width in x, half width in y, cell) in m: fine where the test views look from.
+# (half width in x, half width in y, cell) in m: finest around the test views.
 RINGS = ((16.0, 24.0, 0.03), (40.0, 60.0, 0.12), (200.0, 200.0, 0.8))
-FLAKES = 60  # for each cell
-REPOSE = np.tan(np.deg2rad(50.0))  # of fresh snow on snow
-KEEPS, SHEDS = 30.0, 60.0  # degrees of pitch between which bare surfaces keep less and less
-MOVES = 400  # of one flake at most
-STEEPEST = 2.5  # rise between neighbours, in cells, that still makes one surface
-LEAST = 0.002  # m: less is no snow
+FLAKES = 60  # per cell
+REPOSE = np.tan(np.deg2rad(50.0))  # slope of the angle of repose of fresh snow
+KEEPS, SHEDS = 30.0, 60.0  # degrees of pitch up to which all, and from which no snow stays
+MAX_MOVES = 400  # of one flake
+MAX_RISE = 2.5  # height difference of neighbours on one surface, cells
+MIN_DEPTH = 0.002  # m, thinner snow is removed
 
 
 @dataclass(frozen=True)
 class Cover:
-    """Snow on one field of cells.
+    """Snow on a grid of cells.
 
     Attributes:
-        x0: of the first cell's middle, m; y0 likewise.
-        cell: side, m.
-        ground: height of the highest surface, m; -inf where there is none.
-        depth: of the snow on it, m.
+        x0: x of the first cell's centre, m.
+        y0: y of the first cell's centre, m.
+        cell: side of a cell, m.
+        ground: height of the highest surface, m; -inf without a surface.
+        depth: depth of the snow on it, m.
     """
 
     x0: float
@@ -45,7 +45,14 @@ class Cover:
 
 
 def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> tuple[Cover, Cover]:
-    """Snow over one of `RINGS`, of a mean depth on open level ground; that on leaves comes last."""
+    """Return the snow over one of `RINGS`, on surfaces and on leaves.
+
+    Args:
+        meshes: the street.
+        depth: mean depth on open level ground, m.
+        ring: index into `RINGS`.
+        seed: random seed.
+    """
     half_x, half_y, cell = RINGS[ring]
     columns, rows = round(2 * half_x / cell), round(2 * half_y / cell)
     x0, y0 = -half_x + 0.5 * cell, -half_y + 0.5 * cell
@@ -60,18 +67,18 @@ def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> tu
     (ground, keeps), (crown, holds) = surfaces
     crown[crown <= ground] = -np.inf
     rng = np.random.default_rng(seed)
-    steepest = STEEPEST * cell
+    steepest = MAX_RISE * cell
     lying, held = _settle(ground, keeps, crown, holds, depth / FLAKES, REPOSE * cell, rng)
     covers = []
     for top, snow in ((ground, lying), (crown, held)):
-        for _ in range(4):  # single flakes are no bumps
+        for _ in range(4):  # removes the bumps of single flakes
             snow = _smooth(snow, top, steepest)
-        covers.append(Cover(x0, y0, cell, top, np.where(snow > LEAST, snow, 0.0)))
+        covers.append(Cover(x0, y0, cell, top, np.where(snow > MIN_DEPTH, snow, 0.0)))
     return covers[0], covers[1]
 
 
 def snow_meshes(meshes: list[Mesh], depth: float) -> list[Mesh]:
-    """The snow as meshes: one a ring, each without what finer ones cover."""
+    """Return the snow as meshes, one per ring, without the area of finer rings."""
     out = []
     for ring, (_, _, cell) in enumerate(RINGS):
         inner = RINGS[ring - 1][:2] if ring else (0.0, 0.0)
@@ -83,11 +90,11 @@ def snow_meshes(meshes: list[Mesh], depth: float) -> list[Mesh]:
 
 
 def cover_mesh(cover: Cover, inner: tuple[float, float]) -> Mesh:
-    """Tops of all snowy cells, joined where they are one surface, with skirts where they end.
+    """Return the surface of all snowy cells, with vertical sides at its edges.
 
     Args:
         cover: the snow.
-        inner: half widths, m, of the part that is left out.
+        inner: half widths of the excluded area in x and y, m.
     """
     rows, columns = cover.depth.shape
     x = cover.x0 + cover.cell * np.arange(columns)
@@ -103,7 +110,7 @@ def cover_mesh(cover: Cover, inner: tuple[float, float]) -> Mesh:
         total, count = np.zeros(len(own)), np.zeros(len(own))
         for a, b in ((0, 0), (0, 1), (1, 0), (1, 1)):
             z = padded[j + dj + a, i + di + b]
-            near = np.abs(z - own) < STEEPEST * cover.cell
+            near = np.abs(z - own) < MAX_RISE * cover.cell
             total += np.where(near, z, 0.0)
             count += near
         px, py = x[i] + (di - 0.5) * cover.cell, y[j] + (dj - 0.5) * cover.cell
@@ -118,7 +125,7 @@ def cover_mesh(cover: Cover, inner: tuple[float, float]) -> Mesh:
         ((0, -1), (3, 0)),
     ):
         z = padded[j + 1 + dj, i + 1 + di]
-        open_side = ~(np.abs(z - own) < STEEPEST * cover.cell)
+        open_side = ~(np.abs(z - own) < MAX_RISE * cover.cell)
         upper = tops[open_side][:, [a, b]]
         lower = upper.copy()
         lower[..., 2] = foot[open_side, None]
@@ -132,12 +139,12 @@ def cover_mesh(cover: Cover, inner: tuple[float, float]) -> Mesh:
 
 @numba.njit(cache=True)
 def _from_above(triangles, x0, y0, cell, ground, level):
-    """Highest surface over each cell's middle, and how level it is (|n_z| of its triangle)."""
+    """Find the highest surface over each cell's centre, and |n_z| of its triangle, in place."""
     rows, columns = ground.shape
     for t in range(len(triangles)):
         a, b, c = triangles[t]
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-        if abs(area) < 1e-12:  # edge on: 0/0
+        if abs(area) < 1e-12:  # vertical triangle, 0/0
             continue
         i0 = max(int(np.ceil((min(a[0], b[0], c[0]) - x0) / cell)), 0)
         i1 = min(int(np.floor((max(a[0], b[0], c[0]) - x0) / cell)), columns - 1)
@@ -161,9 +168,9 @@ def _from_above(triangles, x0, y0, cell, ground, level):
 
 @numba.njit(cache=True)
 def _settle(ground, keeps, crown, holds, flake, steepest, rng):
-    """Depth of snow, below and on leaves, after all flakes have come to rest, one after the other.
+    """Drop all flakes one by one; return the depths of snow on surfaces and on leaves.
 
-    A flake that has begun to slide goes on to where all snow is kept, or over the edge.
+    A flake that slides continues until a surface that keeps all snow, or over an edge.
     """
     rows, columns = ground.shape
     depth, held = np.zeros_like(ground), np.zeros_like(ground)
@@ -175,7 +182,7 @@ def _settle(ground, keeps, crown, holds, flake, steepest, rng):
             continue
         if ground[j, i] == -np.inf:
             continue
-        for _ in range(MOVES):
+        for _ in range(MAX_MOVES):
             own = ground[j, i] + depth[j, i]
             best, best_j, best_i = 0.0, j, i
             first = int(rng.random() * 8)
@@ -188,8 +195,8 @@ def _settle(ground, keeps, crown, holds, flake, steepest, rng):
                 if fall > best:
                     best, best_j, best_i = fall, jj, ii
             slides = keeps[j, i] < 1.0 and (slides or rng.random() >= keeps[j, i])
-            # Bare ground may be as steep as it likes: what it keeps is said above.
-            lies = depth[j, i] < LEAST or best <= steepest
+            # The angle of repose applies to snow; `keeps` applies to bare surfaces.
+            lies = depth[j, i] < MIN_DEPTH or best <= steepest
             if best <= 0.0 or (lies and not slides):
                 depth[j, i] += flake
                 break
@@ -202,9 +209,9 @@ _STEPS = np.array([(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0),
 
 @numba.njit(cache=True)
 def _smooth(depth, ground, steepest):
-    """Each depth as the mean of its own and those of the four neighbours on the same surface.
+    """Average each depth (weight 4) with those of its four neighbours on the same surface.
 
-    Cells without a surface have no snow and give none: inf - inf is no height.
+    Cells without a surface do not count: their height difference is inf - inf.
     """
     rows, columns = depth.shape
     out = depth.copy()
@@ -213,8 +220,8 @@ def _smooth(depth, ground, steepest):
             total, count = 4 * depth[j, i], 4
             for k in (1, 3, 4, 6):
                 dj, di = _STEPS[k]
-                apart = abs(ground[j + dj, i + di] - ground[j, i])
-                if apart < steepest:
+                difference = abs(ground[j + dj, i + di] - ground[j, i])
+                if difference < steepest:
                     total += depth[j + dj, i + di]
                     count += 1
             out[j, i] = total / count

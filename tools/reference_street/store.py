@@ -1,4 +1,4 @@
-"""Linear means of pictures in the making, one file each."""
+"""Store of linear mean pictures, one file each, that grow by passes."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 
 def add(path: Path, fresh: Float[np.ndarray, "h w 3"]) -> None:
-    """Averages a new pass into a picture's mean; a stop leaves the old file or the new one."""
+    """Average a new pass into a picture's mean; the file is replaced atomically."""
     passes, mean = stored(path)
     mean = fresh if mean is None else (passes * mean + fresh) / (passes + 1)
     temporary = path.with_name(path.stem + ".tmp.npz")
@@ -17,7 +17,7 @@ def add(path: Path, fresh: Float[np.ndarray, "h w 3"]) -> None:
 
 
 def stored(path: Path) -> tuple[int, Float[np.ndarray, "h w 3"] | None]:
-    """Number of passes and their mean; (0, None) where there is none yet."""
+    """Return the number of passes and their mean; (0, None) without a file."""
     if not path.exists():
         return 0, None
     with np.load(path) as data:

@@ -1,4 +1,4 @@
-"""The ground: one continuous height function, and the meshes cut from it.
+"""The ground: one continuous height function, and the meshes sampled from it.
 
 x runs across the road, y along it, z up, all in metres. The height is a long profile g(y) plus a
 cross profile p(|x|), plus bumps on the grass and hills far away, so every slope is known in closed
@@ -30,7 +30,7 @@ _PROFILE = np.array(
         (5.0, 0.145),
     ]
 )
-DIP_AT = (-1.15, -5.2)  # m: a worn hollow in the left lane, where rain would stand
+DIP_AT = (-1.15, -5.2)  # m, a hollow in the left lane
 DIP_DEPTH = 0.07  # m
 DIP_RADIUS = 1.1  # m, to 1/e
 NEAR_X = 24.0  # m: extent of the detailed lawn picture
@@ -43,7 +43,7 @@ def _softplus(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
 
 
 def road_profile(y: ArrayLike) -> Float[np.ndarray, "*n"]:
-    """Long profile g(y) of the street in metres, 0 at y = 0; slope 1.5 % to 6 %."""
+    """Return the long profile g(y) of the street, m, 0 at y = 0; slope 1.5 % to 6 %."""
     y = np.asarray(y, float)
 
     def raw(v):
@@ -55,18 +55,18 @@ def road_profile(y: ArrayLike) -> Float[np.ndarray, "*n"]:
 
 
 def ground_height(x: ArrayLike, y: ArrayLike) -> Float[np.ndarray, "*n"]:
-    """Height of the ground (road, kerb, pavement, grass, hills) in metres; continuous.
+    """Return the height of the ground (road, kerb, pavement, grass, hills), m; continuous.
 
     Args:
-        x: Metres across the road, any shape.
-        y: Metres along the road, the same shape.
+        x: across the road, m, any shape.
+        y: along the road, m, same shape.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     ax = np.abs(x)
     cross = np.interp(ax, _PROFILE[:, 0], _PROFILE[:, 1])
-    beyond = np.maximum(ax - PAVEMENT_EDGE, 0.0)
-    rise = 0.062 * 15 * np.tanh(beyond / 15)
-    bumps = np.minimum(beyond, 1.5) * (
+    off_pavement = np.maximum(ax - PAVEMENT_EDGE, 0.0)
+    rise = 0.062 * 15 * np.tanh(off_pavement / 15)
+    bumps = np.minimum(off_pavement, 1.5) * (
         0.012 * np.sin(1.3 * x + 0.7 * y)
         + 0.010 * np.sin(0.6 * x - 1.1 * y + 1.0)
         + 0.006 * np.sin(2.9 * x + 2.3 * y + 2.0)
@@ -84,7 +84,7 @@ def ground_height(x: ArrayLike, y: ArrayLike) -> Float[np.ndarray, "*n"]:
 
 
 def _spaced(near: float, step: float) -> Float[np.ndarray, " n"]:
-    """Grid lines from `near` outwards to FAR with steps that grow by 12 %."""
+    """Return grid lines from `near` outwards to FAR with steps that grow by 12 %."""
     out = [near]
     while out[-1] < FAR:
         step *= 1.12
@@ -113,7 +113,7 @@ def _both_sides(xs, ys, uv_scale, u_from) -> Mesh:
 
 
 def ground_meshes() -> list[Mesh]:
-    """The ground as labelled meshes: road, gutter, kerb, pavement, lawn, meadow with hills."""
+    """Return the ground as labelled meshes: road, gutter, kerb, pavement, lawn, meadow, hills."""
     ys = _y_lines()
     corners = _PROFILE[:, 0]
     half = np.unique(np.concatenate([np.linspace(0, ROAD_HALF, 9), corners[:5]]))

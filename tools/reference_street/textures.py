@@ -1,6 +1,6 @@
-"""Procedural textures: `make(name)` gives an 8-bit sRGB picture, row 0 at v = 0.
+"""Procedural textures: `make(name)` returns an 8-bit sRGB picture, row 0 at v = 0.
 
-Everything is drawn from a fixed seed per name, so a texture is the same on every machine.
+Each name has a fixed random seed, so textures are the same on every machine.
 """
 
 import zlib
@@ -14,7 +14,7 @@ Image = Float[np.ndarray, "h w 3"]
 
 
 def noise(shape: tuple[int, int], slope: float, rng: np.random.Generator, stretch: float = 1.0):
-    """Tileable noise with power falling as frequency^-slope; mean 0, standard deviation 1."""
+    """Return tileable noise with amplitude frequency^-slope, mean 0, standard deviation 1."""
     fy = np.fft.fftfreq(shape[0])[:, None] * shape[0]
     fx = np.fft.rfftfreq(shape[1])[None, :] * shape[0] * stretch
     r = np.hypot(fy, fx)
@@ -34,7 +34,7 @@ def _mix(image: Image, colour, amount) -> None:
 
 
 def _metres(shape, width: float, height: float):
-    """Texel-centre coordinates in metres: x to the right, y up the rows."""
+    """Return texel-centre coordinates in metres: x along the columns, y along the rows."""
     y = (np.arange(shape[0]) + 0.5) * height / shape[0]
     x = (np.arange(shape[1]) + 0.5) * width / shape[1]
     return np.meshgrid(x, y)
@@ -46,7 +46,7 @@ def _asphalt(rng) -> Image:
     image = _flat(shape, (112, 112, 114))
     grain = noise(shape, 0.2, rng)
     image *= (1 + 0.07 * grain + 0.07 * noise(shape, 1.1, rng))[..., None]
-    for wheel in (0.75, 2.0, 3.4, 4.7):  # tyre tracks are polished and a little lighter
+    for wheel in (0.75, 2.0, 3.4, 4.7):  # tyre tracks are lighter
         _mix(image, (142, 141, 140), 0.35 * np.exp(-(((x - wheel) / 0.22) ** 2)))
     for _ in range(9):  # repairs
         x0, y0 = rng.uniform(0, 4.2), rng.uniform(0, 45)
@@ -63,7 +63,7 @@ def _asphalt(rng) -> Image:
     dash = (np.abs(x - 2.72) < 0.07) & (np.mod(y, 6.0) < 3.0)
     worn = np.clip(0.85 + 0.25 * noise(shape, 0.6, rng), 0.2, 1.0)
     _mix(image, (226, 224, 214), dash * worn)
-    for cx, cy in ((1.55, 21.0), (3.9, 44.2)):  # manhole covers, by the camera walk
+    for cx, cy in ((1.55, 21.0), (3.9, 44.2)):  # manhole covers
         r = np.hypot(x - cx, y - cy)
         plate = 74 + 26 * ((np.mod(x, 0.1) < 0.05) ^ (np.mod(y, 0.1) < 0.05))
         image[r < 0.34] = (plate / 255.0)[r < 0.34][:, None]
@@ -72,7 +72,7 @@ def _asphalt(rng) -> Image:
 
 
 def _blocks(shape, size, course, length, bond, colours, joint, joint_colour, rng) -> Image:
-    """Courses of bricks, slabs or tiles: a random colour each, joints `joint` metres wide."""
+    """Draw courses of bricks, slabs or tiles with random colours and joints of `joint` m."""
     x, y = _metres(shape, *size)
     row = np.floor(y / course).astype(int)
     shifted = x + bond * length * (row % 2)
@@ -144,7 +144,7 @@ def _lawn(rng) -> Image:
     for colour, level in (((240, 240, 232), 3.35), ((236, 206, 70), 3.5)):  # daisies, dandelions
         where = noise(shape, 0.0, rng) + 0.6 * noise(shape, 1.3, rng) > level
         _mix(image, colour, 0.9 * where)
-    for cx, cy, radius in ((-7.6, 6.6, 2.2), (9.3, -8.6, 1.6)):  # fallen leaves and earth by trees
+    for cx, cy, radius in ((-7.6, 6.6, 2.2), (9.3, -8.6, 1.6)):  # leaves and earth below trees
         r = np.hypot(x - cx, y - cy) / radius
         _mix(image, (120, 104, 64), 0.55 * np.exp(-(r**2)) * (noise(shape, 0.2, rng) > 0.4))
         _mix(image, (92, 76, 54), 0.8 * np.exp(-((r * 2.6) ** 2)))
@@ -179,7 +179,7 @@ def _tiles(colours):
         shape, size = (704, 704), (3.52, 3.52)
         image = _blocks(shape, size, 0.32, 0.22, 0.5, colours, 0.012, (52, 42, 38), rng)
         x, y = _metres(shape, *size)
-        up = np.mod(y, 0.32) / 0.32  # v runs up the roof: dark where the next course overlaps
+        up = np.mod(y, 0.32) / 0.32  # v runs up the roof; dark below the next course
         image *= (1.06 - 0.30 * up**3 - 0.55 * (up < 0.10))[..., None]
         wave = np.cos(2 * np.pi * (x + 0.11 * (np.floor(y / 0.32) % 2)) / 0.22)
         image *= (1 + 0.07 * wave)[..., None]
@@ -234,7 +234,7 @@ def _palette(dark, bright, warm):
 
 def _foliage(dark, bright):
     def draw(rng) -> Image:
-        shape = (512, 512)  # 4 m of leafy surface for inner crowns and distant trees
+        shape = (512, 512)  # 4 m of foliage
         image = _flat(shape, dark)
         _mix(image, bright, np.clip(0.5 + 0.35 * noise(shape, 0.9, rng), 0, 1))
         image *= (1 + 0.22 * noise(shape, 0.3, rng))[..., None]
@@ -336,6 +336,6 @@ NAMES = tuple(_DRAW)
 
 
 def make(name: str) -> UInt8[np.ndarray, "h w 3"]:
-    """The texture called `name` as 8-bit sRGB; row 0 is v = 0."""
+    """Return the texture of a name as 8-bit sRGB; row 0 is v = 0."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     return np.round(255 * np.clip(_DRAW[name](rng), 0.02, 0.95)).astype(np.uint8)

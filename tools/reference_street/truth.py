@@ -1,4 +1,4 @@
-"""What every pixel's middle really shows: distance, normal, class, and how much sun."""
+"""Trace the ground truth at pixel centres: ray length, normal, class, visible sun."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,33 +7,35 @@ from tools.reference_street.geometry import Mesh
 from tools.reference_street.layout import FIELD_OF_VIEW
 from tools.reference_street.sky import SUN_AZIMUTH, SUN_ELEVATION, SUN_WIDTH, direction
 
-# Cityscapes train ids, of which the paper's seven classes are merged; street furniture is "fence".
+# Cityscapes train ids; the paper's seven classes are merged from them. Objects count as fence.
 TRAIN_IDS = {
     "road": 0, "building": 2, "object": 4, "vegetation": 8, "terrain": 9, "sky": 10,
     "person": 11, "vehicle": 13,
 }  # fmt: skip
 SUN_RAYS = 8
-NUDGE = 1e-4  # rad
-LIFT = 1e-3  # m: rays begin beside the surface that they leave
+NUDGE = 1e-4  # rad, change of a ray that misses all meshes
+LIFT = 1e-3  # m, offset of secondary rays from their surface
 
 
 def sun_directions() -> Float[np.ndarray, "n 3"]:
-    """Directions over the bright place of the sky, in its core (half its width to 1/e)."""
+    """Return directions that cover the core of the sun (half its width to 1/e)."""
     sun = direction(SUN_AZIMUTH, SUN_ELEVATION)
     east = np.cross([0.0, 0.0, 1.0], sun)
     east /= np.linalg.norm(east)
     north = np.cross(sun, east)
     k = np.arange(SUN_RAYS)
-    away = np.tan(np.deg2rad(0.5 * SUN_WIDTH)) * np.sqrt((k + 0.5) / SUN_RAYS)
-    turn = k * np.pi * (3 - np.sqrt(5))
-    out = sun + away[:, None] * (np.cos(turn)[:, None] * east + np.sin(turn)[:, None] * north)
+    radius = np.tan(np.deg2rad(0.5 * SUN_WIDTH)) * np.sqrt((k + 0.5) / SUN_RAYS)
+    azimuth = k * np.pi * (3 - np.sqrt(5))
+    out = sun + radius[:, None] * (
+        np.cos(azimuth)[:, None] * east + np.sin(azimuth)[:, None] * north
+    )
     return out / np.linalg.norm(out, axis=-1, keepdims=True)
 
 
 def pixel_rays(
     pose: Float[np.ndarray, "4 4"], width: int, height: int
 ) -> Float[np.ndarray, "h w 3"]:
-    """Unit directions through the middles of the pixels, in the world."""
+    """Return the unit directions through the pixel centres, in the world."""
     focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     local = np.stack([(x - 0.5 * width) / focal, (y - 0.5 * height) / focal, np.ones_like(x)], -1)
@@ -44,17 +46,18 @@ def pixel_rays(
 def layers(
     scene, meshes: list[Mesh], pose: Float[np.ndarray, "4 4"], width: int, height: int
 ) -> dict[str, np.ndarray]:
-    """Truth of a view, one ray a pixel.
+    """Trace the ground truth of a view with one ray per pixel.
 
     Args:
-        scene: Mitsuba's scene of the meshes, loaded with their names.
-        meshes: for the classes of its shapes.
+        scene: Mitsuba scene of the meshes, loaded with `named`.
+        meshes: the meshes, for their classes.
         pose: camera to world, OpenCV axes.
-        width: pixels; height likewise.
+        width: width of the view, pixels.
+        height: height of the view, pixels.
 
     Returns:
         `depth` (m along the ray, inf in the sky), `normal` (world, towards the camera, 0 in the
-        sky), `label` (Cityscapes train ids) and `sun` (share of the sun's rays that arrive).
+        sky), `label` (Cityscapes train ids) and `sun` (fraction of unoccluded rays to the sun).
     """
     import mitsuba as mi
 
@@ -68,7 +71,7 @@ def layers(
     start = mi.Point3f(*eye)
     for i, ray in enumerate(rays):
         hit = scene.ray_intersect(mi.Ray3f(start, mi.Vector3f(*ray)))
-        if not hit.is_valid() and ray[2] < 0:  # through the seam of two meshes: no ray looks under
+        if not hit.is_valid() and ray[2] < 0:  # a ray through the seam of two meshes
             ray = ray + [NUDGE, NUDGE, 0.0]
             hit = scene.ray_intersect(mi.Ray3f(start, mi.Vector3f(*ray / np.linalg.norm(ray))))
         if not hit.is_valid():
@@ -78,8 +81,8 @@ def layers(
         n = n if n @ ray < 0 else -n
         normal[i] = n
         label[i] = classes[hit.shape.id()]
-        place = mi.Point3f(*(eye + float(hit.t) * ray + LIFT * n))
-        free = [n @ d > 0 and not scene.ray_test(mi.Ray3f(place, mi.Vector3f(*d))) for d in sun]
+        point = mi.Point3f(*(eye + float(hit.t) * ray + LIFT * n))
+        free = [n @ d > 0 and not scene.ray_test(mi.Ray3f(point, mi.Vector3f(*d))) for d in sun]
         lit[i] = np.mean(free)
     shape = (height, width)
     return {
@@ -93,17 +96,18 @@ def layers(
 def snow_layers(
     snowy, bare, pose: Float[np.ndarray, "4 4"], width: int, height: int
 ) -> dict[str, np.ndarray]:
-    """Truth of a view under snow, one ray a pixel.
+    """Trace the ground truth of a view under snow with one ray per pixel.
 
     Args:
-        snowy: Mitsuba's scene with the snow's meshes, loaded with their names.
-        bare: the same scene without them.
+        snowy: Mitsuba scene with the snow meshes, loaded with `named`.
+        bare: the same scene without snow.
         pose: camera to world, OpenCV axes.
-        width: pixels; height likewise.
+        width: width of the view, pixels.
+        height: height of the view, pixels.
 
     Returns:
-        `depth` (m along the ray, inf in the sky) and `thickness` (m of snow straight below the
-        place that is seen, to what lies under it; 0 where no snow is seen).
+        `depth` (m along the ray, inf in the sky) and `thickness` (m of snow vertically
+        below the visible point; 0 without visible snow).
     """
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""Flood water for the path tracer: a smooth dielectric over a medium that absorbs."""
+"""Flood water for the path tracer: a smooth dielectric over an absorbing medium."""
 
 from pathlib import Path
 
@@ -6,21 +6,21 @@ import numpy as np
 from jaxtyping import Float, Inexact
 
 IOR = 1.333
-ABSORPTION = 1.2  # 1/m, all colours alike: the medium is dark and has no colour of its own
+ABSORPTION = 1.2  # 1/m, for all colours; no scattering
 WIND = 3.0  # m/s
-WAVE_SCALE = 4.0  # the shortest waves are 15 cm long, so that a mesh shows them all
+WAVE_SCALE = 4.0  # the shortest waves are 15 cm long, which the mesh resolves
 SEED = 7
-NEAR = ((-14.0, 14.0), (-22.0, 18.0))  # m: where waves are modelled; beyond it the water is still
-STEP = 0.03  # m: a fifth of the shortest wave
+NEAR = ((-14.0, 14.0), (-22.0, 18.0))  # m, extent of the waves in x and y; else still water
+STEP = 0.03  # m, a fifth of the shortest wave
 
 
 def still(z: float) -> dict:
-    """A level surface at height z, with absorbing water below."""
+    """Return a level surface at height z (m) with absorbing water below."""
     return {"type": "rectangle", "to_world": _plane(z), **_water()}
 
 
 def wavy(z: float, time: float, folder: Path) -> dict:
-    """The surface with the program's own waves at a time, as a mesh with their normals."""
+    """Write the program's waves at a time (s) as a mesh with normals; return the surface."""
     from climatenerf.weather.flood.parameters import Flood
     from climatenerf.weather.flood.waves import at_time, heights, make_waves
 
@@ -28,7 +28,7 @@ def wavy(z: float, time: float, folder: Path) -> dict:
     frame = at_time(waves, time)
     (x0, x1), (y0, y1) = NEAR
     x, y = np.meshgrid(np.arange(x0, x1 + STEP / 2, STEP), np.arange(y0, y1 + STEP / 2, STEP))
-    # Down to still water within the last two metres.
+    # Waves fade to still water within two metres of the border.
     border = np.minimum.reduce([x - x0, x1 - x, y - y0, y1 - y])
     calm = np.clip(border / 2.0, 0, 1) ** 2 * (3 - 2 * np.clip(border / 2.0, 0, 1))
     height, slope = np.zeros_like(x), np.zeros(x.shape, complex)
@@ -45,7 +45,7 @@ def wavy(z: float, time: float, folder: Path) -> dict:
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((a, b, c), (a, c, d))])
-    # Four strips of still water around, out to the hills.
+    # Four strips of still water around it, out to the hills.
     far, ring_points, ring_faces = 250.0, [], []
     for (u0, v0), (u1, v1) in (
         ((-far, -far), (far, y0)), ((-far, y1), (far, far)),
@@ -67,7 +67,7 @@ def periodic(
     x: Float[np.ndarray, "*m"],
     y: Float[np.ndarray, "*m"],
 ) -> Inexact[np.ndarray, "*m"]:
-    """A periodic table, rows along +y over `side` metres, between its points."""
+    """Interpolate a periodic table (rows along +y) of `side` metres bilinearly."""
     n = len(table)
     u, v = x / side * n, y / side * n
     i, j = np.floor(u).astype(int), np.floor(v).astype(int)

@@ -1,4 +1,4 @@
-"""Pictures, labels, points and scene.json on disk, from the store; the demo's folder of them."""
+"""Write pictures, labels, points and scene.json from the store; write the demo's folder."""
 
 import json
 import os
@@ -17,14 +17,14 @@ from tools.reference_street.truth import layers
 
 JPEG_QUALITY = 92
 SKY, UNKNOWN = 10, 255  # Cityscapes train ids
-HOLDOUT_EVERY = 8  # of the demo: the first, ninth, ... view by name is held out
-PER_VIEW = 48  # sparse points
-FARTHEST = 120.0  # m, of a sparse point
+HOLDOUT_EVERY = 8  # in the demo: the first, ninth, ... view by name is held out
+POINTS_PER_VIEW = 48
+MAX_POINT_DISTANCE = 120.0  # m
 Poses = list[tuple[str, Float[np.ndarray, "4 4"]]]
 
 
 def write_demo(store: Path, out: Path, width: int, height: int) -> None:
-    """The 64 views of the walk and the arc, with labels that tell the sky from all else."""
+    """Write the 64 views of the walk and the arc, with labels of the sky alone."""
     poses = camera_poses()
     write_pictures(store / "clean", out / "images", poses)
     known = truths(store, poses, width, height)
@@ -36,13 +36,13 @@ def write_demo(store: Path, out: Path, width: int, height: int) -> None:
 
 
 def write_pictures(means: Path, folder: Path, poses: Poses) -> None:
-    """JPEGs of the views."""
+    """Write JPEGs of the views."""
     for name, _ in poses:
         save_jpeg(EXPOSURE * mean_of(means, name), folder / name)
 
 
 def mean_of(folder: Path, name: str) -> Float[np.ndarray, "h w 3"]:
-    """The linear picture of a view in a folder of the store."""
+    """Return the linear picture of a view in a folder of the store."""
     mean = stored((folder / name).with_suffix(".npz"))[1]
     if mean is None:
         raise SystemExit(
@@ -53,7 +53,7 @@ def mean_of(folder: Path, name: str) -> Float[np.ndarray, "h w 3"]:
 
 
 def truths(store: Path, poses: Poses, width: int, height: int) -> dict[str, dict[str, np.ndarray]]:
-    """The true layers of views, kept in the store: they take seven seconds each."""
+    """Return the true layers of views; the store caches them, as each takes seven seconds."""
     folder = store / "layers"
     folder.mkdir(parents=True, exist_ok=True)
     out, scene, meshes = {}, None, build_scene()
@@ -75,9 +75,9 @@ def sparse_points(
     width: int,
     height: int,
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
-    """Surface points as structure from motion would give them, metres, and the view of each.
+    """Return random surface points (m) like those of structure from motion, and their views.
 
-    They come from the views alone that are fitted to: what is measured is told to nobody.
+    Held-out views give no points.
     """
     rng = np.random.default_rng(1)
     focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
@@ -85,12 +85,13 @@ def sparse_points(
     for i, (name, pose) in enumerate(poses):
         if name in heldout:
             continue
-        row, column = rng.integers(height, size=PER_VIEW), rng.integers(width, size=PER_VIEW)
+        row = rng.integers(height, size=POINTS_PER_VIEW)
+        column = rng.integers(width, size=POINTS_PER_VIEW)
         depth = known[name]["depth"][row, column]
         pixel = np.stack([column + 0.5 - 0.5 * width, row + 0.5 - 0.5 * height], -1) / focal
-        ray = np.c_[pixel, np.ones(PER_VIEW)] @ pose[:3, :3].T
+        ray = np.c_[pixel, np.ones(POINTS_PER_VIEW)] @ pose[:3, :3].T
         ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-        near = depth < FARTHEST
+        near = depth < MAX_POINT_DISTANCE
         points.append(pose[:3, 3] + depth[near, None] * ray[near])
         seen_by.append(np.full(int(near.sum()), i))
     return np.concatenate(points), np.concatenate(seen_by)
@@ -105,9 +106,9 @@ def write_scene(
     height: int,
     shared: Callable[[str], str] = lambda path: path,
 ) -> None:
-    """Write scene.json (and points.ply) beside the pictures with climatenerf's own writer.
+    """Write scene.json and points.ply with climatenerf's own writer.
 
-    `shared` may say that a file (`images/0001.jpg`) lies elsewhere, as a path from `out`.
+    `shared` maps a file (`images/0001.jpg`) to its path relative to `out`.
     """
     from climatenerf.scene import Camera, Scene, View, save_scene
 
@@ -130,7 +131,7 @@ def write_scene(
     )
     scene = Scene(root, "street", (camera,), views, points, ground_z=ground, lowest_ground_z=lowest)
     path = save_scene(scene, root)
-    # The folder travels with its scene.json, so where it was made is nobody's business.
+    # The folder is portable: its scene.json must not contain its absolute path.
     data = json.loads(path.read_text(encoding="utf-8"))
     data.pop("root_absolute", None)
     temporary = path.with_suffix(".tmp")
@@ -139,7 +140,7 @@ def write_scene(
 
 
 def save_png(picture: np.ndarray, path: Path) -> None:
-    """A picture without loss."""
+    """Write a picture as PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     Image.fromarray(picture).save(temporary, "PNG", optimize=True)
@@ -147,7 +148,7 @@ def save_png(picture: np.ndarray, path: Path) -> None:
 
 
 def save_jpeg(linear: Float[np.ndarray, "h w 3"], path: Path) -> None:
-    """An exposed linear picture as a photo."""
+    """Write a linear picture after exposure as JPEG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     picture = Image.fromarray(encode(linear))
