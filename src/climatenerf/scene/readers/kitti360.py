@@ -166,8 +166,11 @@ def _camera(calibration: Mapping[str, str], name: str, root: Path) -> Camera:
 
 def _poses(
     root: Path, drive: str, name: str, calibration: Mapping[str, str]
-) -> tuple[dict[int, Float[np.ndarray, "4 4"]], str]:
-    """Return the camera-to-world poses of a rectified camera by frame, and their file."""
+) -> tuple[dict[int, Float[np.ndarray, "rows 4"]], str]:
+    """Return the camera-to-world poses of a rectified camera by frame, and their file.
+
+    The poses have 4 rows for camera 0 and 3 rows for camera 1, as in the files.
+    """
     folder = root / "data_poses" / drive
     if name == CAMERAS[0]:
         path = folder / "cam0_to_world.txt"
