@@ -12,7 +12,7 @@ import climatenerf
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-@pytest.mark.parametrize("name", ["01_fit_and_flood", "02_weather_file"])
+@pytest.mark.parametrize("name", ["01_fit_and_flood", "02_weather_file", "03_new_effect"])
 def test_the_examples_use_public_names_alone(name):
     tree = ast.parse((EXAMPLES / f"{name}.py").read_text())
     modules = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
@@ -34,7 +34,7 @@ def test_the_examples_run_one_after_the_other(tmp_path):
     for name, words in (
         ("01_fit_and_flood", ["400", str(run)]),
         ("02_weather_file", [str(run)]),
-        ("03_new_matter", [str(run)]),
+        ("03_new_effect", [str(run)]),
     ):
         command = [sys.executable, str(EXAMPLES / f"{name}.py"), *words]
         done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
@@ -42,7 +42,7 @@ def test_the_examples_run_one_after_the_other(tmp_path):
         told[name] = done.stdout
     assert (run / "flood" / "frames" / "0000.png").stat().st_size > 1000
     assert (run / "weather.jpg").stat().st_size > 1000
-    assert (run / "ash.png").stat().st_size > 1000
+    assert (run / "ash" / "frames" / "0000.png").stat().st_size > 1000
     assert "water on 0%" not in told["01_fit_and_flood"]
     assert told["02_weather_file"].count("visibility") == 3
-    assert "ash on 0%" not in told["03_new_matter"]
+    assert "ash on 0%" not in told["03_new_effect"]

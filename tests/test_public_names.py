@@ -26,7 +26,7 @@ def test_dir_lists_the_public_names_and_loads_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     names, modules = done.stdout.splitlines()
-    assert public(names.split()) == sorted(FUNCTIONS + CLASSES)
+    assert public(names.split()) == sorted([*FUNCTIONS, *CLASSES, "extend"])
     assert "__version__" in names.split()
     assert not {"torch", "numba", "scipy"} & set(modules.split())
 
@@ -43,7 +43,7 @@ def test_each_public_name_is_documented(name):
 def test_the_stub_for_type_checkers_names_the_same():
     stub = ast.parse(Path(climatenerf.__file__).with_suffix(".pyi").read_text())
     names = [n.names[0].asname for n in stub.body if isinstance(n, ast.ImportFrom)]
-    assert sorted(names) == sorted(FUNCTIONS + CLASSES)
+    assert sorted(names) == sorted([*FUNCTIONS, *CLASSES, "extend"])
 
 
 def test_another_name_is_an_attribute_error():

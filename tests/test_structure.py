@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "output": BELOW_RENDER | {"render", "paths", "evaluation"},
     "training": BELOW_TRAINING,
     "studies": BELOW_STUDIES,
+    "extend": BELOW_RENDER,
     "api": BELOW_STUDIES | {"studies", "sfm", "perception"},
     "cli": BELOW_STUDIES | {"studies", "sfm", "perception", "api"},
     "__main__": {"cli"},

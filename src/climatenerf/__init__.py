@@ -9,6 +9,7 @@ import importlib
 __version__ = "0.1.0"
 
 _PUBLIC = {
+    "extend": "climatenerf.extend",
     "open_scene": "climatenerf.api",
     "fit": "climatenerf.api",
     "load_run": "climatenerf.api",
@@ -27,7 +28,8 @@ def __getattr__(name: str) -> object:
     """Import a public name when it is first used."""
     if name not in _PUBLIC:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_PUBLIC[name]), name)
+    module = importlib.import_module(_PUBLIC[name])
+    value = module if name == "extend" else getattr(module, name)
     globals()[name] = value
     return value
 

@@ -1,4 +1,5 @@
 # For type checkers and editors: what `__init__.py` imports when it is first used.
+from climatenerf import extend as extend
 from climatenerf.api import evaluate as evaluate
 from climatenerf.api import fit as fit
 from climatenerf.api import load_run as load_run

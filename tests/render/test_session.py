@@ -11,11 +11,16 @@ from support.analytic_fields import AnalyticField, HalfSpace
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.field import compositing
+from climatenerf.field.compositing import RenderCancelled
+from climatenerf.render import integrator
 from climatenerf.render import session as module
 from climatenerf.render.frame import render_frame
 from climatenerf.render.session import RenderSession
 from climatenerf.scene.scene import Scene, View
-from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.description import weather_from_table, weather_to_table
+from climatenerf.weather.flood import surface as flood_module
+from climatenerf.weather.snow import layer as snow_module
 
 CAMERA = Camera(64, 36, 40.0, 40.0, 32.0, 18.0)
 C2W = np.eye(4)
@@ -85,3 +90,133 @@ def test_weather_without_effect_prepares_nothing(session_of):
 def test_a_level_above_everything_is_refused_at_any_moment(session_of):
     with pytest.raises(UserError, match="above the whole scene"):
         session_of({"flood": {"level": {"0 s": "0 m", "4 s": "50 m"}}}, [0.0, 4.0])
+
+
+# --- what a change prepares again ---------------------------------------------------------------
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Counts the expensive preparations by name."""
+    counts = dict.fromkeys(("find_deposits", "grow", "make_waves", "irradiance"), 0)
+
+    def watch(module, name, label=None):
+        original = getattr(module, name)
+
+        def noting(*args, **kwargs):
+            counts[label or name] += 1
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, noting)
+
+    watch(snow_module, "find_deposits")
+    watch(snow_module, "grow")
+    watch(flood_module, "make_waves")
+    return counts
+
+
+CHANGES = [
+    ("flood.colour", (0.1, 0.2, 0.3), {}),
+    ("flood.level", 0.4, {}),
+    ("flood.clarity", 2.0, {}),
+    ("smog.visibility", 20.0, {}),
+    ("snow.wrap", 1.0, {}),
+    ("snow.depth", 0.25, {"grow": 1}),
+    ("flood.wind_speed", 6.0, {"make_waves": 1}),
+    ("snow.fall_tilt", 0.3, {"find_deposits": 1, "grow": 1}),
+    ("seed", 5, {"find_deposits": 1, "grow": 1, "make_waves": 1}),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "again"), CHANGES)
+def test_a_change_prepares_only_what_it_invalidates(session_of, counted, name, value, again):
+    table = {
+        "flood": {"level": "0 m"},
+        "snow": {"depth": "10 cm"},
+        "smog": {"visibility": "50 m"},
+    }
+    session = session_of(table, [0.0])
+    session.world(0.0)
+    for key in counted:
+        counted[key] = 0
+    changed = session.weather.base.with_value(name, value)
+    session.change(changed)
+    world = session.world(0.0)
+    assert {key: count for key, count in counted.items() if count} == again
+    # The change shows: a session made anew has the same world.
+    fresh = session_of(weather_to_table(changed), [0.0]).world(0.0)
+    assert world.media == fresh.media
+    assert (world.surfaces[0].flood, world.surfaces[0].level) == (
+        fresh.surfaces[0].flood,
+        fresh.surfaces[0].level,
+    )
+    assert world.matters[0].snow == fresh.matters[0].snow
+
+
+def test_a_refused_change_keeps_the_weather(session_of):
+    session = session_of({"flood": {"level": "0 m"}}, [0.0])
+    before = session.weather
+    with pytest.raises(UserError):
+        session.change(before.base.with_value("flood.level", 5e4))
+    with pytest.raises(UserError):
+        session.change(before.base.with_value("flood.wind_speed", -1.0))
+    assert session.weather is before and session.world(0.0).surfaces[0].level == 0
+
+
+def test_the_shutter_s_middle_is_the_moment_that_is_rendered(session_of):
+    table = {"flood": {"level": {"0 s": "-0.3 m", "4 s": "0.5 m"}}}
+    session = session_of(table, [0.0, 4.0])
+    open_long = session.frame(CAMERA, C2W, 1.0, shutter=2.0)
+    assert np.array_equal(open_long.picture, session.frame(CAMERA, C2W, 2.0).picture)
+    assert not np.array_equal(open_long.picture, session.frame(CAMERA, C2W, 1.0).picture)
+
+
+# --- cancelling -------------------------------------------------------------------------------
+
+
+def test_a_cancelled_frame_traces_no_further_chunk(session_of, monkeypatch):
+    session = session_of({"flood": {"level": "0 m", "wind-speed": "5 m/s"}}, [0.0])
+    traced = []
+    original = integrator._trace
+
+    def noting(world, rays_o, *rest, **options):
+        traced.append(len(rays_o))
+        return original(world, rays_o, *rest, **options)
+
+    monkeypatch.setattr(integrator, "_trace", noting)
+    answers = iter([False] * 3 + [True] * 100)
+    asked = []
+
+    def cancelled():
+        asked.append(next(answers))
+        return asked[-1]
+
+    # Chunks of a first guess of 256 rays; this camera has 2304.
+    with pytest.raises(RenderCancelled):
+        session.frame(CAMERA, C2W, cancelled=cancelled)
+    assert asked == [False] * 3 + [True], "asked once more, and never again"
+    outer = [n for n in traced if n >= 16]
+    assert outer[0] == 256 and sum(traced[:1]) < CAMERA.width * CAMERA.height
+
+
+def test_chunks_follow_the_pace_of_the_machine(monkeypatch):
+    """With a clock of 0.1 ms a ray, chunks settle at 100 rays: 10 ms of the promised 20."""
+    clock = [0.0]
+    monkeypatch.setattr(compositing.time, "perf_counter", lambda: clock[0])
+    sizes = []
+    for chunk in compositing.chunks(torch.zeros(5000, 3), lambda: False):
+        n = len(range(*chunk.indices(5000)))
+        sizes.append(n)
+        clock[0] += 1e-4 * n
+    assert sum(sizes) == 5000
+    assert all(n * 1e-4 <= 0.02 for n in sizes[1:])
+    assert sizes[3] == pytest.approx(100, abs=1)
+
+
+def test_a_frame_that_could_be_cancelled_equals_one_that_could_not(session_of):
+    session = session_of({"flood": {"level": "0 m"}, "smog": {"visibility": "50 m"}}, [0.0])
+    free = session.frame(CAMERA, C2W, layers=("normal",))
+    bound = session.frame(CAMERA, C2W, layers=("normal",), cancelled=lambda: False)
+    assert np.array_equal(free.picture, bound.picture)
+    for name, values in free.layers.items():
+        assert np.allclose(values, bound.layers[name], atol=1e-5, equal_nan=True), name

@@ -12,11 +12,11 @@ from support.toy_scene import CAMERA, TINY, make_scene
 from climatenerf.core.classes import BUILDING, SKY, VEGETATION
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json, read_safetensors, write_json, write_safetensors
+from climatenerf.evaluation.appearance import nearby_appearance
 from climatenerf.evaluation.heldout import evaluate
 from climatenerf.evaluation.metrics import psnr_cc
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.sampler import Sampler
-from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.volume import render_view
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import with_split

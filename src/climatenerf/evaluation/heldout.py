@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from climatenerf.evaluation.appearance import nearby_appearance
 from climatenerf.evaluation.metrics import psnr, psnr_cc, ssim
 from climatenerf.field.hash_field import Field
-from climatenerf.render.appearance import nearby_appearance
 from climatenerf.render.volume import render_view
 from climatenerf.scene.images import downscaled_camera, load_image, load_mask
 from climatenerf.scene.scene import Scene

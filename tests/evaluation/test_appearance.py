@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.random_field import random_field
 
-from climatenerf.render.appearance import nearby_appearance
+from climatenerf.evaluation.appearance import nearby_appearance
 
 
 def pose(angle: float, x: float = 0.0) -> np.ndarray:

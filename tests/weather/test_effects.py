@@ -1,0 +1,201 @@
+"""Effects as packages: a user's own one, and those that cannot be used together."""
+
+import dataclasses
+import importlib.util
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.analytic_fields import AnalyticField, Box, HalfSpace
+from support.random_field import random_field
+
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.core.layer_table import Layer
+from climatenerf.core.storage import write_json
+from climatenerf.field.checkpoint import save_field
+from climatenerf.render.session import RenderSession
+from climatenerf.scene import save_scene
+from climatenerf.scene.scene import Scene, View
+from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.effect import Effect
+from climatenerf.weather.registry import EFFECTS, check_effects, in_order, layer_table
+from climatenerf.weather.smog.parameters import SMOG, Smog
+from climatenerf.weather.weather import Weather
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "03_new_effect.py"
+CAMERA = Camera(48, 27, 30.0, 30.0, 24.0, 13.5)
+C2W = np.eye(4)
+C2W[:3, :3] = np.array([[1, 0, 0], [0, -0.35, 0.9367], [0, -0.9367, -0.35]])
+C2W[:3, 3] = (0.0, -4.5, 1.8)
+
+
+@pytest.fixture(scope="module")
+def ash():
+    """The module of the example, as a package would be imported."""
+    spec = importlib.util.spec_from_file_location("volcanic_ash", EXAMPLE)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["volcanic_ash"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def scene_at(folder):
+    views = tuple(View(f"{i}.png", folder / f"{i}.png", 0, C2W) for i in range(3))
+    return Scene(folder, "test", (CAMERA,), views)
+
+
+def test_ash_from_its_own_package_lies_on_the_scene(ash, tmp_path):
+    effects = (*EFFECTS, ash.ASH)
+    box = ((-6.0, -6.0, -2.0), (6.0, 6.0, 4.0))
+    field = AnalyticField([HalfSpace(), Box((-1.0, 0.0, 0.0), (0.5, 1.0, 0.8))], box=box)
+    film = weather_from_table(
+        {"ash": {"depth": {"0 s": "2 cm", "2 s": "10 cm"}, "albedo": 0.05}}, effects
+    )
+    session = RenderSession(
+        field, scene_at(tmp_path), film, times=np.array([0.0, 2.0]), effects=effects
+    )
+    for time, depth in ((0.0, 0.02), (1.0, 0.06), (2.0, 0.1)):
+        frame = session.frame(CAMERA, C2W, time)
+        covered = frame.layers["mask_ash"] > 0.9
+        assert covered.mean() > 0.3
+        assert np.median(frame.layers["ash_thickness"][covered]) == pytest.approx(depth, rel=0.2)
+        assert (frame.layers["mask_snow"] == 0).all()
+    clean = RenderSession(field, scene_at(tmp_path), Weather()).frame(CAMERA, C2W)
+    dark, bright = frame.linear.numpy()[covered].mean(), clean.linear.numpy()[covered].mean()
+    assert dark < 0.5 * bright, "ash is darker than the ground"
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """A folder on the path with the example as an installed package, and a run to render."""
+    site = tmp_path_factory.mktemp("site")
+    shutil.copy(EXAMPLE, site / "volcanic_ash.py")
+    about = site / "volcanic_ash-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: volcanic-ash\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[climatenerf.effects]\nash = volcanic_ash:ASH\n")
+    run = site / "run"
+    run.mkdir()
+    field = random_field(images=3, full=True)
+    field.occupancy.occupied[..., field.occupancy.side // 2 :] = 0  # air above the middle
+    field.geometry_net[-1].add_(5.0)  # dense below
+    save_field(field, run)
+    save_scene(scene_at(run), run)
+    write_json(run / "config.json", {"schema_version": 1, "settings": {}})
+    return site
+
+
+def climatenerf(site, *words):
+    paths = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
+    command = [sys.executable, "-m", "climatenerf", *map(str, words)]
+    environment = os.environ | {"PYTHONPATH": paths}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+
+
+def test_an_installed_effect_has_flags_keyframes_and_layers(installed, tmp_path):
+    (tmp_path / "film.toml").write_text('[ash]\ndepth = { "0 s" = "0 m", "1 s" = "4 cm" }\n')
+    out = tmp_path / "out"
+    words = ["--weather", tmp_path / "film.toml", "--ash.albedo", "0.3", "--layers", "mask_ash"]
+    words += ["--path", "still", "--frames", "2", "--fps", "1", "--size", "32x18"]
+    done = climatenerf(installed, "render", installed / "run", "-o", out, *words)
+    assert done.returncode == 0, done.stderr
+    sidecar = json.loads((out / "movie.json").read_text())
+    assert sidecar["weather"]["ash"] == {"depth": {"0 s": "0 m", "1 s": "0.04 m"}, "albedo": 0.3}
+    assert sidecar["layers"]["mask_ash"]["meaning"] == "share of the pixel that shows ash"
+    first, last = (frame["measured"]["ash_share"] for frame in sidecar["frames"])
+    assert first == 0 < last
+    with np.load(out / "mask_ash" / "0001.npz") as arrays:
+        assert arrays["mask_ash"].shape == (18, 32)
+
+
+def test_an_installed_effect_has_help_and_a_range(installed, tmp_path):
+    shown = " ".join(climatenerf(installed, "render", "--help").stdout.replace("│", " ").split())
+    assert '--ash.depth LENGTH, e.g. "0.5 m"; 0 m to 1 m' in shown
+    words = ["render", installed / "run", "-o", tmp_path / "out", "--ash.depth", "3 m"]
+    done = climatenerf(installed, *words)
+    assert done.returncode == 2 and not (tmp_path / "out").exists()
+    assert done.stderr.strip() == ("climatenerf: --ash.depth must lie between 0 m and 1 m; got 3 m")
+
+
+# --- effects that clash -----------------------------------------------------------------------
+
+
+def effect(**changes) -> Effect:
+    return dataclasses.replace(
+        Effect("rain", Smog, enabled_by=("visibility",), prepare=None), **changes
+    )
+
+
+RAIN = Layer("mask_rain", "1", "share of the pixel that shows rain", 1 / 255, 8)
+
+
+@pytest.mark.parametrize(
+    ("added", "message"),
+    [
+        ([effect(name="flood")], "two weather effects are named 'flood'"),
+        ([effect(name="seed")], "cannot be named 'seed'"),
+        ([effect(name="path")], "cannot be named 'path'"),
+        ([effect(name="acid rain")], "cannot be named 'acid rain'"),
+        ([effect(layers=(dataclasses.replace(RAIN, name="depth"),))], "layer 'depth' is written"),
+        (
+            [effect(layers=(RAIN,)), effect(name="sleet", layers=(RAIN,))],
+            "layer 'mask_rain' is written by the effect 'rain' and by the effect 'sleet'",
+        ),
+        ([effect(after=("hail",))], "placed after hail, which is absent"),
+        ([effect(after=("sleet",)), effect(name="sleet", after=("rain",))], "waits for it"),
+    ],
+)
+def test_effects_that_clash_are_refused_in_one_sentence(added, message):
+    with pytest.raises(UserError) as error:
+        check_effects((*EFFECTS, *added), reserved=["path"])
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_clash_of_installed_effects_ends_with_status_2(installed, tmp_path):
+    for name in ("volcanic_ash.py", "volcanic_ash-1.0.dist-info"):
+        copy = shutil.copytree if (installed / name).is_dir() else shutil.copy
+        copy(installed / name, tmp_path / name)
+    text = (tmp_path / "volcanic_ash.py").read_text()
+    (tmp_path / "volcanic_ash.py").write_text(text.replace('name="ash"', 'name="flood"'))
+    done = climatenerf(tmp_path, "render", installed / "run", "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert done.stderr.startswith("climatenerf: two weather effects are named 'flood'")
+    assert done.stderr.count("\n") == 1
+
+
+def test_built_in_effects_stand_together_and_snow_follows_the_flood():
+    assert check_effects(EFFECTS) == EFFECTS
+    names = [each.name for each in in_order(EFFECTS[::-1])]
+    assert names.index("flood") < names.index("snow")
+    for each in EFFECTS:
+        assert each.fields().keys() == {f.name for f in dataclasses.fields(each.parameters)}
+    assert len(layer_table()) == 4 + sum(len(each.layers) for each in EFFECTS)
+
+
+def test_every_parameter_that_preparation_depends_on_exists():
+    weather = Weather()
+    for each in EFFECTS:
+        for name in each.prepared_from:
+            weather.value(name)
+
+
+def test_weather_is_a_value():
+    one = Weather(smog=Smog(visibility=9.0), seed=3)
+    assert one == Weather(smog=Smog(visibility=9.0), seed=3) and hash(one) == hash(one)
+    assert one != one.with_value("smog.visibility", 8.0) and one.smog.visibility == 9.0
+    assert one.present() == (SMOG,)
+    with pytest.raises(AttributeError):
+        one.seed = 4
+    with pytest.raises(AttributeError, match="no weather effect is named 'hail'"):
+        one.hail  # noqa: B018
+    with pytest.raises(TypeError, match="no weather effect is named 'hail'"):
+        Weather(hail=Smog())
+    assert math.isclose(one.with_value("sun.elevation", 0.5).sun.elevation, 0.5)
