@@ -141,14 +141,14 @@ class RayBatch:
     """Grid units."""
 
 
-def draw_batch(fitting: Trainer, samples: int) -> RayBatch:
+def draw_batch(trainer: Trainer, samples: int) -> RayBatch:
     """Draw rays that have about `samples` samples in total."""
-    field, rays = fitting.field, 512
+    field, rays = trainer.field, 512
     for _ in range(50):  # rays differ, so that the target may not be reached
-        batch = fitting.pixels.draw(rays, fitting.generator)
+        batch = trainer.pixels.draw(rays, trainer.generator)
         n = batch.rays_o.shape[0]
         near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
-        jitter = uniform(fitting.generator, n)
+        jitter = uniform(trainer.generator, n)
         found = field.march(batch.rays_o, batch.rays_d, near, far, 1.0, jitter, stop=1e-4)
         if 0.9 * samples < found.t.shape[0] < 1.1 * samples or rays > 2**16:
             break
@@ -218,17 +218,17 @@ def twin_step(field: Field, at: RayBatch, compiled: bool) -> Callable[[], None]:
     return step
 
 
-def steps(fitting: Trainer, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
+def steps(trainer: Trainer, samples: int, twin_samples: int, repeats: int) -> dict[str, object]:
     """Measure samples per second of our kernels and the twins on the same field and rays.
 
     Measurements alternate, so that a change of the machine's load affects all of them.
     """
-    many = draw_batch(fitting, samples)
-    few = many if twin_samples == samples else draw_batch(fitting, twin_samples)
+    many = draw_batch(trainer, samples)
+    few = many if twin_samples == samples else draw_batch(trainer, twin_samples)
     jobs = {
-        "ours": our_step(fitting.field, many),
-        "eager": twin_step(fitting.field, few, False),
-        "compile": twin_step(fitting.field, few, True),
+        "ours": our_step(trainer.field, many),
+        "eager": twin_step(trainer.field, few, False),
+        "compile": twin_step(trainer.field, few, True),
     }
     counts = {name: (many if name == "ours" else few).samples.t.shape[0] for name in jobs}
     taken: dict[str, list[float]] = {name: [] for name in jobs}
@@ -266,13 +266,13 @@ def time_to_psnr(
     """Fit a capture; return the seconds to reach each PSNR of `goals` (dB), and the curve."""
     scene = read_scene(capture)
     start = time.perf_counter()
-    fitting = begin(scene, settings, downscale)
+    trainer = begin(scene, settings, downscale)
     prepared = time.perf_counter() - start
     curve: list[dict[str, float]] = []
 
     def look(report: Report) -> None:
         if report.seconds >= every * (len(curve) + 1) or report.progress >= 1:
-            found = evaluate(fitting.field, scene, downscale, lambda done, total: None, False)
+            found = evaluate(trainer.field, scene, downscale, lambda done, total: None, False)
             curve.append(
                 {
                     "seconds": prepared + report.seconds,
@@ -282,9 +282,9 @@ def time_to_psnr(
                 }
             )
 
-    fitting.run(look)
+    trainer.run(look)
     last = curve[-1]
-    found = {"prepared_s": prepared, "samples_per_s": last["samples"] / fitting.seconds}
+    found = {"prepared_s": prepared, "samples_per_s": last["samples"] / trainer.seconds}
     return {**reached(curve, goals), **found, "curve": curve}
 
 
@@ -329,10 +329,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     scene = load_scene(options.run)
-    fitting = begin(scene, FitSettings(seed=options.seed, multiview_stereo=False), 1)
-    fitting.field = load_field(options.run).requires_grad_()
+    trainer = begin(scene, FitSettings(seed=options.seed, multiview_stereo=False), 1)
+    trainer.field = load_field(options.run).requires_grad_()
     found: dict[str, object] = {"run": options.run.name, "capture": scene.root.name}
-    found["step"] = steps(fitting, options.samples, options.twin_samples, options.repeats)
+    found["step"] = steps(trainer, options.samples, options.twin_samples, options.repeats)
     shown = frames(options.run, options.size, options.path, options.repeats, options.seed)
     found["frame"] = {
         f"{name}_s": row["seconds"]["median"] for name, row in shown["frames"].items()

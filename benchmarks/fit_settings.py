@@ -42,18 +42,18 @@ VARIANTS = {
 
 
 def heldout_psnr(scene: Scene, seed: int, variant: dict) -> float:
-    """Fit a variant; return the mean PSNR of the held-out views. Capitals are module constants."""
+    """Fit a variant; return the mean PSNR of the held-out views."""
     settings = FitSettings(
         size=TINY, minutes=None, steps=400, samples_per_step=2**15, seed=seed, **variant
     )
     views = scene.of_split("train")
     extent = find_extent(np.stack([scene.c2w_world(view) for view in views]), None)
-    fitting = make_trainer(load_pixels(scene, 1), extent, settings)
-    fitting.run(lambda _: None)
+    trainer = make_trainer(load_pixels(scene, 1), extent, settings)
+    trainer.run(lambda _: None)
     found = []
     for view in scene.of_split("heldout"):
         photo = load_image(view, scene).astype(np.float32) / 255
-        found.append(psnr(render_view(fitting.field, CAMERA, scene.c2w_world(view)), photo))
+        found.append(psnr(render_view(trainer.field, CAMERA, scene.c2w_world(view)), photo))
     return float(np.mean(found))
 
 

@@ -74,8 +74,8 @@ def frames(
         rows[name] = {
             "seconds": seconds,
             "prepare_seconds": prepared,
-            "water_share": float(layers["mask_water"].mean()),
-            "snow_share": float(layers["mask_snow"].mean()),
+            "water_coverage": float(layers["mask_water"].mean()),
+            "snow_coverage": float(layers["mask_snow"].mean()),
         }
     for row in rows.values():
         row["times_clean"] = row["seconds"]["median"] / rows["clean"]["seconds"]["median"]

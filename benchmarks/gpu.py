@@ -54,13 +54,13 @@ def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
 
 def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
     """Measure samples per second of a step, ours and eager PyTorch's, on the same rays."""
-    fitting = begin(load_scene(run), FitSettings(seed=seed, multiview_stereo=False), 1)
-    fitting.field = load_field(run).requires_grad_()
-    at = draw_batch(fitting, samples)
+    trainer = begin(load_scene(run), FitSettings(seed=seed, multiview_stereo=False), 1)
+    trainer.field = load_field(run).requires_grad_()
+    at = draw_batch(trainer, samples)
     size, found = at.samples.t.shape[0], {}
     makers = {"ours": our_step, "eager": lambda field, at: twin_step(field, at, False)}
     for name, make in makers.items():  # one by one: the twin removes our optimiser's buffers
-        job = finished(make(fitting.field, at), device)
+        job = finished(make(trainer.field, at), device)
         seconds = common.measure(job, repeats, warm_up=3)
         found[name] = {"samples_per_s": size / seconds["median"], "seconds": seconds}
     return {"samples": size, **found}
@@ -96,13 +96,13 @@ def samples_of_frame(run: Path, size: str, view: str) -> int:
 
 def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300) -> dict[str, Any]:
     """Count synchronisations with the device per step in the last third of a fit, by line."""
-    fitting = begin(read_scene(capture), replace(settings, minutes=None, steps=steps), downscale)
+    trainer = begin(read_scene(capture), replace(settings, minutes=None, steps=steps), downscale)
     met, ends = [], []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
         try:
-            fitting.run(lambda _: ends.append(len(caught)))
+            trainer.run(lambda _: ends.append(len(caught)))
         finally:
             torch.cuda.set_sync_debug_mode("default")
         met = [f"{Path(each.filename).name}:{each.lineno}" for each in caught]

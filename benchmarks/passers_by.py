@@ -55,20 +55,20 @@ def people(scene: Scene) -> list[Bool[np.ndarray, "h w"]]:
 
 def fit(scene: Scene, settings: FitSettings, downscale: int) -> Trainer:
     """Fit a scene like `climatenerf fit`."""
-    fitting = begin(scene, settings, downscale)
-    fitting.run(lambda _: None)
-    fitting.field.occupancy.update(fitting.field.grid_density, 1.0, 0.8, fitting.generator)
-    return fitting
+    trainer = begin(scene, settings, downscale)
+    trainer.run(lambda _: None)
+    trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
+    return trainer
 
 
-def masked(fitting: Trainer, image: int, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+def masked(trainer: Trainer, image: int, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """Evaluate the mask of a photo at its pixel centres."""
     y, x = ((np.arange(side) + 0.5) / side for side in shape)
     position = torch.tensor(
         np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), dtype=torch.float32
     )
     with torch.no_grad():
-        found = fitting.masks(torch.full((len(position),), image), position) > MASK_THRESHOLD
+        found = trainer.masks(torch.full((len(position),), image), position) > MASK_THRESHOLD
     return found.view(shape).numpy()
 
 
@@ -87,10 +87,10 @@ def main() -> None:
             scene = read_scene(REFERENCE / ("street" if row == "quiet" else "street-busy"))
             shown = people(scene)
             given = without_people(scene, Path(folder)) if row == "unnamed" else scene
-            fitting = fit(given, settings, options.downscale)
-            marked = [masked(fitting, i, each.shape) for i, each in enumerate(shown)]
+            trainer = fit(given, settings, options.downscale)
+            marked = [masked(trainer, i, each.shape) for i, each in enumerate(shown)]
             person, mask = np.concatenate(shown), np.concatenate(marked)
-            scores = evaluate(fitting.field, scene, options.downscale, lambda *_: None, False)
+            scores = evaluate(trainer.field, scene, options.downscale, lambda *_: None, False)
             found[row] = {
                 "people_pixels": float(person.mean()),
                 "people_masked": float(mask[person].mean()) if person.any() else None,

@@ -104,14 +104,14 @@ def main() -> None:
     options = parser.parse_args()
     random = np.random.default_rng(0)
     scene = read_scene(ROOT / "reference" / "street")
-    fitting = begin(scene, FitSettings(minutes=None, steps=1, multiview_stereo=False), 1)
+    trainer = begin(scene, FitSettings(minutes=None, steps=1, multiview_stereo=False), 1)
     size = options.size
     jobs = {
         "metaball sums": snow_sums(random, int(2**18 * size)),
         "plane sweep": windows(
-            random, fitting.pixels, fitting.evidence.free_space.sparse, int(2**14 * size)
+            random, trainer.pixels, trainer.evidence.free_space.sparse, int(2**14 * size)
         ),
-        "visual hull": hull_points(random, fitting.pixels, int(2**18 * size)),
+        "visual hull": hull_points(random, trainer.pixels, int(2**18 * size)),
     }
     best = bounds(options.repeats, 2**17)
     rows: dict[str, dict] = {"machine": best}
