@@ -1,10 +1,10 @@
-"""The main job on real photographs, through the command line; what must be seen, from the layers.
+"""Fit and render real captures through the command line, and check the layers of each weather.
 
 pytest -m slow tests/test_captures_end_to_end.py      (about a quarter of an hour on two cores)
 
-A few hundred steps of fitting: a soft picture, but where things are is settled. After half as many
-haze still hangs over the ground and takes the snow. Steps, not minutes: a busy machine takes longer
-and finds the same.
+The fit has 700 steps: images are blurred, but the geometry is settled. After half as many steps,
+haze above the ground still collects the snow. The number of steps is fixed, not the time, so that
+the load of the machine does not change the result.
 """
 
 import dataclasses
@@ -20,15 +20,15 @@ pytestmark = pytest.mark.slow
 
 VISIBILITY = 40.0
 SNOW = 0.15
-# Where each is flooded to (ditch: its datum is the street, the channel lies below), how much of
-# the picture must then show water, and from where it is looked at.
+# Water level above the datum (for ditch the street; its channel lies below), the minimum fractions
+# of the frame that show water and snow, and the downscaling of the photos.
 CAPTURES = {
-    "ditch": {"level": "-1.5 m", "least_water": 0.05, "least_snow": 0.05, "downscale": 2},
-    "stone_sign": {"level": "0.3 m", "least_water": 0.10, "least_snow": 0.15, "downscale": 2},
-    "kitti_drive": {"level": "0.3 m", "least_water": 0.05, "least_snow": 0.05, "downscale": 2},
-    "fox": {"level": "0.3 m", "least_water": 0.02, "downscale": 1},
+    "ditch": {"level": "-1.5 m", "min_water": 0.05, "min_snow": 0.05, "downscale": 2},
+    "stone_sign": {"level": "0.3 m", "min_water": 0.10, "min_snow": 0.15, "downscale": 2},
+    "kitti_drive": {"level": "0.3 m", "min_water": 0.05, "min_snow": 0.05, "downscale": 2},
+    "fox": {"level": "0.3 m", "min_water": 0.02, "downscale": 1},
 }
-WALL = "fox"  # hangs on one: in its picture hardly anything lies level
+WALL = "fox"  # shows a wall, with hardly any horizontal surface
 FLAGS = {
     "smog": ["--smog.visibility", f"{VISIBILITY} m"],
     "snow": ["--snow.depth", f"{SNOW} m"],
@@ -37,25 +37,25 @@ FLAGS = {
 
 @pytest.fixture(scope="module", params=CAPTURES)
 def fitted(request, captures, tmp_path_factory):
-    """Name of the capture and its run."""
+    """Return the name of the capture and its run folder."""
     name = request.param
     run = tmp_path_factory.mktemp(name) / "run"
-    words = ["fit", str(captures / name), "-o", str(run), "--steps", "700", "--minutes", "30"]
-    assert cli.main([*words, "--downscale", str(CAPTURES[name]["downscale"])]) == 0
+    command = ["fit", str(captures / name), "-o", str(run), "--steps", "700", "--minutes", "30"]
+    assert cli.main([*command, "--downscale", str(CAPTURES[name]["downscale"])]) == 0
     return name, run
 
 
 @pytest.fixture(scope="module")
 def rendered(fitted, tmp_path_factory):
-    """Layers of one still frame by weather."""
+    """Return the layers, and the linear colours, of one still frame by weather."""
     name, run = fitted
     level = ["--flood.level", CAPTURES[name]["level"]]
     weathers = {"clean": [], **FLAGS, "flood": level, "all": [*level, *sum(FLAGS.values(), [])]}
     found = {}
     for weather, flags in weathers.items():
         out = tmp_path_factory.mktemp(f"{name}-{weather}")
-        words = ["render", str(run), "-o", str(out), "--path", "still", "--frames", "1"]
-        assert cli.main([*words, "--size", "160x90", "--layers", "all", *flags]) == 0
+        command = ["render", str(run), "-o", str(out), "--path", "still", "--frames", "1"]
+        assert cli.main([*command, "--size", "160x90", "--layers", "all", *flags]) == 0
         frame = json.loads((out / "movie.json").read_text())["frames"][0]
         found[weather] = {
             key: np.load(out / paths[0])[key] for key, paths in frame["layers"].items()
@@ -69,42 +69,43 @@ def rendered(fitted, tmp_path_factory):
     return found
 
 
-def test_the_fit_is_measured(fitted):
+def test_fit_reaches_a_minimum_psnr(fitted):
     name, run = fitted
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["psnr"] > 14 and metrics["psnr_cc"] >= metrics["psnr"] - 0.1, name
-    if name != "kitti_drive":  # nothing moves in the others
+    if name != "kitti_drive":  # the other captures have no moving objects
         assert metrics["masked_fraction"] < 0.02, name
 
 
-def test_no_weather_leaves_no_trace(rendered):
+def test_clean_frame_has_empty_weather_layers(rendered):
     clean = rendered["clean"]
     assert (clean["mask_water"] == 0).all() and (clean["mask_snow"] == 0).all()
     assert (clean["transmittance"] == 1).all()
 
 
-def test_smog_takes_the_contrast_that_distance_asks_for(rendered):
-    """The picture itself, against clean picture and clean depth: I = T J + (1 - T) A.
+def test_smog_attenuates_contrast_with_distance(rendered):
+    """The smoggy image equals I = T J + (1 - T) A of the clean image and depth.
 
-    A visibility of 40 m leaves 5 % of the contrast there.
+    The visibility is the distance at which 5 % of the contrast remains.
     """
     clean, smog = rendered["clean"], rendered["smog"]
     seen = np.isfinite(clean["depth"])
     assert seen.mean() > 0.2
-    passed = np.where(seen, np.exp(np.log(0.05) / VISIBILITY * clean["depth"]), 0.0)[..., None]
+    transmittance = np.where(seen, np.exp(np.log(0.05) / VISIBILITY * clean["depth"]), 0.0)[
+        ..., None
+    ]
     white = np.array([0.8394, 0.8034, 0.5363])  # .925 .906 .758 in display values
-    expected = passed * clean["linear"] + (1 - passed) * white
-    off = np.abs(smog["linear"] - expected).max(-1)
-    # Not exact: a ray's light comes from a spread of depths, and the clean picture is clipped.
-    assert np.median(off[seen]) < 0.04 and np.quantile(off[seen], 0.9) < 0.15
-    changed = np.abs(clean["linear"] - expected).max(-1)
-    assert np.median(changed) > 2 * np.median(off), "it changes the picture by far more than that"
-    # The layer tells the same, and what is far away is gone.
-    assert np.allclose(smog["transmittance"], passed[..., 0], atol=2e-3)
+    expected = transmittance * clean["linear"] + (1 - transmittance) * white
+    error = np.abs(smog["linear"] - expected).max(-1)
+    # Not exact: the samples of a ray lie at several depths, and the clean image is clipped.
+    assert np.median(error[seen]) < 0.04 and np.quantile(error[seen], 0.9) < 0.15
+    change = np.abs(clean["linear"] - expected).max(-1)
+    assert np.median(change) > 2 * np.median(error), "the effect of smog exceeds the error"
+    assert np.allclose(smog["transmittance"], transmittance[..., 0], atol=2e-3)
     assert np.allclose(smog["mask_smog"], 1 - smog["transmittance"], atol=1e-5)
 
 
-def test_with_all_weathers_the_air_still_counts_from_the_surface_seen(rendered):
+def test_transmittance_with_all_weathers_follows_the_visible_surface(rendered):
     layers = rendered["all"]
     seen = np.isfinite(layers["depth"])
     expected = np.exp(np.log(0.05) / VISIBILITY * layers["depth"][seen])
@@ -113,21 +114,21 @@ def test_with_all_weathers_the_air_still_counts_from_the_surface_seen(rendered):
 
 
 @pytest.mark.parametrize("weather", ["flood", "all"])
-def test_water_covers_what_lies_low(fitted, rendered, weather):
+def test_water_covers_the_low_ground(fitted, rendered, weather):
     name, _ = fitted
     layers = rendered[weather]
-    share = layers["mask_water"].mean()
-    assert CAPTURES[name]["least_water"] <= share < 0.95, share
+    fraction = layers["mask_water"].mean()
+    assert CAPTURES[name]["min_water"] <= fraction < 0.95, fraction
     wet = layers["mask_water"] > 0.5
     assert layers["water_depth"][wet].mean() > 0.01
     assert (layers["water_depth"][layers["mask_water"] == 0] == 0).all()
-    # The level is a plane: water is level ground at most as far as the clean scene's surface.
+    # The water surface is not behind the surface of the clean scene.
     clean = rendered["clean"]["depth"]
     assert (layers["depth"][wet] <= clean[wet] + 0.05 * np.abs(clean[wet]) + 0.1).mean() > 0.9
 
 
-def test_the_water_mirrors_the_place(fitted, monkeypatch):
-    """Still water that reflects all shows what a camera mirrored in its surface sees."""
+def test_mirror_water_reflects_the_scene(fitted, monkeypatch):
+    """Perfectly reflecting still water shows the scene along the mirrored rays."""
     import torch
 
     from climatenerf.field.checkpoint import load_field
@@ -140,46 +141,47 @@ def test_the_water_mirrors_the_place(fitted, monkeypatch):
     from climatenerf.scene import load_scene
     from climatenerf.weather.description import weather_from_table
 
-    # Else reflected rays march in coarser steps, in which leaves come out differently.
+    # Reflected rays otherwise use coarser steps, which render leaves differently.
     monkeypatch.setattr(tracing, "SECONDARY_STEP", RENDER_STEP)
     name, run = fitted
     field, scene = load_field(run), load_scene(run)
     path = camera_path("still", scene, 1, (160, 90))
     table = {"flood": {"level": CAPTURES[name]["level"], "wind-speed": "0 m/s"}}
-    places, times = path.c2w[:, :3, 3], np.zeros(1)
-    world = RenderSession(field, scene, weather_from_table(table), places, times).world(0.0)
+    positions, times = path.c2w[:, :3, 3], np.zeros(1)
+    world = RenderSession(field, scene, weather_from_table(table), positions, times).world(0.0)
     (water,) = world.surfaces
     level = water.level
     mirror = dataclasses.replace(world, surfaces=(dataclasses.replace(water, mirror_only=True),))
     o, d = camera_rays(path.cameras[0], path.c2w[0])
     angle = torch.full((len(o),), 1 / 160)
-    seen = trace(mirror, o, d, angle)
-    wet = seen.mask_water > 0.999
-    assert wet.float().mean() > CAPTURES[name]["least_water"] / 2
+    rendered = trace(mirror, o, d, angle)
+    wet = rendered.layers["mask_water"] > 0.999
+    assert wet.float().mean() > CAPTURES[name]["min_water"] / 2
     t = (level - o[:, 2]) / d[:, 2]
     start = (o + t[:, None] * d)[wet]
-    turned = (d * torch.tensor([1.0, 1.0, -1.0]))[wet]
-    clean = trace(dataclasses.replace(world, near=0.0, water=None), start, turned, angle[wet])
-    error = (clean.rgb.clamp(0, 1) - seen.rgb[wet].clamp(0, 1)).square().mean()
+    mirrored = (d * torch.tensor([1.0, 1.0, -1.0]))[wet]
+    monkeypatch.setattr(field, "near", 0.0)
+    clean = trace(dataclasses.replace(world, surfaces=()), start, mirrored, angle[wet])
+    error = (clean.rgb.clamp(0, 1) - rendered.rgb[wet].clamp(0, 1)).square().mean()
     assert -10 * np.log10(float(error)) > 35
 
 
-def test_snow_lies_as_deep_as_asked_for(fitted, rendered):
+def test_snow_has_the_requested_depth(fitted, rendered):
     layers = rendered["snow"]
     assert (layers["snow_thickness"][layers["mask_snow"] == 0] == 0).all()
-    snowy = layers["mask_snow"] > 0.5  # a short fit's surfaces are soft and shine through
+    snowy = layers["mask_snow"] > 0.5  # surfaces of a short fit are partly transparent
     if fitted[0] == WALL:
-        assert snowy.mean() < 0.02, "hardly anything lies level"
+        assert snowy.mean() < 0.02, "hardly any surface is horizontal"
         return
-    assert snowy.mean() > CAPTURES[fitted[0]]["least_snow"]
-    # Within 10 % over known planes (test_snow.py); here the ground is rough and soft.
+    assert snowy.mean() > CAPTURES[fitted[0]]["min_snow"]
+    # Planes are within 10 % (test_snow.py); the ground here is rough and partly transparent.
     assert np.median(layers["snow_thickness"][snowy]) == pytest.approx(SNOW, rel=0.45)
 
 
-def test_sheltered_places_stay_bare(fitted, rendered):
-    """Surfaces seen in the picture, and whether matter stands straight above them."""
+def test_sheltered_surfaces_have_less_snow(fitted, rendered):
+    """Compare visible surfaces with and without matter straight above them."""
     if fitted[0] == WALL:
-        pytest.skip("a wall: no snow in the open to compare with")
+        pytest.skip("a wall has no open surface with snow to compare with")
     import torch
 
     from climatenerf.field.checkpoint import load_field
@@ -197,15 +199,15 @@ def test_sheltered_places_stay_bare(fitted, rendered):
     above = (o + torch.where(solid, depth, 0.0)[:, None] * d) + torch.tensor([0.0, 0.0, 0.6])
     up = torch.tensor([0.0, 0.0, 1.0]).expand_as(above).contiguous()
     samples = field.march(above, up, torch.zeros(len(o)), torch.full((len(o),), 60.0))
-    _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    _, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     snow = torch.from_numpy(rendered["snow"]["mask_snow"]).reshape(-1)
-    bare, open_sky = snow[solid & (left < 0.02)], snow[solid & (left > 0.9)]
-    if len(bare) < 50 or len(open_sky) < 50:
-        pytest.skip("nothing in this picture is sheltered, or nothing is open")
-    assert bare.mean() < 0.4 * open_sky.mean()
+    sheltered, exposed = snow[solid & (transmittance < 0.02)], snow[solid & (transmittance > 0.9)]
+    if len(sheltered) < 50 or len(exposed) < 50:
+        pytest.skip("the frame shows too few sheltered or exposed surfaces")
+    assert sheltered.mean() < 0.4 * exposed.mean()
 
 
-def test_no_snow_is_seen_under_water(rendered):
+def test_snow_under_water_is_hidden(rendered):
     layers = rendered["all"]
     wet = layers["mask_water"] > 0.99
     assert (layers["mask_snow"][wet] < 0.01 + 1e-4).all()

@@ -11,18 +11,18 @@ from climatenerf.core import storage
 from climatenerf.core.errors import UserError
 
 
-def names(folder: Path) -> list[str]:
+def file_names(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir())
 
 
-def test_json_round_trip_of_everything_we_store(tmp_path):
+def test_json_round_trip_of_supported_types(tmp_path):
     @dataclass(frozen=True)
-    class Level:
+    class Length:
         metres: float
 
     storage.write_json(
         tmp_path / "deep" / "a.json",
-        {"x": np.float32(0.5), "m": np.eye(2), "p": Path("b"), "l": Level(1.0), "inf": np.inf},
+        {"x": np.float32(0.5), "m": np.eye(2), "p": Path("b"), "l": Length(1.0), "inf": np.inf},
     )
     assert storage.read_json(tmp_path / "deep" / "a.json") == {
         "x": 0.5,
@@ -31,10 +31,10 @@ def test_json_round_trip_of_everything_we_store(tmp_path):
         "l": {"metres": 1.0},
         "inf": None,
     }
-    assert names(tmp_path / "deep") == ["a.json"]
+    assert file_names(tmp_path / "deep") == ["a.json"]
 
 
-def test_failure_or_interrupt_leaves_old_file_and_no_rubbish(tmp_path):
+def test_failure_or_interrupt_keeps_the_old_file_and_leaves_no_other(tmp_path):
     path = tmp_path / "a.json"
     storage.write_json(path, {"old": 1})
     with pytest.raises(KeyboardInterrupt), storage.atomic_path(path) as temporary:
@@ -44,11 +44,11 @@ def test_failure_or_interrupt_leaves_old_file_and_no_rubbish(tmp_path):
     with pytest.raises(TypeError):
         storage.write_json(path, {"bad": object()})
     assert json.loads(path.read_text()) == {"old": 1}
-    assert names(tmp_path) == ["a.json"]
+    assert file_names(tmp_path) == ["a.json"]
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
-def test_disk_full_is_one_clear_sentence(tmp_path, monkeypatch, code):
+def test_full_disk_raises_and_keeps_the_old_file(tmp_path, monkeypatch, code):
     path = tmp_path / "a.bin"
     storage.write_bytes(path, b"old")
 
@@ -59,10 +59,10 @@ def test_disk_full_is_one_clear_sentence(tmp_path, monkeypatch, code):
     monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(UserError, match="disk is full"):
         storage.write_bytes(path, b"new")
-    assert path.read_bytes() == b"old" and names(tmp_path) == ["a.bin"]
+    assert path.read_bytes() == b"old" and file_names(tmp_path) == ["a.bin"]
 
 
-def test_disk_full_inside_safetensors(tmp_path, monkeypatch):
+def test_full_disk_in_safetensors_raises(tmp_path, monkeypatch):
     import safetensors.numpy
     from safetensors import SafetensorError
 
@@ -72,10 +72,10 @@ def test_disk_full_inside_safetensors(tmp_path, monkeypatch):
     monkeypatch.setattr(safetensors.numpy, "save_file", full)
     with pytest.raises(UserError, match="disk is full"):
         storage.write_safetensors(tmp_path / "f.safetensors", {"a": np.zeros(3)})
-    assert names(tmp_path) == []
+    assert file_names(tmp_path) == []
 
 
-def test_places_that_cannot_be_written(tmp_path):
+def test_unwritable_paths_raise(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="is a file, not a folder"):
         storage.write_bytes(tmp_path / "file" / "a.bin", b"")
@@ -104,20 +104,20 @@ def test_safetensors_round_trip(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "content, words",
+    "content, message",
     [(b'{"a": 1', "line 1, column"), (b"[1]", "object"), (b"\xff\xfe\x00", "not text")],
 )
-def test_read_json_says_what_is_wrong(tmp_path, content, words):
+def test_read_json_error_names_file_and_cause(tmp_path, content, message):
     path = tmp_path / "a.json"
     path.write_bytes(content)
-    with pytest.raises(UserError, match=words) as caught:
+    with pytest.raises(UserError, match=message) as caught:
         storage.read_json(path, "run")
     assert str(path) in str(caught.value) and str(caught.value).startswith("run")
     with pytest.raises(UserError, match="does not exist"):
         storage.read_json(tmp_path / "b.json")
 
 
-def test_schema():
+def test_check_schema():
     storage.check_schema(1, 2, "run x")
     with pytest.raises(UserError, match="version 3.*up to 2.*upgrade"):
         storage.check_schema(3, 2, "run x")
@@ -126,7 +126,7 @@ def test_schema():
             storage.check_schema(bad, 2, "run x")
 
 
-def test_new_files_have_ordinary_permissions(tmp_path):
+def test_new_files_have_default_permissions(tmp_path):
     storage.write_bytes(tmp_path / "a", b"")
     (tmp_path / "b").write_bytes(b"")
     storage.write_safetensors(tmp_path / "c", {"a": np.zeros(2)})
