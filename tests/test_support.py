@@ -1,5 +1,6 @@
 """The helpers of other tests: shape checks and the statistical comparison of pictures."""
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,12 @@ from climatenerf.core.samples import Samples
 from climatenerf.evaluation.metrics import psnr
 from climatenerf.ops import reference
 
+needs_checks = pytest.mark.skipif(
+    jaxtyping.config.jaxtyping_disable, reason="the shape checks are switched off"
+)
 
+
+@needs_checks
 def test_calls_with_wrong_shapes_or_types_raise():
     u = torch.rand(5, 3)
     assert reference.contract(u).shape == (5, 3)
@@ -25,6 +31,7 @@ def test_calls_with_wrong_shapes_or_types_raise():
         psnr(np.zeros((4, 5, 3)), np.zeros((4, 6, 3)))
 
 
+@needs_checks
 def test_dataclasses_check_their_fields():
     one = torch.ones(4)
     assert len(Samples(torch.tensor([0, 4]), one, one, one).t) == 4
