@@ -1,6 +1,6 @@
 """Picture quality against a photograph: PSNR, SSIM, and PSNR after a colour correction.
 
-All take display-encoded (sRGB) pictures in [0, 1], or 8-bit ones, and work in float64.
+Pictures are display-encoded (sRGB), in [0, 1] or 8 bit. All scores are computed in float64.
 """
 
 from typing import Any
@@ -17,14 +17,14 @@ SSIM_K2 = 0.03
 
 
 def psnr(rendered: Picture, photo: Picture) -> float:
-    """Peak signal-to-noise ratio in dB, over all pixels and channels, peak 1.
+    """Return the peak signal-to-noise ratio over all pixels and channels, peak 1, dB.
 
     Args:
         rendered: display-encoded picture, [0, 1] or 8 bit; CPU torch tensors are accepted.
-        photo: the picture it should be, same shape.
+        photo: the expected picture, same shape.
 
     Returns:
-        dB; +inf where the pictures are equal.
+        dB; +inf for equal pictures.
     """
     a, b = _pair(rendered, photo)
     mse = float(np.mean((a - b) ** 2))
@@ -32,18 +32,21 @@ def psnr(rendered: Picture, photo: Picture) -> float:
 
 
 def ssim(rendered: Picture, photo: Picture) -> float:
-    """Structural similarity, mean over channels and over all whole windows.
+    """Return the structural similarity, mean over channels and all complete windows.
 
     Wang, Bovik, Sheikh and Simoncelli 2004: 11x11 Gaussian window of sigma 1.5 pixels, K1 = 0.01,
-    K2 = 0.03, data range 1; population (not sample) covariances; windows that leave the picture
-    are not counted.
+    K2 = 0.03, data range 1, population (not sample) covariances. Windows that extend beyond the
+    picture do not count.
 
     Args:
         rendered: display-encoded picture, [0, 1] or 8 bit, at least 11 pixels a side.
-        photo: the picture it should be, same shape.
+        photo: the expected picture, same shape.
 
     Returns:
-        A number in [-1, 1]; 1 where the pictures are equal.
+        A number in [-1, 1]; 1 for equal pictures.
+
+    Raises:
+        ValueError: the shapes differ, or the pictures are smaller than a window.
     """
     a, b = _pair(rendered, photo)
     if min(a.shape[:2]) < SSIM_WINDOW:
@@ -59,23 +62,24 @@ def ssim(rendered: Picture, photo: Picture) -> float:
 
 
 def psnr_cc(rendered: Picture, photo: Picture) -> float:
-    """PSNR in dB after the affine colour map that fits the photo best (see `colour_corrected`).
+    """Return the PSNR after the best affine colour map (see `colour_corrected`), dB.
 
-    It leaves out what a photo's own exposure and white balance do, which a held-out
-    view can know from photos nearby at most. Report it beside `psnr`, never instead of it.
+    This removes the effect of a photo's exposure and white balance, which held-out views can only
+    take from nearby photos. Report it beside `psnr`, never instead of it.
     """
     return psnr(colour_corrected(rendered, photo), photo)
 
 
 def colour_corrected(rendered: Picture, photo: Picture) -> Float[np.ndarray, "h w 3"]:
-    """The rendered picture after the 3x4 affine colour map nearest to the photo.
+    """Return the rendered picture after the best 3x4 affine colour map to the photo.
 
-    Least squares over all pixels in display-encoded colours; the result is clipped to [0, 1].
+    The map is the least-squares solution over all pixels in display values. The result is clipped
+    to [0, 1].
     """
     a, b = _pair(rendered, photo)
     flat = a.reshape(-1, a.shape[-1])
     with_one = np.concatenate([flat, np.ones_like(flat[:, :1])], axis=1)
-    # lstsq, not the normal equations: a picture of one colour leaves them singular.
+    # lstsq: the normal equations are singular for a picture of one colour.
     matrix, *_ = np.linalg.lstsq(with_one, b.reshape(-1, b.shape[-1]), rcond=None)
     return np.clip(with_one @ matrix, 0.0, 1.0).reshape(b.shape)
 
@@ -83,7 +87,7 @@ def colour_corrected(rendered: Picture, photo: Picture) -> Float[np.ndarray, "h 
 def _pair(rendered: Picture, photo: Picture) -> tuple[np.ndarray, np.ndarray]:
     a, b = _unit_range(rendered), _unit_range(photo)
     if a.shape != b.shape or a.ndim != 3:
-        raise ValueError(f"pictures must both be (h, w, c) and of one shape: {a.shape}, {b.shape}")
+        raise ValueError(f"pictures must have one shape (h, w, c): {a.shape}, {b.shape}")
     return a, b
 
 
@@ -93,7 +97,7 @@ def _unit_range(picture: Picture) -> np.ndarray:
 
 
 def _blur(picture: np.ndarray) -> np.ndarray:
-    """Separable Gaussian of the SSIM window, whole windows only."""
+    """Convolve with the separable Gaussian window of SSIM; complete windows only."""
     offsets = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
     weights = np.exp(-(offsets**2) / (2 * SSIM_SIGMA**2))
     weights /= weights.sum()
