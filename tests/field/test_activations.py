@@ -63,7 +63,7 @@ def test_density_from_raw_is_the_twins():
     (grad,) = torch.autograd.grad(found.sum(), ours)
     (goal,) = torch.autograd.grad(expected.sum(), twin)
     assert torch.allclose(grad.double()[inner], goal[inner], rtol=2e-5)
-    assert (grad[raw > cpu_pointwise.LARGEST_RAW] == 0).all() and (grad[raw < 15] > 0).all()
+    assert (grad[raw > cpu_pointwise.MAX_RAW] == 0).all() and (grad[raw < 15] > 0).all()
 
 
 def test_positions_that_learn_keep_their_gradient():

@@ -272,7 +272,7 @@ def test_marching(generator, monkeypatch, skip, share, thin):
     spans[2, 1] = 0.5
     steps = (0.1, 0.02, thin)
     monkeypatch.setattr(marching, "GPU_RAYS", 19)  # in two parts, the first of two blocks
-    monkeypatch.setattr(marching, "CAPACITY", 64)
+    monkeypatch.setattr(marching, "MAX_RAY_SAMPLES", 64)
     offsets, samples = marching.march(
         (o.to(DEVICE), d.to(DEVICE)), spans.to(DEVICE), cells, steps, 1e-3, weights
     )

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from climatenerf.ops.cpu import metaballs
-from climatenerf.ops.cpu.metaballs import BRICK, HEIGHT_UNIT, RADIUS, REACH, STORED, Lattice
+from climatenerf.ops.cpu.metaballs import BRICK, HEIGHT_UNIT, RADIUS, STORED, SUPPORT, Lattice
 from climatenerf.ops.metaballs_reference import metaball_kernel, metaball_sums
 
 SPACING = 0.05
@@ -22,7 +22,7 @@ def dense_lattice(fill: np.ndarray, height: np.ndarray, shade: np.ndarray) -> La
         window = tuple(slice(c * BRICK, c * BRICK + STORED) for c in (i, j, m))
         for part, array in zip(parts, padded, strict=True):
             part.append(array[window])
-    band, near = metaballs.where_matter_is(np.stack(parts[0]))
+    band, near = metaballs.occupied_cells(np.stack(parts[0]))
     return Lattice(
         lower=np.array([[-0.3, 0.2, 0.1]]),
         spacing=np.array([SPACING]),
@@ -180,7 +180,7 @@ def test_march_respects_its_limits_and_misses_nothing():
 
 
 def test_reach_and_radius_belong_together():
-    assert abs(REACH - 1.5 * RADIUS) < 1e-12
+    assert abs(SUPPORT - 1.5 * RADIUS) < 1e-12
 
 
 def test_cells_without_snow_have_low_sums():

@@ -45,7 +45,7 @@ def test_kernels_are_compiled_anew_when_their_instructions_change():
     for module in (cpu_encoding, cpu_marching, cpu_network, cpu_optimiser, metaballs):
         text = own + balls if module is metaballs else own
         digest = hashlib.sha256(text).hexdigest()[:12]
-        assert digest == module.LANES_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
+        assert digest == module.SIMD_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
 
 
 @pytest.mark.parametrize(("m", "k", "vectors"), [(64, 24, 8), (3, 7, 3), (1, 32, 1), (5, 1, 2)])
@@ -102,7 +102,7 @@ def test_many_points_are_encoded_as_few_are():
     generator = torch.Generator().manual_seed(5)
     table = torch.rand(3, 512, 2, generator=generator) - 0.5
     resolutions = torch.tensor([4, 16, 40])
-    u = torch.rand(2 * cpu_encoding.ENCODED + 37, 3, generator=generator)
+    u = torch.rand(2 * cpu_encoding.MAX_BLOCK + 37, 3, generator=generator)
     out = encoding.hash_encode(u, table, resolutions)
     parts = [encoding.hash_encode(part, table, resolutions) for part in u.split(1000)]
     assert torch.allclose(out, torch.cat(parts), atol=1e-6)

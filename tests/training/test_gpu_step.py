@@ -45,7 +45,7 @@ def test_a_step_with_the_gpu_kernels_has_the_gradients_of_the_cpu_kernels(scene,
         (gpu_compositing, "LIST", 64),
         (gpu_optimiser, "ENTRIES", 2**16),
         (gpu_visual_hull, "PLACES", 4096),
-        (marching, "CAPACITY", 128),
+        (marching, "MAX_RAY_SAMPLES", 128),
     ):
         monkeypatch.setattr(module, name, size)
     results = []

@@ -11,7 +11,7 @@ from torch import Tensor
 from climatenerf.core.colour import decode_srgb
 from climatenerf.core.vectors import length
 from climatenerf.ops.cpu import activations as cpu
-from climatenerf.ops.cpu.activations import BLACK, LARGEST_RAW, MIN_SLOPE, SHARPNESS
+from climatenerf.ops.cpu.activations import BLACK, MAX_RAW, MIN_SLOPE, SHARPNESS
 
 
 def radiance(raw: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -45,7 +45,7 @@ def plain_density_from_raw(raw: Float[Tensor, "n"], u: Float[Tensor, "n 3"]) -> 
     """
     # 1e-4: in the outermost shell rounding could make it negative.
     shell = (2.0 - length(4.0 * u - 2.0)).clamp(1e-4, 1.0)
-    return raw.clamp_max(LARGEST_RAW).exp() * shell.square()
+    return raw.clamp_max(MAX_RAW).exp() * shell.square()
 
 
 def _on_cpu(*tensors: Tensor) -> bool:

@@ -163,7 +163,7 @@ class Field(nn.Module):
         learned = {capabilities.NORMALS} if self.knows_normals else set()
         learned |= {capabilities.CLASSES} if self.knows_classes else set()
         # The fused kernel runs on NVIDIA GPUs only.
-        fused = {capabilities.FUSED} if fused_render.takes_whole_rays(self.geometry_grid) else set()
+        fused = {capabilities.FUSED} if fused_render.is_available(self.geometry_grid) else set()
         always = {capabilities.DENSITY, capabilities.APPEARANCE, capabilities.OBSERVED}
         return frozenset(always | learned | fused)
 
@@ -240,7 +240,7 @@ class Field(nn.Module):
         The twin is `field.compositing.composited`.
         """
         sampler = self.sampler
-        shared = self._ray_hidden(rays_d, self._appearance(appearance, rays_o.shape[0]))
+        ray_hidden = self._ray_hidden(rays_d, self._appearance(appearance, rays_o.shape[0]))
         endless, start = torch.full_like(t_min, 1e9), torch.zeros_like(t_min)
         found = fused_render.composite(
             (self.to_grid(rays_o), rays_d),
@@ -249,7 +249,8 @@ class Field(nn.Module):
             sampler.steps(step_scale, pruning_threshold),
             (stop, MIN_WEIGHT),
             self.density_net,
-            ((self.appearance_grid, self.appearance_resolutions, *self.colour_net), shared),
+            (self.appearance_grid, self.appearance_resolutions, *self.colour_net),
+            ray_hidden,
         )
         return found[:, :3], found[:, 4], found[:, 3] * self.unit
 

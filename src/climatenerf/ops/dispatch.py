@@ -33,9 +33,14 @@ def kernels(operation: str, *tensors: Tensor) -> ModuleType | None:
 
 
 def kernel_array(tensor: Tensor) -> Any:
-    """Return a tensor's data in the form kernels take: C-contiguous, NumPy array on a CPU.
+    """Return a tensor's data in the form that kernels take: contiguous; a NumPy array on a CPU.
 
     The data are copied only where the tensor is not contiguous.
     """
     tensor = tensor.detach().contiguous()
     return tensor if tensor.is_cuda else tensor.numpy()
+
+
+def kernel_arrays(*tensors: Tensor) -> tuple[Any, ...]:
+    """Return `kernel_array` of each tensor."""
+    return tuple(kernel_array(tensor) for tensor in tensors)

@@ -8,8 +8,8 @@ from climatenerf.ops import dispatch
 from climatenerf.ops.marching import Cells, Net
 
 
-def takes_whole_rays(*tensors: Tensor) -> bool:
-    """Whether these are on a GPU, as `composite` wants them."""
+def is_available(*tensors: Tensor) -> bool:
+    """Return whether `composite` takes these tensors: they must be on an NVIDIA GPU."""
     return dispatch.backend(*tensors) == "triton"
 
 
@@ -20,30 +20,32 @@ def composite(
     cells: Cells,
     steps: tuple[float, float, float],
     limits: tuple[float, float],
-    net: Net,
-    colours: tuple[Net, Float[Tensor, "n h"]],
+    density_net: Net,
+    colour_net: Net,
+    ray_hidden: Float[Tensor, "n h"],
 ) -> Float[Tensor, "n 5"]:
-    """Whole rays in one launch, where `takes_whole_rays`; elsewhere march and composite.
+    """March and composite rays, where `is_available`; elsewhere compose the separate operations.
 
     Args:
-        rays, spans, cells, steps, net: as those of `march`.
-        limits: transmittance at which a ray ends, weight from which a sample has a colour.
-        colours: encoding and network of the appearance, and what is added to its hidden layer.
+        rays, spans, cells, steps, density_net: as `marching.march` takes them.
+        limits: transmittance at which a ray ends; weight from which a sample's colour is evaluated.
+        colour_net: encoding and network of the appearance.
+        ray_hidden: what each ray adds to the hidden layer of the colours.
 
     Returns:
-        Linear radiance of matter, weighted sum of ray lengths (grid units), transmittance.
+        Linear radiance, weighted sum of ray lengths (grid units), transmittance.
     """
     from climatenerf.ops.triton import fused_render as triton
 
-    looks, shared = colours
     out = spans.new_empty(spans.shape[0], 5)
-    weights = tuple(map(dispatch.kernel_array, net)), tuple(map(dispatch.kernel_array, looks))
-    given = (
-        tuple(map(dispatch.kernel_array, rays)),
-        dispatch.kernel_array(spans),
-        tuple(map(dispatch.kernel_array, cells)),
-    )
     triton.composite(
-        *given, steps, limits, *weights, dispatch.kernel_array(shared), dispatch.kernel_array(out)
+        dispatch.kernel_arrays(*rays),
+        dispatch.kernel_array(spans),
+        dispatch.kernel_arrays(*cells),
+        steps,
+        limits,
+        dispatch.kernel_arrays(*density_net),
+        dispatch.kernel_arrays(*colour_net),
+        *dispatch.kernel_arrays(ray_hidden, out),
     )
     return out

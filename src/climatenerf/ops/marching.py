@@ -1,4 +1,7 @@
-"""Marching of rays through occupied space, and the density on the way. No gradients."""
+"""Marching of rays through occupied space, and the density that it evaluates. No gradients.
+
+Lengths are in grid units (see `reference.contract`).
+"""
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -7,62 +10,52 @@ from torch import Tensor
 from climatenerf.ops import dispatch, reference
 from climatenerf.ops.cpu import marching as cpu
 
-CAPACITY = 1024  # samples a ray may have; a ray across all cascades takes 850 whole steps
-CPU_RAYS = 2048  # marched at once; a multiple of cpu.RAY_BLOCK
-GPU_RAYS = 2**15  # the same; the room for their samples takes 12 kB a ray
+MAX_RAY_SAMPLES = 1024  # capacity of a ray; a ray across all cascades takes 850 whole steps
+CPU_RAYS = 2048  # rays per launch on a CPU; a multiple of cpu.RAY_BLOCK
+GPU_RAYS = 2**15  # rays per launch on a GPU; the scratch memory takes 12 kB a ray
+
 Net = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Table and resolutions of an encoding; w1, b1, w2, b2 of the network of one hidden layer on it."""
+"""Table and resolutions of an encoding; w1, b1, w2, b2 of the network of one hidden layer on it.
+
+Weights are [inputs, outputs].
+"""
 Cells = tuple[Int[Tensor, "k w w w"] | UInt8[Tensor, "k g g g"], UInt8[Tensor, "k b b b"]]
-"""What `cells_of` gives: words of 4³ cells on a CPU, cells elsewhere; and blocks."""
+"""The result of `cells_of`: 64-bit words of 4³ cells on a CPU, cells on a GPU; and blocks."""
 
 
 def _cpu_net(net: Net) -> tuple:
-    """With the weights turned: a unit's lie side by side."""
+    """Return a network as the CPU kernels take it: weights [outputs, inputs], b2 a float."""
     table, resolutions, w1, b1, w2, b2 = net
-    return *map(dispatch.kernel_array, (table, resolutions, w1.T, b1, w2.T)), dispatch.kernel_array(
-        b2
-    )[0]
+    arrays = dispatch.kernel_arrays(table, resolutions, w1.T, b1, w2.T, b2)
+    return *arrays[:-1], arrays[-1][0]
 
 
 @torch.no_grad()
 def density(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n"]:
-    """See `reference.density`, which it is for one hidden layer."""
+    """Return the density (1/grid unit) at q: `reference.density` with one hidden layer."""
     kernels = dispatch.kernels("marching", q, *net)
     if kernels is None:
         table, resolutions, w1, b1, w2, b2 = net
         return reference.density(q, table, resolutions, [(w1, b1), (w2, b2)])
     out = q.new_empty(q.shape[0])
-    if kernels is cpu:
-        kernels.density_at(dispatch.kernel_array(q), _cpu_net(net), dispatch.kernel_array(out))
-    else:
-        kernels.density_at(
-            dispatch.kernel_array(q),
-            tuple(map(dispatch.kernel_array, net)),
-            dispatch.kernel_array(out),
-        )
+    arrays = _cpu_net(net) if kernels is cpu else dispatch.kernel_arrays(*net)
+    kernels.density_at(dispatch.kernel_array(q), arrays, dispatch.kernel_array(out))
     return out
 
 
 def density_slopes(q: Float[Tensor, "n 3"], net: Net) -> Float[Tensor, "n 3"]:
-    """See `reference.density_slopes`; q in grid units, no gradient."""
+    """Return the gradient of the logarithm of the density at q: `reference.density_slopes`."""
     kernels = dispatch.kernels("marching", q, *net)
     table, resolutions, w1, b1, w2, b2 = (each.detach() for each in net)
     if kernels is None:
         return reference.density_slopes(q, table, resolutions, [(w1, b1), (w2, b2)])
     out = torch.empty_like(q, memory_format=torch.contiguous_format)
     if kernels is cpu:
-        cpu.density_slopes(
-            dispatch.kernel_array(q),
-            _cpu_net(net),
-            dispatch.kernel_array(w1),
-            dispatch.kernel_array(out),
-        )
+        q_array, w1_array, out_array = dispatch.kernel_arrays(q, w1, out)
+        cpu.density_slopes(q_array, _cpu_net(net), w1_array, out_array)
     else:
-        kernels.density_slopes(
-            dispatch.kernel_array(q),
-            tuple(map(dispatch.kernel_array, net)),
-            dispatch.kernel_array(out),
-        )
+        q_array, out_array = dispatch.kernel_arrays(q, out)
+        kernels.density_slopes(q_array, dispatch.kernel_arrays(*net), out_array)
     return out
 
 
@@ -72,22 +65,22 @@ def positions(
     offsets: Int[Tensor, "n+1"],
     t: Float[Tensor, "s"],
 ) -> Float[Tensor, "s 3"]:
-    """Where packed samples lie in the unit cube (`reference.contract`); lengths in grid units."""
+    """Return the unit-cube coordinates (`reference.contract`) of packed samples on rays."""
     kernels = dispatch.kernels("marching", *rays, offsets, t)
     if kernels is None:
         o, d = (torch.repeat_interleave(each, offsets.diff(), dim=0) for each in rays)
         return reference.contract(o + t[:, None] * d)
     u = t.new_zeros(t.shape[0], 3)
-    kernels.grid_positions(*map(dispatch.kernel_array, (*rays, offsets, t, u)))
+    kernels.grid_positions(*dispatch.kernel_arrays(*rays, offsets, t, u))
     return u
 
 
 def cells_of(occupied: UInt8[Tensor, "k g g g"]) -> Cells:
-    """What `march` reads of an occupancy: its cells, and which blocks of 8³ cells hold one.
+    """Return an occupancy as `march` reads it: its cells, and which blocks of 8³ cells hold one.
 
-    On a CPU cells are bits, 4³ of them a number, so that they stay in the nearer caches. Where the
-    side does not allow for blocks (they would reach into the cube of the next finer cascade), they
-    are the cells themselves.
+    On a CPU the cells are bits, 4³ of them in a word, so that they stay in the inner caches. Where
+    the side is no multiple of 32, blocks would reach into the cube of the next finer cascade; then
+    a block is one cell.
     """
     cascades, side = occupied.shape[:2]
     whole = side % 32 == 0
@@ -98,9 +91,9 @@ def cells_of(occupied: UInt8[Tensor, "k g g g"]) -> Cells:
             torch.amax(split, dim=(2, 4, 6), out=blocks)
         return occupied, blocks
     words = occupied.new_empty(cascades, *3 * (-(-side // 4),), dtype=torch.int64)
-    cpu.pack_cells(dispatch.kernel_array(occupied), dispatch.kernel_array(words))
+    cpu.pack_cells(*dispatch.kernel_arrays(occupied, words))
     if whole:
-        cpu.occupied_blocks(dispatch.kernel_array(words), dispatch.kernel_array(blocks))
+        cpu.occupied_blocks(*dispatch.kernel_arrays(words, blocks))
     return words, blocks
 
 
@@ -112,61 +105,57 @@ def march(
     steps: tuple[float, float, float],
     stop: float,
     net: Net,
-    room: int | None = None,
+    capacity: int | None = None,
 ) -> tuple[Int[Tensor, "n+1"], Float[Tensor, "3 s"]]:
-    """See `reference.march`: all rays' samples, packed, and their offsets.
+    """Return the samples of rays in occupied space, packed: `reference.march` for each ray.
 
     Args:
-        rays: origins and unit directions, grid units.
-        spans: first and last length of each ray, share of the first step that it begins after.
-        cells: which are occupied, by `cells_of`.
-        steps: the smallest one, the step per length, the optical depth below which one is empty.
+        rays: origins and unit directions.
+        spans: first and last length of each ray, jitter: the fraction of the first step to skip.
+        cells: the occupied cells, by `cells_of`.
+        steps: smallest step, step per length, optical depth below which a sample counts as empty.
         stop: transmittance at which a ray ends.
-        net: of the density.
-        room: length of the samples' list; what is over is 0, the last at least, and samples that
-            find no room are left out. None: as many as there are, for which a GPU has to be asked.
+        net: encoding and network of the density.
+        capacity: length of the list of samples. It is padded with zeros, at least one; samples
+            beyond it are dropped. None: as long as needed, which synchronises with a GPU.
 
     Returns:
         Offsets; t, dt (grid units) and sigma (1/grid unit) of the samples.
+
+    Raises:
+        TypeError: the tensors are not float32 on one device, a CPU or an NVIDIA GPU.
     """
     kernels = dispatch.kernels("marching", *rays, *net)
     if kernels is None:
-        raise TypeError("rays and field must be of 32 bits and on one device, CPU or NVIDIA GPU")
-    at_once = CPU_RAYS if kernels is cpu else GPU_RAYS
-    occupied = tuple(map(dispatch.kernel_array, cells))
-    weights = _cpu_net(net) if kernels is cpu else tuple(map(dispatch.kernel_array, net))
-    # Used again and again: fresh memory would cost more than marching.
-    scratch = dispatch.kernel_array(_scratch(rays[0], at_once, kernels is cpu))
+        raise TypeError("rays and field must be float32 and on one device, a CPU or an NVIDIA GPU")
+    chunk = CPU_RAYS if kernels is cpu else GPU_RAYS
+    arrays = _cpu_net(net) if kernels is cpu else dispatch.kernel_arrays(*net)
+    occupied = dispatch.kernel_arrays(*cells)
+    # Shared by all chunks: fresh memory for each would cost more than marching.
+    scratch = dispatch.kernel_array(_scratch(rays[0], chunk, kernels is cpu))
     parts, ends = [], [spans.new_zeros(1, dtype=torch.long)]
-    out = None if room is None else spans.new_zeros(3, room)
-    for o, d, span in zip(*(x.split(at_once) for x in (*rays, spans)), strict=True):
+    out = None if capacity is None else spans.new_zeros(3, capacity)
+    for o, d, span in zip(*(x.split(chunk) for x in (*rays, spans)), strict=True):
         count = o.new_zeros(o.shape[0], dtype=torch.long)
-        given = dispatch.kernel_array(o), dispatch.kernel_array(d), dispatch.kernel_array(span)
-        kernels.march(*given, occupied, steps, stop, weights, scratch, dispatch.kernel_array(count))
-        begin = ends[-1][-1:]
-        own = count.cumsum(0)
+        o_array, d_array, span_array, count_array = dispatch.kernel_arrays(o, d, span, count)
+        kernels.march(
+            o_array, d_array, span_array, occupied, steps, stop, arrays, scratch, count_array
+        )
+        start, chunk_ends = ends[-1][-1:], count.cumsum(0)
         if out is None:
             part = o.new_empty(3, int(count.sum()))
-            kernels.pack(
-                scratch,
-                dispatch.kernel_array(torch.cat([ends[0], own])),
-                dispatch.kernel_array(part),
-            )
+            kernels.pack(scratch, *dispatch.kernel_arrays(torch.cat([ends[0], chunk_ends]), part))
             parts.append(part)
-            ends.append(begin + own)
+            ends.append(start + chunk_ends)
         else:
-            ends.append((begin + own).clamp_max(out.shape[1] - 1))
-            kernels.pack(
-                scratch,
-                dispatch.kernel_array(torch.cat([begin, ends[-1]])),
-                dispatch.kernel_array(out),
-            )
+            ends.append((start + chunk_ends).clamp_max(out.shape[1] - 1))
+            kernels.pack(scratch, *dispatch.kernel_arrays(torch.cat([start, ends[-1]]), out))
     return torch.cat(ends), torch.cat(parts, dim=1) if out is None else out
 
 
-def _scratch(rays_o: Tensor, at_once: int, by_block: bool) -> Tensor:
-    """Memory for the samples of some rays: in blocks of rays, or a column for each."""
-    n = min(at_once, max(rays_o.shape[0], 1))
+def _scratch(rays_o: Tensor, chunk: int, by_block: bool) -> Tensor:
+    """Return memory for the samples of a chunk of rays: by blocks of rays, or a column a ray."""
+    n = min(chunk, max(rays_o.shape[0], 1))
     if by_block:
-        return rays_o.new_empty(3, -(-n // cpu.RAY_BLOCK), cpu.RAY_BLOCK * CAPACITY)
-    return rays_o.new_empty(3, CAPACITY, n)
+        return rays_o.new_empty(3, -(-n // cpu.RAY_BLOCK), cpu.RAY_BLOCK * MAX_RAY_SAMPLES)
+    return rays_o.new_empty(3, MAX_RAY_SAMPLES, n)

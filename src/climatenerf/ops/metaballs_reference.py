@@ -1,4 +1,4 @@
-"""Metaball sums, slow and obvious: the specification and test oracle of `ops.metaballs`."""
+"""Metaball sums, slow and obvious: the specification and test oracle of `ops.cpu.metaballs`."""
 
 import math
 
@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def metaball_kernel(r: Float[Tensor, "*n"], radius: float) -> Float[Tensor, "*n"]:
-    """Metaball kernel with compact support (ClimateNeRF, after van der Laan's SPH kernel).
+    """Return the metaball kernel of compact support (ClimateNeRF, after van der Laan's SPH one).
 
     K(r, R) = 315 / (64 pi 1.5^7) (1.5^2 - (r/R)^2)^3 for r < 1.5 R and 0 beyond, so that value,
     first and second derivative vanish at the edge of the support.
@@ -32,22 +32,22 @@ def metaball_sums(
     spacing: float,
     radius: float,
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n c"]]:
-    """Normalised metaball sum of a lattice and the kernel-weighted mean of values on it.
+    """Return the normalised metaball sum of a lattice and the kernel-weighted mean of values on it.
 
     s(x) = sum_v f_v K(|x - x_v|) / sum_v K(|x - x_v|) over *all* vertices v; outside of its support
-    the kernel is 0. The quotient makes a filled half-space exactly 1 however the lattice lies.
+    the kernel is 0. The quotient is exactly 1 in a filled region, wherever the lattice lies.
     Mean: sum_v f_v K a_v / sum_v f_v K.
 
     Args:
         points: positions, m, at least 1.5 radius inside the lattice.
-        fractions: f_v, how much of a vertex's surroundings is filled, 0 to 1.
-        values: a_v, anything to be averaged.
+        fractions: f_v, filled fraction of each vertex's surroundings, 0 to 1.
+        values: a_v, the quantities to average.
         origin: position of vertex (0, 0, 0), m.
         spacing: lattice spacing, m.
         radius: R of the kernel, m.
 
     Returns:
-        s and the means (0 where nothing is filled within reach).
+        s and the means, which are 0 where no vertex within the support is filled.
     """
     axes = [origin[i] + spacing * torch.arange(n).to(points) for i, n in enumerate(fractions.shape)]
     vertices = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -57,6 +57,6 @@ def metaball_sums(
     kernel = 315 / (64 * math.pi * 1.5**7) * inside**3
     filled = kernel * fractions.reshape(-1)
     total = filled.sum(-1)
-    # Where no ball reaches, 0 / 0 would give NaN.
+    # Outside all supports 0 / 0 would give NaN.
     means = filled @ values.reshape(-1, values.shape[-1]) / total.clamp(min=1e-12)[:, None]
     return total / kernel.sum(-1), means

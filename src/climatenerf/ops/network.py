@@ -1,4 +1,4 @@
-"""Small fully connected networks, with gradients, and an encoding fused with one."""
+"""Small fully connected networks, with gradients, alone or fused with a hash encoding."""
 
 from collections.abc import Sequence
 
@@ -12,73 +12,59 @@ from climatenerf.ops.cpu import network as cpu
 
 
 class _Network(torch.autograd.Function):
-    """Keeps no hidden layer: the backward pass computes them again, block by block."""
+    """Store no hidden layer: the backward pass computes them again, block by block."""
 
     @staticmethod
     def forward(ctx, x, shared, row, *layers):
-        weights, widths = layers[::2], np.array([x.shape[1], *(b.shape[0] for b in layers[1::2])])
-        common = x.new_empty(0, widths[1]) if shared is None else shared
-        rows = x.new_empty(0, dtype=torch.long) if row is None else row
-        packed = _in_one_row([w.T for w in weights], layers[1::2])
+        weights, biases = layers[::2], layers[1::2]
+        widths = np.array([x.shape[1], *(b.shape[0] for b in biases)])
+        shared = x.new_empty(0, widths[1]) if shared is None else shared
+        row = x.new_empty(0, dtype=torch.long) if row is None else row
+        packed = _packed([w.T for w in weights], biases)
         out = x.new_empty(widths[-1], x.shape[0])
-        cpu.network_forward(
-            dispatch.kernel_array(x.T),
-            dispatch.kernel_array(common),
-            dispatch.kernel_array(rows),
-            packed,
-            widths,
-            dispatch.kernel_array(out),
-        )
-        ctx.save_for_backward(x, common, rows, *layers)
-        ctx.given = packed, widths
+        x_array, shared_array, row_array, out_array = dispatch.kernel_arrays(x.T, shared, row, out)
+        cpu.network_forward(x_array, shared_array, row_array, packed, widths, out_array)
+        ctx.save_for_backward(x, shared, row, *layers)
+        ctx.packed, ctx.widths = packed, widths
         return out.T
 
     @staticmethod
     def backward(ctx, grad):
-        x, common, rows, *layers = ctx.saved_tensors
-        packed, widths = ctx.given
-        turned = _in_one_row(layers[::2], layers[1::2])
-        borders = cpu.chunk_borders(dispatch.kernel_array(rows), x.shape[0])
-        sums = x.new_zeros(borders.shape[0] - 1, packed.shape[0])
+        x, shared, row, *layers = ctx.saved_tensors
+        packed, widths = ctx.packed, ctx.widths
+        transposed = _packed(layers[::2], layers[1::2])
+        inputs = dispatch.kernel_arrays(x.T, shared, row)
+        chunks = cpu.chunk_bounds(inputs[2], x.shape[0])
+        sums = x.new_zeros(chunks.shape[0] - 1, packed.shape[0])
         grad_x = x.new_empty(widths[0] if ctx.needs_input_grad[0] else 0, x.shape[0])
-        grad_shared = torch.zeros_like(common if ctx.needs_input_grad[1] else common[:0])
+        grad_shared = torch.zeros_like(shared if ctx.needs_input_grad[1] else shared[:0])
         cpu.network_backward(
-            (
-                dispatch.kernel_array(x.T),
-                dispatch.kernel_array(common),
-                dispatch.kernel_array(rows),
-            ),
+            inputs,
             packed,
-            turned,
+            transposed,
             widths,
             dispatch.kernel_array(grad.T),
-            borders,
-            (
-                dispatch.kernel_array(grad_x),
-                dispatch.kernel_array(grad_shared),
-                dispatch.kernel_array(sums),
-            ),
+            chunks,
+            dispatch.kernel_arrays(grad_x, grad_shared, sums),
         )
-        of_layers, start, total = [], 0, sums.sum(0)
-        for inputs, outputs in zip(widths[:-1].tolist(), widths[1:].tolist(), strict=True):
-            end = start + outputs * (inputs + 1)
-            own = total[start:end].view(outputs, inputs + 1)
-            of_layers += [own[:, :-1].T, own[:, -1]]
+        grad_layers, start, total = [], 0, sums.sum(0)
+        for n_in, n_out in zip(widths[:-1].tolist(), widths[1:].tolist(), strict=True):
+            end = start + n_out * (n_in + 1)
+            layer = total[start:end].view(n_out, n_in + 1)
+            grad_layers += [layer[:, :-1].T, layer[:, -1]]
             start = end
         return (
             grad_x.T if ctx.needs_input_grad[0] else None,
             grad_shared if ctx.needs_input_grad[1] else None,
             None,
-            *of_layers,
+            *grad_layers,
         )
 
 
-def _in_one_row(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> np.ndarray:
-    """Layers as `cpu_network` takes them."""
+def _packed(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> np.ndarray:
+    """Return all layers as one flat array, as `cpu.network` takes them."""
     pairs = zip(weights, biases, strict=True)
-    return np.concatenate(
-        [dispatch.kernel_array(each).reshape(-1) for pair in pairs for each in pair]
-    )
+    return np.concatenate([a.reshape(-1) for pair in pairs for a in dispatch.kernel_arrays(*pair)])
 
 
 def mlp(
@@ -87,31 +73,31 @@ def mlp(
     shared: Float[Tensor, "m h"] | None = None,
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
-    """See `reference.mlp`, which it is but for networks of 32 bits with hidden layers on a CPU."""
-    given = [x, *(each for pair in layers for each in pair), *([] if shared is None else [shared])]
-    if (
-        dispatch.kernels("network", *given) is cpu and len(layers) > 1
-    ):  # a GPU's own matrix products are fast
+    """Return the network's outputs: `reference.mlp`.
+
+    The CPU kernel is for networks with hidden layers. A GPU uses PyTorch's matrix products.
+    """
+    inputs = [x, *(each for pair in layers for each in pair), *([] if shared is None else [shared])]
+    if len(layers) > 1 and dispatch.backend(*inputs) == "cpu":
         return _Network.apply(x, shared, row, *(each for pair in layers for each in pair))
     return reference.mlp(x, layers, shared, row)
 
 
 class _EncodedNetwork(torch.autograd.Function):
-    """An encoding and the network on it in one launch. Keeps nothing but where the samples are."""
+    """An encoding and the network on it in one launch; stores only the positions."""
 
     @staticmethod
     def forward(ctx, u, table, resolutions, shared, row, w1, b1, w2, b2):
         from climatenerf.ops.triton import network as triton
 
-        rays = (
-            None if shared is None else (dispatch.kernel_array(shared), dispatch.kernel_array(row))
-        )
-        encoding, layers = (
-            (dispatch.kernel_array(table), dispatch.kernel_array(resolutions)),
-            tuple(map(dispatch.kernel_array, (w1, b1, w2, b2))),
-        )
         out = torch.empty(u.shape[0], w2.shape[1], device=u.device)
-        triton.network_forward(dispatch.kernel_array(u), encoding, layers, rays, out)
+        triton.network_forward(
+            dispatch.kernel_array(u),
+            dispatch.kernel_arrays(table, resolutions),
+            dispatch.kernel_arrays(w1, b1, w2, b2),
+            None if shared is None else dispatch.kernel_arrays(shared, row),
+            out,
+        )
         ctx.save_for_backward(u, resolutions, shared, row, w1, b1, w2, b2)
         ctx.table = table
         return out
@@ -121,21 +107,34 @@ class _EncodedNetwork(torch.autograd.Function):
         from climatenerf.ops.triton import network as triton
 
         u, resolutions, shared, row, *layers = ctx.saved_tensors
-        u, layers = dispatch.kernel_array(u), tuple(map(dispatch.kernel_array, layers))
-        rays = (
-            None if shared is None else (dispatch.kernel_array(shared), dispatch.kernel_array(row))
-        )
-        encoding = dispatch.kernel_array(ctx.table), dispatch.kernel_array(resolutions)
-        # As `_HashEncode.backward`: the optimiser clears what it has used.
+        u = dispatch.kernel_array(u)
+        rays = None if shared is None else dispatch.kernel_arrays(shared, row)
+        tables = dispatch.kernel_arrays(ctx.table, resolutions)
+        # As in `encoding`: the optimiser clears the entries of the buffer that it has used.
         buffer = getattr(ctx.table, "grad_buffer", None)
-        learns = ctx.needs_input_grad[1]
-        of_table = (torch.zeros_like(encoding[0]) if buffer is None else buffer) if learns else None
-        of_shared = torch.zeros_like(rays[0]) if rays and ctx.needs_input_grad[3] else None
-        of_u = torch.empty_like(u) if ctx.needs_input_grad[0] else None
-        of_layers = triton.network_backward(
-            u, encoding, layers, rays, dispatch.kernel_array(grad), (of_table, of_shared, of_u)
+        grad_table = grad_shared = grad_u = None
+        if ctx.needs_input_grad[1]:
+            grad_table = torch.zeros_like(tables[0]) if buffer is None else buffer
+        if rays and ctx.needs_input_grad[3]:
+            grad_shared = torch.zeros_like(rays[0])
+        if ctx.needs_input_grad[0]:
+            grad_u = torch.empty_like(u)
+        grad_layers = triton.network_backward(
+            u,
+            tables,
+            dispatch.kernel_arrays(*layers),
+            rays,
+            dispatch.kernel_array(grad),
+            (grad_table, grad_shared, grad_u),
         )
-        return of_u, (of_table if buffer is None else None), None, of_shared, None, *of_layers
+        return (
+            grad_u,
+            grad_table if buffer is None else None,
+            None,
+            grad_shared,
+            None,
+            *grad_layers,
+        )
 
 
 def encoded_mlp(
@@ -146,12 +145,9 @@ def encoded_mlp(
     shared: Float[Tensor, "m h"] | None = None,
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
-    """`mlp` of `hash_encode`: on a GPU in one launch, where there is one hidden layer."""
-    given = [u, table, *(each for pair in layers for each in pair)]
-    if (
-        dispatch.kernels("network", *given, *([] if shared is None else [shared]))
-        not in (None, cpu)
-        and len(layers) == 2
-    ):
+    """Return `mlp` of `hash_encode`; on a GPU, with one hidden layer, in one launch."""
+    inputs = [u, table, *(each for pair in layers for each in pair)]
+    inputs += [] if shared is None else [shared]
+    if len(layers) == 2 and dispatch.backend(*inputs) == "triton":
         return _EncodedNetwork.apply(u, table, resolutions, shared, row, *layers[0], *layers[1])
     return mlp(encoding.hash_encode(u, table, resolutions), layers, shared, row)

@@ -17,16 +17,17 @@ def adam(
     epsilon: float,
     step: int,
 ) -> None:
-    """One step of Adam (Kingma & Ba 2015) in place, for tables whose gradients are mostly zero.
+    """Take one step of Adam (Kingma & Ba 2015) in place, and clear the gradient.
 
-    Entries without gradient are left alone with their moments; the gradient is cleared.
+    Entries whose gradient is zero keep their value and moments.
+
+    Raises:
+        TypeError: the tensors are not float32 on one device, a CPU or an NVIDIA GPU.
     """
     kernels = dispatch.kernels("optimiser", parameter, gradient, *moments)
     if kernels is None:
-        raise TypeError("a table and its moments must be of 32 bits and on one device")
+        raise TypeError("a table and its moments must be float32 and on one device")
     corrections = (1.0 - beta**step for beta in betas)
     scalars = map(np.float32, (rate, *betas, epsilon, *corrections))
-    kernels.adam(
-        *(dispatch.kernel_array(each.view(-1)) for each in (parameter, gradient, *moments)),
-        *scalars,
-    )
+    flat = (each.view(-1) for each in (parameter, gradient, *moments))
+    kernels.adam(*dispatch.kernel_arrays(*flat), *scalars)

@@ -1,4 +1,4 @@
-"""Label votes for positions by views of known pose. No gradients."""
+"""Votes of label masks on positions in space. No gradients."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -7,29 +7,26 @@ from torch import Tensor
 from climatenerf.ops import dispatch, reference
 
 Views = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
-"""Maps of some views in one row (8 bits), where each starts, sizes (rows, columns), fx fy cx cy,
-c2w."""
+"""Views with their masks: depths inside the masks (uint8, all views in one flat list), start of
+each view in it, sizes (rows, columns), pinholes (fx, fy, cx, cy), c2w."""
 
 
 def label_votes(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
     views: Views,
-    least: tuple[int, float, float],
+    thresholds: tuple[int, float, float],
 ) -> Bool[Tensor, "n"]:
-    """See `reference.label_votes`."""
+    """Return on which balls the views' masks agree: `reference.label_votes`."""
     kernels = dispatch.kernels("visual_hull", x, radius, *views)
     if kernels is None:
-        reach, starts, sizes, pinholes, c2w = views
+        depth, starts, sizes, pinholes, c2w = views
         corners = zip(starts.tolist(), sizes.tolist(), strict=True)
-        maps = [reach[start : start + h * w].view(h, w) for start, (h, w) in corners]
-        return reference.label_votes(x, radius, maps, pinholes, c2w, least)
-    agreed = torch.empty_like(radius, dtype=torch.uint8)
-    given = (
-        dispatch.kernel_array(x),
-        dispatch.kernel_array(radius),
-        tuple(map(dispatch.kernel_array, views)),
-        least,
+        masks = [depth[start : start + h * w].view(h, w) for start, (h, w) in corners]
+        return reference.label_votes(x, radius, masks, pinholes, c2w, thresholds)
+    consensus = torch.empty_like(radius, dtype=torch.uint8)
+    x_array, radius_array, consensus_array = dispatch.kernel_arrays(x, radius, consensus)
+    kernels.label_votes(
+        x_array, radius_array, dispatch.kernel_arrays(*views), thresholds, consensus_array
     )
-    kernels.label_votes(*given, dispatch.kernel_array(agreed))
-    return agreed.bool()
+    return consensus.bool()

@@ -310,7 +310,7 @@ class Trainer:
             self.step_scale,
             uniform(self.generator, n),
             stop=STOP,
-            capacity=self.buffers.capacity(name, min(n * marching.CAPACITY, limit)),
+            capacity=self.buffers.capacity(name, min(n * marching.MAX_RAY_SAMPLES, limit)),
         )
         self.buffers.record(name, samples.offsets[-1])
         return samples

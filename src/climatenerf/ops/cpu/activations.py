@@ -1,33 +1,35 @@
-"""What is worked out for each value or direction by itself: radiance, density, harmonics.
+"""CPU kernels in Numba for single values and directions: radiance, density, harmonics.
 
-Their twins, and when they are asked, are in `field/activations.py` and
-`field/spherical_harmonics.py`; these
-take a pass through memory for every
-operation. Numba calls the system's `exp` and `pow` value by value; the short series here are plain
-arithmetic, of which LLVM makes vectors. Arrays are float32, C-contiguous.
+The twins, and the choice between both, are in `field/activations.py` and
+`field/spherical_harmonics.py`; they take a pass through memory for each operation. Numba calls the
+system's `exp` and `pow` value by value. The short series here are plain arithmetic, which LLVM
+vectorises. Arrays are float32 and C-contiguous.
 """
 
 import numpy as np
 from numba import njit, prange
 
+from climatenerf.core.srgb import DISPLAY_TOE, EXPONENT, OFFSET, SCALE, TOE_SLOPE
+
 SHARPNESS = 8.0  # of the softplus
-MIN_SLOPE = 0.1  # upwards
-BLACK = -0.5  # below it the display value is under .003, and nothing darkens further
-LARGEST_RAW = 15.0  # logarithm of a density: beyond it a float32 would be infinite soon
-# NaN keeps its meaning: what has diverged is to be seen.
+MIN_SLOPE = 0.1  # of the softplus, for gradients that brighten
+BLACK = -0.5  # input below which nothing darkens further: the display value is under 0.003
+MAX_RAW = 15.0  # upper bound of the logarithm of a density: exp(15) is opaque at any step
+# Without nnan: a fit that has diverged must show as NaN.
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
-BLOCK = 2048  # values that one thread takes at once
+BLOCK = 2048  # values per task of a thread
 LN2 = 0.6931471805599453
-# exp2 over [-1/2, 1/2]: the exponential's series, 2e-7 off.
+# exp2 over [-1/2, 1/2] by the series of exp; relative error 2e-7.
 E1, E2, E3, E4, E5, E6 = (LN2**k / np.prod(np.arange(1.0, k + 1)) for k in range(1, 7))
-L1, L3, L5, L7 = (2.0 / (k * LN2) for k in (1, 3, 5, 7))  # log2 by atanh's series
+L1, L3, L5, L7 = (2.0 / (k * LN2) for k in (1, 3, 5, 7))  # log2 by the series of atanh
 P1, P3, P5, P7, P9, P11, P13 = (2.0 / (k * SHARPNESS) for k in range(1, 14, 2))  # softplus
-TOE, TOE_SLOPE, ABOVE_SLOPE = 0.04045, 1.0 / 12.92, 2.4 / 1.055  # see `field.colour_space`
+# Slopes of `core.srgb`'s decoding curve: in its toe, and continued above 1.
+SLOPE_IN_TOE, SLOPE_ABOVE = 1.0 / TOE_SLOPE, EXPONENT / SCALE
 
 
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _exp2(y):
-    """2 to the power of a float32, which is held within what one can be."""
+    """Return 2 to the power y, clamped to the range of normal float32 numbers."""
     y = min(max(y, np.float32(-126.0)), np.float32(126.0))
     whole = np.int32(np.floor(y + np.float32(0.5)))
     f = y - np.float32(whole)
@@ -39,9 +41,9 @@ def _exp2(y):
 
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _log2(x):
-    """Logarithm of a positive, normal float32."""
+    """Return the base-2 logarithm of a positive, normal float32."""
     bits = np.float32(x).view(np.int32)
-    # Mantissas from the root of a half to that of 2: log2 of 1 is 0, and small near it.
+    # Mantissas from sqrt(1/2) to sqrt(2): log2 is exactly 0 at 1, and accurate near it.
     whole = np.int32((bits - np.int32(0x3F3504F3)) >> np.int32(23))
     m = np.int32(bits - np.int32(whole << np.int32(23))).view(np.float32)
     s = (m - np.float32(1.0)) / (m + np.float32(1.0))
@@ -53,9 +55,9 @@ def _log2(x):
 
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _display(x):
-    """The softplus of x, and e^-|x·SHARPNESS|, of which its slope is made."""
+    """Return the softplus of x, and e^-|x·SHARPNESS|, which gives its slope."""
     e = _exp2(-abs(x) * np.float32(SHARPNESS / LN2))
-    # log(1 + e), without the sum in which a small e would lose its digits.
+    # log(1 + e) without the sum 1 + e, in which a small e would lose its digits.
     s = e / (np.float32(2.0) + e)
     square = s * s
     series = np.float32(P9) + square * (np.float32(P11) + square * np.float32(P13))
@@ -66,47 +68,48 @@ def _display(x):
 
 @njit(cache=True, fastmath=_FAST, parallel=True)
 def radiance_forward(raw, out):
-    """Linear radiance of network outputs raw [n]."""
+    """Write the linear radiance of network outputs raw [n]."""
     n = raw.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
             x, _ = _display(raw[i] + np.float32(0.5))
-            base = (max(x, np.float32(TOE)) + np.float32(0.055)) * np.float32(1.0 / 1.055)
-            value = _exp2(np.float32(2.4) * _log2(base))
+            base = (max(x, np.float32(DISPLAY_TOE)) + np.float32(OFFSET)) * np.float32(1.0 / SCALE)
+            value = _exp2(np.float32(EXPONENT) * _log2(base))
             if x > np.float32(1.0):
-                value = np.float32(1.0) + (x - np.float32(1.0)) * np.float32(ABOVE_SLOPE)
-            if x <= np.float32(TOE):
-                value = x * np.float32(TOE_SLOPE)
+                value = np.float32(1.0) + (x - np.float32(1.0)) * np.float32(SLOPE_ABOVE)
+            if x <= np.float32(DISPLAY_TOE):
+                value = x * np.float32(SLOPE_IN_TOE)
             out[i] = value if raw[i] == raw[i] else raw[i]
 
 
 @njit(cache=True, fastmath=_FAST, parallel=True)
 def radiance_backward(raw, value, grad_out, grad):
-    """Gradient to raw [n]; `value` is what `radiance_forward` gave."""
+    """Write the gradient to raw [n]; value [n] is the output of `radiance_forward`."""
     n = raw.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
             x, e = _display(raw[i] + np.float32(0.5))
-            decoding = np.float32(2.4) * value[i] / (max(x, np.float32(TOE)) + np.float32(0.055))
+            shifted = max(x, np.float32(DISPLAY_TOE)) + np.float32(OFFSET)
+            decoding = np.float32(EXPONENT) * value[i] / shifted
             if x > np.float32(1.0):
-                decoding = np.float32(ABOVE_SLOPE)
-            if x <= np.float32(TOE):
-                decoding = np.float32(TOE_SLOPE)
-            own = grad_out[i] * decoding
-            slope = np.float32(1.0) / (np.float32(1.0) + e)  # the sigmoid; from below e times it
+                decoding = np.float32(SLOPE_ABOVE)
+            if x <= np.float32(DISPLAY_TOE):
+                decoding = np.float32(SLOPE_IN_TOE)
+            product = grad_out[i] * decoding
+            slope = np.float32(1.0) / (np.float32(1.0) + e)  # the sigmoid; below 0 e times it
             at = raw[i] + np.float32(0.5)
             if at < np.float32(0.0):
                 slope *= e
-            if own < np.float32(0.0):
+            if product < np.float32(0.0):
                 slope = max(slope, np.float32(MIN_SLOPE))
             elif at <= np.float32(BLACK):
                 slope = np.float32(0.0)
-            grad[i] = own * slope
+            grad[i] = product * slope
 
 
 @njit(cache=True, fastmath=_FAST, parallel=True)
 def density_forward(raw, u, out):
-    """Density (1/grid unit) of network outputs raw [n] at u [n,3]."""
+    """Write the density (1/grid unit) of network outputs raw [n] at unit-cube u [n,3]."""
     n = raw.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
@@ -116,23 +119,23 @@ def density_forward(raw, u, out):
                 square += side * side
             shell = np.float32(2.0) - np.sqrt(square)
             shell = min(max(shell, np.float32(1e-4)), np.float32(1.0))
-            y = min(raw[i], np.float32(LARGEST_RAW)) * np.float32(1.0 / LN2)
+            y = min(raw[i], np.float32(MAX_RAW)) * np.float32(1.0 / LN2)
             out[i] = _exp2(y) * shell * shell
 
 
 @njit(cache=True, fastmath=_FAST, parallel=True)
 def density_backward(raw, sigma, grad_out, grad):
-    """Gradient to raw [n]; `sigma` is what `density_forward` gave."""
+    """Write the gradient to raw [n]; sigma [n] is the output of `density_forward`."""
     n = raw.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):
-            own = grad_out[i] * sigma[i]
-            grad[i] = own if raw[i] <= np.float32(LARGEST_RAW) else np.float32(0.0)
+            product = grad_out[i] * sigma[i]
+            grad[i] = product if raw[i] <= np.float32(MAX_RAW) else np.float32(0.0)
 
 
 @njit(cache=True, fastmath=_FAST, parallel=True)
 def harmonics(d, out):
-    """The 16 spherical harmonics of unit directions d [n,3] in rows, out [16,n]."""
+    """Write the 16 spherical harmonics of unit directions d [n,3] → out [16,n]."""
     n = d.shape[0]
     for block in prange((n + BLOCK - 1) // BLOCK):
         for i in range(block * BLOCK, min(n, block * BLOCK + BLOCK)):

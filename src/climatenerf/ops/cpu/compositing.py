@@ -10,35 +10,38 @@ from numba import njit, prange
 
 @njit(cache=True, parallel=True)
 def weights_forward(tau, offsets, weights, transmittance):
-    """Rendering weights of packed samples with optical depths tau; transmittance left per ray."""
+    """Write rendering weights of samples with optical depths tau, and transmittance of rays."""
     for r in prange(offsets.shape[0] - 1):
-        left = 1.0
+        light = 1.0
         for i in range(offsets[r], offsets[r + 1]):
-            passed = np.exp(-np.float64(tau[i]))  # in double 1 - passed keeps its digits
-            weights[i] = left * (1.0 - passed)
-            left *= passed
-        transmittance[r] = left
+            passed = np.exp(-np.float64(tau[i]))  # float64: 1 - passed keeps its digits
+            weights[i] = light * (1.0 - passed)
+            light *= passed
+        transmittance[r] = light
 
 
 @njit(cache=True, parallel=True)
 def weights_backward(tau, offsets, grad_w, grad_t, grad_tau):
-    """Gradient of `weights_forward`: dw_i/dtau_i = T_{i+1}, dw_j/dtau_i = -w_j for j > i."""
+    """Write the gradient of `weights_forward`.
+
+    dw_i/dtau_i = T_{i+1}, dw_j/dtau_i = -w_j for j > i, dT/dtau_i = -T.
+    """
     for r in prange(offsets.shape[0] - 1):
-        left = 1.0
+        light = 1.0
         for i in range(offsets[r], offsets[r + 1]):
-            grad_tau[i] = left  # for the way back
-            left *= np.exp(-np.float64(tau[i]))
-        behind = grad_t[r] * left
+            grad_tau[i] = light  # read again by the loop below
+            light *= np.exp(-np.float64(tau[i]))
+        behind = grad_t[r] * light
         for i in range(offsets[r + 1] - 1, offsets[r] - 1, -1):
             before = np.float64(grad_tau[i])
-            grad_tau[i] = grad_w[i] * left - behind
+            grad_tau[i] = grad_w[i] * light - behind
             behind += grad_w[i] * before * (1.0 - np.exp(-np.float64(tau[i])))
-            left = before
+            light = before
 
 
 @njit(cache=True, parallel=True)
 def accumulate_forward(weights, values, offsets, out):
-    """Sum over each ray of weights [s] · values [c,s] → out [rays,c]."""
+    """Write the sum over each ray of weights [s] · values [c,s] → out [rays,c]."""
     for r in prange(offsets.shape[0] - 1):
         for c in range(values.shape[0]):
             total = 0.0
@@ -49,7 +52,7 @@ def accumulate_forward(weights, values, offsets, out):
 
 @njit(cache=True, parallel=True)
 def accumulate_backward(weights, values, offsets, grad_out, grad_w, grad_v):
-    """Gradient of `accumulate_forward`."""
+    """Write the gradient of `accumulate_forward`."""
     for r in prange(offsets.shape[0] - 1):
         for i in range(offsets[r], offsets[r + 1]):
             total = 0.0
@@ -61,17 +64,17 @@ def accumulate_backward(weights, values, offsets, grad_out, grad_w, grad_v):
 
 @njit(cache=True, fastmath=True, inline="always")
 def _unit(x, y, z):
-    """Direction of a vector, its length, and the least length taken where it has none."""
-    least = np.float32(1e-6)
-    length = max(np.sqrt(x * x + y * y + z * z), least)
-    return x / length, y / length, z / length, length, least
+    """Return the unit vector, the length, and the minimum that the length is clamped to."""
+    min_length = np.float32(1e-6)
+    length = max(np.sqrt(x * x + y * y + z * z), min_length)
+    return x / length, y / length, z / length, length, min_length
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def surface_forward(weights, raw, target, offsets, logits, apart):
-    """Sums over rays of weights [s] · the surface head's output; see `reference.surface`.
+def surface_forward(weights, raw, target, offsets, logits, error):
+    """Write weighted sums of the surface head's output along rays; see `reference.surface`.
 
-    raw [3 + c, s]; target [s, 3], or [0, 3] → logits [rays, c], apart [rays].
+    weights [s]; raw [3 + c, s]; target [s, 3], or [0, 3] → logits [rays, c], error [rays].
     """
     for r in prange(offsets.shape[0] - 1):
         first, last = offsets[r], offsets[r + 1]
@@ -86,12 +89,12 @@ def surface_forward(weights, raw, target, offsets, logits, apart):
                 nx, ny, nz, _, _ = _unit(raw[0, i], raw[1, i], raw[2, i])
                 nx, ny, nz = nx - target[i, 0], ny - target[i, 1], nz - target[i, 2]
                 total += weights[i] * (nx * nx + ny * ny + nz * nz)
-        apart[r] = total
+        error[r] = total
 
 
 @njit(cache=True, fastmath=True, parallel=True)
-def surface_backward(weights, raw, target, offsets, grad_logits, grad_apart, grad_raw):
-    """Gradient of `surface_forward` to raw."""
+def surface_backward(weights, raw, target, offsets, grad_logits, grad_error, grad_raw):
+    """Write the gradient of `surface_forward` to raw."""
     for r in prange(offsets.shape[0] - 1):
         for i in range(offsets[r], offsets[r + 1]):
             for c in range(grad_logits.shape[1]):
@@ -99,19 +102,19 @@ def surface_backward(weights, raw, target, offsets, grad_logits, grad_apart, gra
             if not target.shape[0]:
                 grad_raw[:3, i] = 0.0
                 continue
-            nx, ny, nz, length, least = _unit(raw[0, i], raw[1, i], raw[2, i])
+            nx, ny, nz, length, min_length = _unit(raw[0, i], raw[1, i], raw[2, i])
             ex, ey, ez = nx - target[i, 0], ny - target[i, 1], nz - target[i, 2]
-            # A direction moves across itself alone.
-            along = nx * ex + ny * ey + nz * ez if length > least else np.float32(0.0)
-            pull = np.float32(2.0) * grad_apart[r] * weights[i] / length
-            grad_raw[0, i] = pull * (ex - along * nx)
-            grad_raw[1, i] = pull * (ey - along * ny)
-            grad_raw[2, i] = pull * (ez - along * nz)
+            # The gradient of a direction is perpendicular to it.
+            along = nx * ex + ny * ey + nz * ez if length > min_length else np.float32(0.0)
+            scale = np.float32(2.0) * grad_error[r] * weights[i] / length
+            grad_raw[0, i] = scale * (ex - along * nx)
+            grad_raw[1, i] = scale * (ey - along * ny)
+            grad_raw[2, i] = scale * (ez - along * nz)
 
 
 @njit(cache=True, parallel=True)
 def distortion_forward(weights, s, ds, offsets, out):
-    """Distortion loss per ray, in linear time (DVGOv2); see `reference.distortion`."""
+    """Write the distortion of each ray in linear time (DVGOv2); see `reference.distortion`."""
     for r in prange(offsets.shape[0] - 1):
         total, w_sum, ws_sum = 0.0, 0.0, 0.0
         for i in range(offsets[r], offsets[r + 1]):
@@ -124,7 +127,7 @@ def distortion_forward(weights, s, ds, offsets, out):
 
 @njit(cache=True, parallel=True)
 def distortion_backward(weights, s, ds, offsets, grad_out, grad_w):
-    """Gradient of `distortion_forward` to the weights."""
+    """Write the gradient of `distortion_forward` to the weights."""
     for r in prange(offsets.shape[0] - 1):
         w_all, ws_all = 0.0, 0.0
         for i in range(offsets[r], offsets[r + 1]):
@@ -142,7 +145,7 @@ def distortion_backward(weights, s, ds, offsets, grad_out, grad_w):
 
 @njit(cache=True, parallel=True)
 def merge_order(t_a, offsets_a, t_b, offsets_b, offsets, order):
-    """Order that merges two packed sample lists by t; indices ≥ len(t_a) mean list b."""
+    """Write the order that merges two packed lists by t; indices ≥ len(t_a) are list b's."""
     shift = t_a.shape[0]
     for r in prange(offsets.shape[0] - 1):
         i, j = offsets_a[r], offsets_b[r]

@@ -1,11 +1,11 @@
-"""Metaball sums over a sparse lattice, and rays marched through them: Numba, CPU.
+"""Metaball sums over a sparse lattice, and rays marched through them. CPU, in Numba.
 
-The slow twin is `ops.metaballs_reference`. Inside, lengths are in lattice spacings.
+The slow twin is `ops.metaballs_reference`. Kernels compute lengths in lattice spacings.
 
 A lattice consists of cascades: squares in x and y around one centre, each with twice the spacing
-and twice the side of the one before, all of them over the full height. A position belongs to the
-finest cascade that contains it. Vertices are stored in bricks: a brick holds the vertices -1 to 9
-along each axis relative to its corner, all that the balls reaching into its 8 x 8 x 8 cells need.
+and twice the side of the one before, all over the full height. A position belongs to the finest
+cascade that contains it. Vertices are stored in bricks of 8 x 8 x 8 cells: a brick holds the
+vertices -1 to 9 along each axis relative to its corner, because balls of those reach its cells.
 """
 
 import math
@@ -15,68 +15,68 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from numba import njit, prange
 
-from climatenerf.ops.cpu.simd_metaballs import BALL_REACH, ball_means, ball_sums
+from climatenerf.ops.cpu.simd_metaballs import BALL_SUPPORT, ball_means, ball_sums
 
-LANES_DIGEST = "60fe272ebcab"  # of `simd.py` and `simd_metaballs.py`; the former explains why
+SIMD_DIGEST = "ee9d1f67a672"  # of `simd.py` and `simd_metaballs.py`; the former explains why
 BRICK = 8
 """Cells along a brick's side."""
 STORED = BRICK + 3
 """Vertices along a brick's side that are stored."""
-REACH = BALL_REACH
-"""Support 1.5 R of the kernel in lattice spacings."""
-RADIUS = REACH / 1.5
-"""R of the kernel in lattice spacings (measured in docs/adr/0016)."""
+SUPPORT = BALL_SUPPORT
+"""Radius 1.5 R of the kernel's support, lattice spacings."""
+RADIUS = SUPPORT / 1.5
+"""R of the kernel, lattice spacings (measured in docs/adr/0016)."""
 THRESHOLD = 0.497
-"""tau: the surface of a half-space lies where half of the sum is reached; the 0.003 make up for
-rays that see a little (0.006 spacings, the same for every lattice) into the snow."""
+"""tau, the sum at the surface. That of a half-space is 0.5; the 0.003 compensate for rays that end
+0.006 spacings, at every spacing, below the surface."""
 SHARPNESS = 100.0
-"""a of the logistic that turns the sum into density."""
+"""a, the steepness of the logistic from sum to density."""
 HEIGHT_UNIT = 1 / 128
 """Unit of `Lattice.height`, in lattice spacings."""
 MAX_SAMPLES = 24
-"""Samples on one ray at most."""
+"""Capacity of a ray."""
 
 LOW = 0.42
-"""Below this sum the density is less than a thousandth of that inside."""
-_SLOPE_BOUND = 0.75  # no sum rises faster than this per spacing (tests measure it)
-_GROUP = 0.5  # optical depth that is gathered into one sample
+"""Sum below which the density is less than a thousandth of that inside."""
+_SLOPE_BOUND = 0.75  # upper bound of a sum's slope per spacing (measured by a test)
+_SAMPLE_DEPTH = 0.5  # optical depth that is merged into one sample
 _OPAQUE = 7.0  # optical depth at which a ray ends: exp(-7) < 1e-3
-# NaN and infinity keep their meaning: t_max may be infinite.
+# Without nnan and ninf: t_max may be infinite.
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
 class Lattice(NamedTuple):
-    """Cascades of bricks (a named tuple because Numba takes it as it is)."""
+    """Cascades of bricks, in a named tuple because Numba accepts that as an argument."""
 
     lower: Float[np.ndarray, "k 3"]
-    """Corner of each cascade, m; vertex (0, 0, 0) lies there. One brick around is margin."""
+    """Position of vertex (0, 0, 0) of each cascade, m. The outermost bricks are a margin."""
     spacing: Float[np.ndarray, "k"]
-    """m; doubles from one to the next."""
+    """Lattice spacing, m; doubles from one cascade to the next."""
     bricks: Int[np.ndarray, "k 3"]
     """Number of bricks along x, y, z."""
     start: Int[np.ndarray, "k"]
-    """Where a cascade's part of `index` begins."""
+    """Offset of each cascade in `index`."""
     index: Int[np.ndarray, "i"]
-    """Brick at (x, y, z), row by row, z fastest; -1: empty."""
+    """Brick at (x, y, z), z fastest; -1: empty."""
     fill: np.ndarray
     """[b, 11, 11, 11] uint8: filled fraction f of a vertex's surroundings, in 1/255."""
     height: np.ndarray
-    """int16: height of the vertex over the ground under it, in HEIGHT_UNIT spacings."""
+    """int16: height of the vertex above the ground below it, in HEIGHT_UNIT spacings."""
     shade: np.ndarray
     """uint8: brightness under the scene's light, in 1/255."""
     band: np.ndarray
-    """[b, 2] uint8: layers of cells, from and to, outside of which a brick's sums are low."""
+    """[b, 2] uint8: first and last layer of cells; outside them all sums of the brick are low."""
     near: np.ndarray
-    """[b, 8, 8] uint8: bit m says whether sums in the cell (x, y, m) may be more than low."""
+    """[b, 8, 8] uint8: bit m is set if sums in the cell (x, y, m) may exceed `LOW`."""
     burial: Float[np.ndarray, "k"]
-    """Depth under the ground below which there is no matter, m."""
+    """Depth below the ground at which the snow ends, m."""
 
 
-def where_matter_is(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """`Lattice.band` and `Lattice.near` from `Lattice.fill`.
+def occupied_cells(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `Lattice.band` and `Lattice.near` of `Lattice.fill`.
 
-    A cell's sum is a mean over the vertices one below to two above it along each axis: where they
-    all are low, so is the sum.
+    The sum in a cell is a mean over the vertices from one below to two above it along each axis:
+    where all of them are low, so is the sum.
     """
     cells = fill >= LOW * 255
     for axis in (1, 2, 3):
@@ -90,12 +90,12 @@ def where_matter_is(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _find(lattice, x, y, z):
-    """Finest cascade around a position and the brick there (-1: none)."""
+    """Return the finest cascade that contains a position, and its brick there (-1: none)."""
     for k in range(lattice.spacing.shape[0]):
         h = lattice.spacing[k]
         i = math.floor((x - lattice.lower[k, 0]) / (h * BRICK))
         j = math.floor((y - lattice.lower[k, 1]) / (h * BRICK))
-        # The outermost bricks only lend vertices to those inside.
+        # The outermost bricks only provide vertices for those inside.
         if i < 1 or j < 1 or i >= lattice.bricks[k, 0] - 1 or j >= lattice.bricks[k, 1] - 1:
             continue
         m = math.floor((z - lattice.lower[k, 2]) / (h * BRICK))
@@ -108,7 +108,7 @@ def _find(lattice, x, y, z):
 
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _sum(lattice, brick, px, py, pz):
-    """Normalised sum and its gradient per spacing; p relative to the brick's corner, spacings."""
+    """Return the normalised sum and its gradient per spacing; p from the brick's corner."""
     i, j, m = int(px), int(py), int(pz)
     i, j, m = min(max(i, 0), BRICK - 1), min(max(j, 0), BRICK - 1), min(max(m, 0), BRICK - 1)
     ux, uy, uz = np.float32(px - i), np.float32(py - j), np.float32(pz - m)
@@ -125,9 +125,9 @@ def _sum(lattice, brick, px, py, pz):
 
 @njit(cache=True, fastmath=_FAST)
 def _means(lattice, brick, px, py, pz):
-    """Kernel-weighted mean height over the ground (spacings, of the vertices) and brightness.
+    """Return height above the ground (spacings) and brightness, as kernel-weighted means.
 
-    The height is that of the position itself: the mean ground is subtracted from it.
+    The height is that of the position: the mean ground height is subtracted from it.
     """
     i, j, m = int(px), int(py), int(pz)
     i, j, m = min(max(i, 0), BRICK - 1), min(max(j, 0), BRICK - 1), min(max(m, 0), BRICK - 1)
@@ -136,17 +136,17 @@ def _means(lattice, brick, px, py, pz):
         lattice.fill, lattice.height, lattice.shade, brick, i, j, m, ux, uy, uz
     )
     height = over * np.float32(HEIGHT_UNIT) + dz
-    if total <= np.float32(0):  # nothing within reach: 0 / 0 would give NaN
+    if total <= np.float32(0):  # no filled vertex in the support: 0 / 0 would give NaN
         return np.float32(0), np.float32(1)
     return height / total, shade / (total * np.float32(255))
 
 
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _extinction(s, h):
-    """Density O = sigma0 s sigmoid(a (s - tau)), 1/m.
+    """Return the density O = sigma0 s sigmoid(a (s - tau)), 1/m.
 
-    A half-space's sum rises by about 1/2 per spacing, and sigma0 = a / spacing makes a ray that
-    enters it head-on lose half of its light exactly at s = tau, whatever the spacing.
+    The sum of a half-space rises by about 1/2 per spacing. With sigma0 = a / spacing a ray that
+    enters it at a right angle loses half of its light at s = tau, whatever the spacing.
     """
     return SHARPNESS / h * s / (1 + math.exp(-SHARPNESS * (s - THRESHOLD)))
 
@@ -155,23 +155,23 @@ def _extinction(s, h):
 def evaluate(
     points: Float32[np.ndarray, "n 3"], lattice: Lattice
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Metaball sum and what is averaged on the lattice, at points.
+    """Return the metaball sum, and the means of what the lattice stores, at points.
 
     Args:
         points: positions, m.
         lattice: the cascades.
 
     Returns:
-        float32 arrays: the normalised sum s [n]; its gradient [n, 3], 1/m; and [n, 3]: height over
-        the ground under the snow, m, brightness, and density O, 1/m, 0 below the ground.
+        float32 arrays: the normalised sum s [n]; its gradient [n, 3], 1/m; and [n, 3]: height above
+        the ground, m, brightness, and density O, 1/m, which is 0 below the ground.
     """
     n = points.shape[0]
     sums = np.zeros(n, np.float32)
     gradients = np.zeros((n, 3), np.float32)
-    rest = np.zeros((n, 3), np.float32)
+    means = np.zeros((n, 3), np.float32)
     for r in prange(n):
         x, y, z = np.float64(points[r, 0]), np.float64(points[r, 1]), np.float64(points[r, 2])
-        rest[r, 1] = 1
+        means[r, 1] = 1
         k, brick, i, j, m = _find(lattice, x, y, z)
         if brick < 0:
             continue
@@ -183,39 +183,39 @@ def evaluate(
         sums[r] = s
         gradients[r, 0], gradients[r, 1], gradients[r, 2] = gx / h, gy / h, gz / h
         height, shade = _means(lattice, brick, px, py, pz)
-        rest[r, 0], rest[r, 1] = height * h, shade
+        means[r, 0], means[r, 1] = height * h, shade
         if height * h > -lattice.burial[k]:
-            rest[r, 2] = _extinction(s, h)
-    return sums, gradients, rest
+            means[r, 2] = _extinction(s, h)
+    return sums, gradients, means
 
 
 @njit(cache=True, fastmath=_FAST)
 def _to_band(px, py, pz, d, low, high):
-    """Way (spacings) to a brick's band of layers, or out of the brick if that comes first."""
-    way = np.inf
+    """Return the length (spacings) to a brick's band of layers, or out of the brick if shorter."""
+    length = np.inf
     for p, c in ((px, d[0]), (py, d[1]), (pz, d[2])):
         if c != 0:
-            way = min(way, ((BRICK if c > 0 else 0) - p) / c)
+            length = min(length, ((BRICK if c > 0 else 0) - p) / c)
     if d[2] != 0:
-        level = (low if pz < low else high) - pz
-        if level * d[2] > 0:
-            way = min(way, level / d[2])
-    return max(way, 0.0)
+        rise = (low if pz < low else high) - pz
+        if rise * d[2] > 0:
+            length = min(length, rise / d[2])
+    return max(length, 0.0)
 
 
 @njit(cache=True, fastmath=_FAST)
 def _to_face(ux, uy, uz, d):
-    """Way (spacings) out of a cell from a place in it."""
-    way = np.inf
+    """Return the length (spacings) from a position in a cell to its boundary."""
+    length = np.inf
     for p, c in ((ux, d[0]), (uy, d[1]), (uz, d[2])):
         if c != 0:
-            way = min(way, ((1 if c > 0 else 0) - p) / c)
-    return max(way, 0.0)
+            length = min(length, ((1 if c > 0 else 0) - p) / c)
+    return max(length, 0.0)
 
 
 @njit(cache=True, fastmath=_FAST)
 def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
-    """Samples of one ray into the given rows; returns their number."""
+    """Write the samples of one ray to the given rows; return their number."""
     n = 0
     depth = 0.0  # optical depth so far
     group, moment, first, last = 0.0, 0.0, 0.0, 0.0
@@ -224,12 +224,12 @@ def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
     while t < end and depth < _OPAQUE:
         x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
         px, py, pz = (x - cx) * per, (y - cy) * per, (z - cz) * per
-        # Most steps stay in their brick; only of the finest is it sure that no finer one is there.
+        # Most steps stay in their brick. In the finest cascade no finer brick can be there.
         inside = min(px, py, pz) >= 0 and max(px, py, pz) < BRICK
         if not (k == 0 and brick >= 0 and inside):
             k, brick, i, j, m = _find(lattice, x, y, z)
             if k < 0:
-                break  # the ray was cut to the outermost cascade before
+                break  # outside the outermost cascade, to which `march` clips the ray
             h = lattice.spacing[k]
             side, per = h * BRICK, 1 / h
             cx = lattice.lower[k, 0] + i * side
@@ -240,12 +240,12 @@ def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
             step = np.inf
             for axis, face in ((0, cx), (1, cy), (2, cz)):
                 if d[axis] != 0:
-                    far = face + (h * BRICK if d[axis] > 0 else 0.0)
-                    step = min(step, (far - o[axis]) / d[axis] - t)
+                    edge = face + (h * BRICK if d[axis] > 0 else 0.0)
+                    step = min(step, (edge - o[axis]) / d[axis] - t)
             t += max(step, 0.0) + 1e-3 * h
             sigma, step = 0.0, 0.0
         else:
-            # Rounding may bring the last cell's far face to 8.
+            # Rounding may give 8 at the upper face of the last cell.
             i, j, m = min(int(px), BRICK - 1), min(int(py), BRICK - 1), min(int(pz), BRICK - 1)
             if pz < lattice.band[brick, 0] or pz > lattice.band[brick, 1]:
                 t += _to_band(px, py, pz, d, lattice.band[brick, 0], lattice.band[brick, 1]) * h
@@ -272,7 +272,7 @@ def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
             group += sigma * step
             moment += sigma * step * (t - step / 2)
             depth += sigma * step
-        if group > 0 and (sigma == 0 or group > _GROUP or depth >= _OPAQUE or t >= end):
+        if group > 0 and (sigma == 0 or group > _SAMPLE_DEPTH or depth >= _OPAQUE or t >= end):
             if group > 1e-4 and n < MAX_SAMPLES:
                 out_t[n] = moment / group
                 out_dt[n] = last - first
@@ -292,18 +292,18 @@ def march(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """March rays through the snow, front to back, until they are opaque.
 
-    Steps are as long as the sum's steepest possible rise allows, so no surface is jumped over;
-    within a surface they follow its slope.
+    Outside the surface a step is as long as the bound of the sum's slope allows, so that no surface
+    is missed. Inside it the step follows the slope.
 
     Args:
         rays_o: origins, m.
         rays_d: unit directions.
-        t_min: where each ray begins, m.
-        t_max: where it ends, m; infinite is allowed.
+        t_min: ray length at which each ray begins, m.
+        t_max: ray length at which it ends, m; may be infinite.
         lattice: the cascades.
 
     Returns:
-        offsets [n + 1] and, packed, the samples' middle t, extent dt (m) and extinction (1/m).
+        Offsets [n + 1] and, packed, middle t and extent dt (m) and extinction (1/m) of the samples.
     """
     n = rays_o.shape[0]
     t = np.empty((n, MAX_SAMPLES), np.float32)

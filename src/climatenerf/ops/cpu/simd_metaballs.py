@@ -1,10 +1,10 @@
-"""Sums of metaballs about a point, in vector registers; see `lanes.py`.
+"""SIMD intrinsics: sums of metaballs around a point; see `simd.py`.
 
-The lanes are 4 x 4 vertices about the point in y and z, for one plane of x at a time. As there,
-files with kernels that use this one carry its digest.
+The lanes are the 4 x 4 vertices around the point in y and z, for one plane of x at a time. Files
+with kernels that use this one hold the digest of both.
 """
 
-# Numba's stubs do not know what an intrinsic's generator is given.
+# Numba's stubs have no types for the arguments of an intrinsic's generator.
 # pyright: reportAttributeAccessIssue=false
 
 from typing import Any
@@ -22,47 +22,47 @@ from climatenerf.ops.cpu.simd import (
     INTS,
     LANES,
     arrays_of,
+    broadcast,
     constant,
-    everywhere,
     multiply_add,
-    sides_of,
+    shape_of,
     sums_of,
 )
 
-_NEAR = [
+_OFFSETS = [
     [float(lane // 4 - 1) for lane in range(LANES)],
     [float(lane % 4 - 1) for lane in range(LANES)],
 ]
 
 
-def _squares(b: Any, u: list[Any], reach: float) -> tuple[list[Any], Any]:
-    """Distances of the vertices in y and z, and reach squared less their squares."""
-    beside = [
-        b.fsub(everywhere(b, own), ir.Constant(FLOATS, near), flags=FAST)
-        for own, near in zip(u[1:], _NEAR, strict=True)
+def _squares(b: Any, u: list[Any], support: float) -> tuple[list[Any], Any]:
+    """Return the vertices' distances in y and z, and support squared less their squares."""
+    distances = [
+        b.fsub(broadcast(b, position), ir.Constant(FLOATS, offset), flags=FAST)
+        for position, offset in zip(u[1:], _OFFSETS, strict=True)
     ]
-    rest = constant(FLOATS, reach * reach)
-    for d in beside:
+    rest = constant(FLOATS, support * support)
+    for d in distances:
         rest = b.fsub(rest, b.fmul(d, d, flags=FAST), flags=FAST)
-    return beside, rest
+    return distances, rest
 
 
 def _planes(b: Any, u: list[Any], rest: Any) -> Any:
-    """For each of the planes in x: its number, distance, and how far within reach vertices are."""
+    """Yield each plane in x: its number, its distance, and support² - r² of the vertices, or 0."""
     for plane in range(4):
-        d = everywhere(b, b.fsub(u[0], ir.Constant(F32, plane - 1.0), flags=FAST))
+        d = broadcast(b, b.fsub(u[0], ir.Constant(F32, plane - 1.0), flags=FAST))
         q = b.fsub(rest, b.fmul(d, d, flags=FAST), flags=FAST)
         zero = constant(FLOATS, 0.0)
         yield plane, d, b.select(b.fcmp_ordered(">", q, zero), q, zero)
 
 
-def _vertices(b: Any, array: Any, place: list[Any], plane: int) -> Any:
-    """Values at a plane's vertices: [brick, x, y, z] of whole numbers, in floats."""
-    sides = sides_of(b, array)
+def _vertices(b: Any, array: Any, cell: list[Any], plane: int) -> Any:
+    """Return the values at a plane's vertices of an integer array [brick, x, y, z], as floats."""
+    sides = shape_of(b, array)
     kind = array.data.type.pointee
     run = ir.IntType(4 * kind.width)
     rows = ir.Constant(ir.VectorType(run, 4), ir.Undefined)
-    brick, i, j, m = place
+    brick, i, j, m = cell
     for row in range(4):
         at = b.add(b.mul(brick, sides[1]), b.add(i, I64(plane)))
         at = b.add(b.mul(at, sides[2]), b.add(j, I64(row)))
@@ -70,23 +70,23 @@ def _vertices(b: Any, array: Any, place: list[Any], plane: int) -> Any:
         four = b.load(b.bitcast(b.gep(array.data, [at]), run.as_pointer()), align=1)
         rows = b.insert_element(rows, four, I32(row))
     values = b.bitcast(rows, ir.VectorType(kind, LANES))
-    wide = b.zext if kind.width == 8 else b.sext  # bytes have no sign here, longer ones have
+    wide = b.zext if kind.width == 8 else b.sext  # bytes are unsigned here, longer integers signed
     return b.sitofp(wide(values, INTS), FLOATS)
 
 
-def _given(b: Any, arguments: Any, first: int) -> tuple[list[Any], list[Any]]:
-    """Where a point is: brick, x, y, z of its cell; and its place in the cell, in spacings."""
+def _cell_and_position(b: Any, arguments: Any, first: int) -> tuple[list[Any], list[Any]]:
+    """Return brick, x, y, z of a point's cell, and its position in the cell (spacings)."""
     return list(arguments[first : first + 4]), list(arguments[first + 4 : first + 7])
 
 
 WHERE = (types.int64,) * 4 + (types.float32,) * 3
 
 
-def _ball_sums(reach: float) -> Any:
-    """Generates `ball_sums(fill, brick, i, j, m, ux, uy, uz)`: kernels' sums about a point.
+def _ball_sums(support: float) -> Any:
+    """Generate `ball_sums(fill, brick, i, j, m, ux, uy, uz)`: kernel sums around a point.
 
-    K = (reach² - r²)³. Returns sums over the 64 vertices about it of K and K f, then of the slope
-    (reach² - r²)² times dx, dy and dz, and of that times f.
+    K = (support² - r²)³. It returns sums over the 64 vertices around the point: of K and K f; of
+    the slope (support² - r²)² times dx, dy and dz; and of that times f.
     """
 
     @intrinsic
@@ -95,12 +95,12 @@ def _ball_sums(reach: float) -> Any:
 
         def generate(context, b, signature, arguments):
             (fills,) = arrays_of(context, b, signature, arguments, (0,))
-            place, u = _given(b, arguments, 1)
-            (dy, dz), rest = _squares(b, u, reach)
+            cell, u = _cell_and_position(b, arguments, 1)
+            (dy, dz), rest = _squares(b, u, support)
             names = ("k", "kf", "x", "xf", "all", "allf")
             sums = dict.fromkeys(names, constant(FLOATS, 0.0))
             for plane, dx, q in _planes(b, u, rest):
-                f = _vertices(b, fills, place, plane)
+                f = _vertices(b, fills, cell, plane)
                 slope = b.fmul(q, q, flags=FAST)
                 slope_f = b.fmul(slope, f, flags=FAST)
                 terms = ((slope, q), (slope_f, q), (slope, dx), (slope_f, dx))
@@ -111,18 +111,18 @@ def _ball_sums(reach: float) -> Any:
             yz = [b.fmul(sums[kind], d, flags=FAST) for kind in ("all", "allf") for d in (dy, dz)]
             k, kf, x, xf = (sums[name] for name in names[:4])
             halves = sums_of(b, [k, kf, x, yz[0]]), sums_of(b, [yz[1], xf, yz[2], yz[3]])
-            own = [b.extract_element(half, I32(n)) for half in halves for n in range(4)]
-            return context.make_tuple(b, signature.return_type, own)
+            values = [b.extract_element(half, I32(n)) for half in halves for n in range(4)]
+            return context.make_tuple(b, signature.return_type, values)
 
         return result(fill, *WHERE), generate
 
     return ball_sums
 
 
-def _ball_means(reach: float) -> Any:
-    """Generates `ball_means(fill, height, shade, brick, ...)`: as `ball_sums`.
+def _ball_means(support: float) -> Any:
+    """Generate `ball_means(fill, height, shade, brick, ...)`, as `ball_sums`.
 
-    Returns sums of K f; of that times height; times dz; times shade.
+    It returns sums of K f; of that times height; times dz; times shade.
     """
 
     @intrinsic
@@ -131,24 +131,24 @@ def _ball_means(reach: float) -> Any:
 
         def generate(context, b, signature, arguments):
             arrays = arrays_of(context, b, signature, arguments, (0, 1, 2))
-            place, u = _given(b, arguments, 3)
-            (_, dz), rest = _squares(b, u, reach)
-            total, high, lit = (constant(FLOATS, 0.0) for _ in range(3))
+            cell, u = _cell_and_position(b, arguments, 3)
+            (_, dz), rest = _squares(b, u, support)
+            total, heights, shades = (constant(FLOATS, 0.0) for _ in range(3))
             for plane, _, q in _planes(b, u, rest):
-                f, over, bright = (_vertices(b, array, place, plane) for array in arrays)
+                f, over, bright = (_vertices(b, array, cell, plane) for array in arrays)
                 cube = b.fmul(b.fmul(q, q, flags=FAST), q, flags=FAST)
                 weight = b.fmul(cube, f, flags=FAST)
                 total = b.fadd(total, weight, flags=FAST)
-                high = multiply_add(b, weight, over, high)
-                lit = multiply_add(b, weight, bright, lit)
-            four = sums_of(b, [total, high, b.fmul(total, dz, flags=FAST), lit])
-            own = [b.extract_element(four, I32(n)) for n in range(4)]
-            return context.make_tuple(b, signature.return_type, own)
+                heights = multiply_add(b, weight, over, heights)
+                shades = multiply_add(b, weight, bright, shades)
+            four = sums_of(b, [total, heights, b.fmul(total, dz, flags=FAST), shades])
+            values = [b.extract_element(four, I32(n)) for n in range(4)]
+            return context.make_tuple(b, signature.return_type, values)
 
         return result(fill, height, shade, *WHERE), generate
 
     return ball_means
 
 
-BALL_REACH = 2.0  # of a metaball's kernel, lattice spacings
-ball_sums, ball_means = _ball_sums(BALL_REACH), _ball_means(BALL_REACH)
+BALL_SUPPORT = 2.0  # radius of the support of a metaball's kernel, lattice spacings
+ball_sums, ball_means = _ball_sums(BALL_SUPPORT), _ball_means(BALL_SUPPORT)

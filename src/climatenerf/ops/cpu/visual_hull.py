@@ -5,15 +5,15 @@ from numba import njit, prange
 
 
 @njit(cache=True, parallel=True)
-def label_votes(x, radius, views, least, agreed):
-    """Which places enough views see before nothing but sky, or ground: see `reference.label_votes`.
+def label_votes(x, radius, views, thresholds, consensus):
+    """Write on which balls (x, radius) the views' masks agree; see `reference.label_votes`.
 
-    Args: views: their maps in one row, each from starts [v] on and of sizes [v, 2], pinholes, c2w.
+    views: (depths inside the masks, flat; start of each view; sizes [v,2]; pinholes [v,4]; c2w).
     """
-    reach, starts, sizes, pinholes, c2w = views
-    least_voices, least_share, apart = least
+    depth, starts, sizes, pinholes, c2w = views
+    min_votes, min_fraction, min_baseline = thresholds
     for i in prange(x.shape[0]):
-        voices, watching, first, spread = 0, 0, 0, False
+        votes, observers, first, wide = 0, 0, 0, False
         for v in range(c2w.shape[0]):
             pose, pinhole = c2w[v], pinholes[v]
             dx, dy, dz = x[i, 0] - pose[0, 3], x[i, 1] - pose[1, 3], x[i, 2] - pose[2, 3]
@@ -22,23 +22,23 @@ def label_votes(x, radius, views, least, agreed):
                 continue
             across = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
             down = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
-            per_metre = np.float32(1.0) / z
-            column = np.floor(pinhole[0] * across * per_metre + pinhole[2])
-            row = np.floor(pinhole[1] * down * per_metre + pinhole[3])
+            inverse_z = np.float32(1.0) / z
+            column = np.floor(pinhole[0] * across * inverse_z + pinhole[2])
+            row = np.floor(pinhole[1] * down * inverse_z + pinhole[3])
             height, width = sizes[v, 0], sizes[v, 1]
             if not (column >= 0 and column < width and row >= 0 and row < height):
                 continue
-            watching += 1
-            within = reach[starts[v] + np.int64(row) * width + np.int64(column)]
-            footprint = radius[i] * max(pinhole[0], pinhole[1]) * per_metre
-            if within < 1 or within - np.float32(1.0) < footprint:
+            observers += 1
+            inside = depth[starts[v] + np.int64(row) * width + np.int64(column)]
+            footprint = radius[i] * max(pinhole[0], pinhole[1]) * inverse_z
+            if inside < 1 or inside - np.float32(1.0) < footprint:
                 continue
-            if voices == 0:
+            if votes == 0:
                 first = v
             else:
-                far = np.float32(0.0)
+                baseline = np.float32(0.0)
                 for k in range(3):
-                    far += (c2w[first, k, 3] - pose[k, 3]) ** 2
-                spread |= far > apart * apart
-            voices += 1
-        agreed[i] = spread and voices >= least_voices and voices >= least_share * watching
+                    baseline += (c2w[first, k, 3] - pose[k, 3]) ** 2
+                wide |= baseline > min_baseline * min_baseline
+            votes += 1
+        consensus[i] = wide and votes >= min_votes and votes >= min_fraction * observers

@@ -16,16 +16,16 @@ from numba import njit
 from climatenerf.ops.cpu.metaballs import (
     BRICK,
     HEIGHT_UNIT,
-    REACH,
     STORED,
+    SUPPORT,
     Lattice,
-    where_matter_is,
+    occupied_cells,
 )
 
 _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 # A column that extends below the ground by the supports of kernel and prefilter gives the same
 # surface as a half-space.
-_BURIAL = REACH + _BLUR
+_BURIAL = SUPPORT + _BLUR
 _BELOW, _ABOVE = 20.0, 40.0  # m; ground up to this far below and above the cameras carries snow
 _FULL_COVER_DEPTH = 0.01  # m; thinner snow covers only part of the ground
 
@@ -148,7 +148,7 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
     sizes = [part.size for part in index]
     spacing = np.array([grid.spacing_of(k) for k in range(grid.cascades)])
     fill = np.concatenate([p[0] for p in pool])
-    band, near = where_matter_is(fill)
+    band, near = occupied_cells(fill)
     return Lattice(
         lower=np.array(lower),
         spacing=spacing,
