@@ -1,1 +1,1 @@
-"""Flood water: a level surface with waves, a body and a bed."""
+"""Flood water: a horizontal surface with waves, a body of water and a bottom."""

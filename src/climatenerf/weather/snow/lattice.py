@@ -139,7 +139,7 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
         position = (deposits.position[part].astype(np.float64) - corner) / h
         weight = deposits.weight[part] * np.float32(cover / deposits.passes[k])
         sums, core = _fill(position, weight, deposits.shade[part], depth / h, count)
-        table, fill, height, shade = _assemble(sums, core, count)
+        table, fill, height, shade = _assemble(sums, core)
         index.append(np.where(table >= 0, table + used, -1).astype(np.int32).reshape(-1))
         pool.append((fill, height, shade))
         used += fill.shape[0]
@@ -249,25 +249,19 @@ def _fill(
 def _assemble(
     sums: Float32[np.ndarray, "b 8 8 8 4"],
     core: Int[np.ndarray, "x y z"],
-    bricks: Int[np.ndarray, "3"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Quantise the vertices and store with each brick the adjacent vertices of its neighbours.
 
     Returns:
         Brick table [x, y, z] (-1: empty), and `fill`, `height` and `shade` of `Lattice`.
     """
+    from scipy import ndimage
+
     shaded = float(sums[..., 2].sum(dtype=np.float64))
     # Without any shaded deposit in this cascade the default is never visible.
     default_shade = float(sums[..., 3].sum(dtype=np.float64)) / shaded if shaded > 0 else 1.0
     vertices = _quantise(sums, default_shade)
-    near = core >= 0
-    for axis in range(3):
-        wide = near.copy()
-        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        wide[tuple(ahead)] |= near[tuple(behind)]
-        wide[tuple(behind)] |= near[tuple(ahead)]
-        near = wide
+    near = ndimage.binary_dilation(core >= 0, np.ones((3, 3, 3), bool))
     cells = np.argwhere(near)
     fill, height, shade = _gather(cells, core, *vertices)
     occupied = fill.any((1, 2, 3))
