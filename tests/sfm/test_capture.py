@@ -1,35 +1,26 @@
-"""From bare photos to a scene, through the command line: the embedded street against its truth."""
+"""From photos to a scene through the command line; the embedded street is the ground truth."""
 
 import json
 import math
 import re
 import shutil
 import subprocess
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.command_line import STREET, run_cli
 from support.photo_builders import exif, photo
 
-from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene
 
 pytest.importorskip("pycolmap")
-STREET = Path(str(files("climatenerf") / "assets" / "street"))
 HOME = (47.3769, 8.5417)
 
 
-def status(*words):
-    try:
-        return cli.main([str(word) for word in words])
-    except SystemExit as left:
-        return left.code
-
-
 def similarity(a, b):
-    """Umeyama's scale, rotation and shift with b = s R a + t."""
+    """Return scale s, rotation R and translation t of b = s R a + t (Umeyama 1991)."""
     ma, mb = a.mean(0), b.mean(0)
     u, d, vt = np.linalg.svd((b - mb).T @ (a - ma))
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
@@ -40,7 +31,7 @@ def similarity(a, b):
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory):
-    """The street's photos with GPS in them, every third turned on its side, captured."""
+    """A capture of the street's photos with GPS; every third is stored rotated by 90 degrees."""
     truth = read_scene(STREET)
     folder = tmp_path_factory.mktemp("photos")
     lat_m = 111132.954 - 559.822 * math.cos(2 * math.radians(HOME[0]))
@@ -49,111 +40,99 @@ def captured(tmp_path_factory):
     for number, view in enumerate(truth.views):
         x, y, z = truth.c2w_world(view)[:3, 3]
         x, y = x + rng.normal(0, 0.15), y + rng.normal(0, 0.15)
-        place = (HOME[0] + y / lat_m, HOME[1] + x / lon_m, 400 + z)
-        turned = number % 3 == 0
+        gps = (HOME[0] + y / lat_m, HOME[1] + x / lon_m, 400 + z)
+        rotated = number % 3 == 0
         image = Image.open(view.path)
-        image = image.transpose(Image.Transpose.ROTATE_90) if turned else image
-        data = exif(6 if turned else 1, place=place)
+        image = image.transpose(Image.Transpose.ROTATE_90) if rotated else image
+        data = exif(6 if rotated else 1, gps=gps)
         image.save(folder / f"{Path(view.name).stem}.jpg", quality=95, exif=data)
     out = tmp_path_factory.mktemp("street") / "scene"
-    assert status("capture", folder, "-o", out) == 0
+    assert run_cli("capture", folder, "-o", out) == 0
     return truth, out
 
 
 @pytest.mark.slow
-def test_poses_scale_and_up_against_the_truth(captured):
+def test_poses_scale_and_up_match_the_truth(captured):
     truth, out = captured
     scene = load_scene(out)
     by_name = {Path(v.name).stem: v for v in truth.views}
     assert len(scene.views) >= 0.95 * len(truth.views)
-    own = np.stack([scene.c2w_world(v) for v in scene.views])
+    estimated = np.stack([scene.c2w_world(v) for v in scene.views])
     true = np.stack([truth.c2w_world(by_name[Path(v.name).stem]) for v in scene.views])
-    scale, rotation, shift = similarity(own[:, :3, 3], true[:, :3, 3])
-    placed = scale * own[:, :3, 3] @ rotation.T + shift
-    away = np.linalg.norm(placed - true[:, :3, 3], axis=-1)
-    sound = away <= 4 * np.median(away)  # one picture placed wrongly must not turn all others
-    assert sound.mean() > 0.95
-    scale, rotation, shift = similarity(own[sound, :3, 3], true[sound, :3, 3])
-    placed = scale * own[:, :3, 3] @ rotation.T + shift
+    scale, rotation, shift = similarity(estimated[:, :3, 3], true[:, :3, 3])
+    aligned = scale * estimated[:, :3, 3] @ rotation.T + shift
+    error = np.linalg.norm(aligned - true[:, :3, 3], axis=-1)
+    inlier = error <= 4 * np.median(error)  # one wrong pose must not affect the alignment
+    assert inlier.mean() > 0.95
+    scale, rotation, shift = similarity(estimated[inlier, :3, 3], true[inlier, :3, 3])
+    aligned = scale * estimated[:, :3, 3] @ rotation.T + shift
     extent = np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))
-    assert np.median(np.linalg.norm(placed - true[:, :3, 3], axis=-1)) < 0.01 * extent
-    between = rotation @ own[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
+    assert np.median(np.linalg.norm(aligned - true[:, :3, 3], axis=-1)) < 0.01 * extent
+    between = rotation @ estimated[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
     angles = np.degrees(np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     assert np.median(angles) < 0.5
-    # GPS: metres within 3 %, x to the east; up from the pictures.
+    # GPS gives the scale within 3 % and x to the east; the pictures give up.
     assert scene.scale_source == "gps" and scale == pytest.approx(1, abs=0.03)
     up = np.degrees(np.arccos(np.clip(rotation[2, 2], -1, 1)))
     east = np.degrees(np.arctan2(rotation[1, 0], rotation[0, 0]))
     assert up < 3 and abs(east) < 3
-    assert scene.of_split("heldout"), "photos are kept for measuring"
+    assert scene.of_split("heldout"), "some photos are held out"
 
 
 @pytest.mark.slow
-def test_the_report_and_the_next_command(captured, tmp_path, capsys):
+def test_report_and_following_commands(captured, tmp_path, capsys):
     _, out = captured
     text = (out / "report.md").read_text()
     assert re.search(r"Pictures with poses: 6\d of 64", text) and "GPS of 6" in text
     assert Image.open(out / "report.png").size == (1280, 640)
     assert (out / "sparse" / "0" / "images.bin").is_file()
     run = tmp_path / "run"
-    assert status("fit", out, "-o", run, "--steps", "2", "--downscale", "4") == 0
+    assert run_cli("fit", out, "-o", run, "--steps", "2", "--downscale", "4") == 0
     assert json.loads((run / "scene.json").read_text())["scale_source"] == "gps"
-    assert status("export", out, "-o", tmp_path / "out") == 0
+    assert run_cli("export", out, "-o", tmp_path / "out") == 0
     assert (tmp_path / "out" / "transforms.json").is_file()
 
 
 @pytest.mark.slow
-def test_a_second_run_goes_on_from_what_is_there(captured, tmp_path, capsys):
+def test_second_run_reuses_earlier_results(captured, tmp_path, capsys):
     truth, out = captured
     scene = tmp_path / "scene"
     shutil.copytree(out, scene)
     shutil.rmtree(scene / "images")
     photos = tmp_path / "photos"
     photos.mkdir()
-    for view in truth.views:  # other files: the pictures are taken in anew, the rest is kept
+    for view in truth.views:  # new files: pictures are converted again
         shutil.copy(view.path, photos / f"{Path(view.name).stem}.jpg")
-    assert status("capture", photos, "-o", scene) == 0
+    assert run_cli("capture", photos, "-o", scene) == 0
     assert len(list((scene / "images").iterdir())) >= 60
 
 
-def test_photos_that_fit_nowhere_are_one_clear_sentence(tmp_path, capsys):
+def test_unmatched_photos_give_one_error_sentence(tmp_path, capsys):
     for i in range(4):
         photo(tmp_path / "in" / f"{i}.jpg", (320, 240), seed=i)
-    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+    assert run_cli("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
     err = capsys.readouterr().err
     assert "fit together" in err and "Traceback" not in err
     assert not (tmp_path / "scene" / "scene.json").exists()
 
 
-def test_two_photos_and_a_scene_that_is_there_already(tmp_path, capsys):
-    for i in range(2):
-        photo(tmp_path / "in" / f"{i}.jpg", seed=i)
-    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
-    assert "2 usable" in capsys.readouterr().err
-    shutil.copytree(STREET, tmp_path / "mine")
-    before = (tmp_path / "mine" / "scene.json").read_bytes()
-    assert status("capture", tmp_path / "in", "-o", tmp_path / "mine") == 2
-    assert "already holds" in capsys.readouterr().err
-    assert (tmp_path / "mine" / "scene.json").read_bytes() == before
-
-
-def test_without_pycolmap_the_remedy_is_told(tmp_path, capsys, monkeypatch):
+def test_missing_pycolmap_names_the_install_command(tmp_path, capsys, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     photo(tmp_path / "in" / "0.jpg")
-    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+    assert run_cli("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
     assert "climatenerf[capture]" in capsys.readouterr().err
 
 
 def street_photo(number, size):
-    """A large picture with as much detail as the street's photos have."""
+    """An enlarged photo of the street."""
     view = sorted((STREET / "images").iterdir())[number]
     return Image.open(view).convert("RGB").resize(size, Image.Resampling.BICUBIC)
 
 
-def turned(picture, focal, yaw, pitch, size=(320, 240), lens=350.0):
-    """What a camera sees that is turned in the centre of a picture of the surroundings."""
+def rotated_view(picture, focal, yaw, pitch, size=(320, 240), lens=350.0):
+    """View of a camera in the centre of a larger picture, rotated by yaw and pitch (degrees)."""
     a, b = math.radians(yaw), math.radians(pitch)
     about_y = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
     about_x = np.array([[1, 0, 0], [0, math.cos(b), -math.sin(b)], [0, math.sin(b), math.cos(b)]])
@@ -166,20 +145,20 @@ def turned(picture, focal, yaw, pitch, size=(320, 240), lens=350.0):
     )
 
 
-def test_photos_from_one_spot_are_told_so(tmp_path, capsys):
+def test_pure_rotation_gives_one_error_sentence(tmp_path, capsys):
     around = street_photo(10, (1536, 864))
     (tmp_path / "in").mkdir()
     for i, (yaw, pitch) in enumerate([(-9, 0), (-5, 3), (0, 0), (4, -3), (8, 2), (2, 5)]):
-        turned(around, 1200, yaw, pitch).save(tmp_path / "in" / f"{i}.jpg", quality=95)
-    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
+        rotated_view(around, 1200, yaw, pitch).save(tmp_path / "in" / f"{i}.jpg", quality=95)
+    assert run_cli("capture", tmp_path / "in", "-o", tmp_path / "scene") == 2
     err = capsys.readouterr().err
     assert "from one spot" in err and "Traceback" not in err
     assert not (tmp_path / "scene" / "scene.json").exists()
 
 
 @pytest.mark.slow
-def test_of_two_places_the_larger_is_kept(tmp_path, capsys):
-    """Mirrored photos are those of another place: nothing in them fits the others."""
+def test_larger_of_two_unconnected_groups_is_kept(tmp_path, capsys):
+    """Mirrored photos do not match the others, like photos of another scene."""
     views = sorted((STREET / "images").iterdir())
     (tmp_path / "in").mkdir()
     for path in views[:16]:
@@ -187,18 +166,18 @@ def test_of_two_places_the_larger_is_kept(tmp_path, capsys):
     for path in views[:9]:
         mirrored = Image.open(path).convert("RGB").transpose(Image.Transpose.FLIP_LEFT_RIGHT)
         mirrored.save(tmp_path / "in" / f"there-{path.stem}.jpg", quality=95)
-    assert status("capture", tmp_path / "in", "-o", tmp_path / "scene") == 0
-    told = capsys.readouterr()
-    assert re.search(r"2 groups that do not fit together \(1\d, [789] pictures\)", told.err)
-    assert "cut off from the rest" in told.err
+    assert run_cli("capture", tmp_path / "in", "-o", tmp_path / "scene") == 0
+    output = capsys.readouterr()
+    assert re.search(r"2 groups that do not fit together \(1\d, [789] pictures\)", output.err)
+    assert "not connected to the rest" in output.err
     names = [view.name for view in load_scene(tmp_path / "scene").views]
     assert len(names) >= 12 and all(name.startswith("here-") for name in names)
-    assert "Groups that do not fit together" in (tmp_path / "scene" / "report.md").read_text()
+    assert "Unconnected groups of pictures" in (tmp_path / "scene" / "report.md").read_text()
 
 
 @pytest.mark.slow
-def test_a_video_of_the_street(tmp_path, capsys):
-    """The street's photos in their order as a film: compared with neighbours, not all with all."""
+def test_capture_of_a_video(tmp_path, capsys):
+    """A video of the street's photos in order: only neighbours and loop closures are matched."""
     import imageio_ffmpeg
 
     truth = read_scene(STREET)
@@ -207,14 +186,15 @@ def test_a_video_of_the_street(tmp_path, capsys):
     command += ["-pix_fmt", "rgb24", "-s", "384x216", "-r", "4", "-i", "-", "-crf", "12", video]
     frames = b"".join(Image.open(view.path).convert("RGB").tobytes() for view in truth.views)
     subprocess.run([str(word) for word in command], input=frames, check=True)
-    assert status("capture", video, "-o", tmp_path / "scene") == 0
-    told = capsys.readouterr()
+    assert run_cli("capture", video, "-o", tmp_path / "scene") == 0
+    output = capsys.readouterr()
     scene = load_scene(tmp_path / "scene")
-    assert len(scene.views) > 0.8 * len(truth.views), told.err
+    assert len(scene.views) > 0.8 * len(truth.views), output.err
     names = [Path(view.name).stem for view in truth.views]
     true = np.stack([truth.c2w_world(truth.views[int(Path(v.name).stem)]) for v in scene.views])
     assert len(set(names)) == len(names) and scene.scale_source == "camera-height-assumed"
-    own = np.stack([scene.c2w_world(view) for view in scene.views])
-    scale, rotation, shift = similarity(own[:, :3, 3], true[:, :3, 3])
-    away = np.linalg.norm(scale * own[:, :3, 3] @ rotation.T + shift - true[:, :3, 3], axis=-1)
-    assert np.median(away) < 0.02 * np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))
+    estimated = np.stack([scene.c2w_world(view) for view in scene.views])
+    scale, rotation, shift = similarity(estimated[:, :3, 3], true[:, :3, 3])
+    aligned = scale * estimated[:, :3, 3] @ rotation.T + shift
+    error = np.linalg.norm(aligned - true[:, :3, 3], axis=-1)
+    assert np.median(error) < 0.02 * np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))

@@ -1,35 +1,27 @@
-"""Nothing of the user's is harmed, and what comes out is of these photos and no others."""
+"""Captures never harm the user's files, and scenes contain the given photos only."""
 
 import contextlib
 import json
 import os
 import shutil
 import sqlite3
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.command_line import STREET, run_cli
 from support.photo_builders import exif, photo
 
-from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.export import export_colmap
+from climatenerf.sfm.photo_import import import_photos
+from climatenerf.sfm.reconstruct import read_result
 from climatenerf.sfm.scene_folder import OLD_RECORD, RECORD
 
-STREET = Path(str(files("climatenerf") / "assets" / "street"))
 
-
-def status(*words):
-    try:
-        return cli.main([str(word) for word in words])
-    except SystemExit as left:
-        return left.code
-
-
-def everything(folder):
-    """Every file below a folder with its content, links as where they lead."""
+def snapshot(folder):
+    """Content of every file below a folder; of links the target."""
     return {
         path.relative_to(folder).as_posix(): os.readlink(path)
         if path.is_symlink()
@@ -41,7 +33,7 @@ def everything(folder):
 
 @pytest.fixture
 def posed(tmp_path):
-    """Six photos, and a COLMAP model of them in a folder of its own."""
+    """Six photos, and a COLMAP model of them in another folder."""
     truth = read_scene(STREET, holdout="0")
     export_colmap(truth, tmp_path / "model")
     lines = (tmp_path / "model" / "sparse" / "0" / "images.txt").read_text().splitlines()
@@ -53,59 +45,59 @@ def posed(tmp_path):
 
 
 def capture(here, out, *more):
-    return status(
+    return run_cli(
         "capture", here / "photos", "--from-colmap", here / "model", "-o", out, *more
     )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["images", "sparse", "labels", "scene.json", "work", "mark.html"])
-def test_what_no_capture_made_is_in_the_way(posed, capsys, name):
+def test_capture_refuses_folders_of_other_origin(posed, capsys, name):
     out = posed / "mine"
     if "." in name:
         photo(out / "other.jpg")
         (out / name).write_text("mine")
     else:
         photo(out / name / "logo.png")
-    before = everything(out)
+    before = snapshot(out)
     assert capture(posed, out) == 2
-    assert "already holds" in capsys.readouterr().err and everything(out) == before
+    assert "already contains" in capsys.readouterr().err and snapshot(out) == before
 
 
-def test_a_link_to_the_users_photos_is_in_the_way(posed, capsys):
+def test_linked_photos_are_never_deleted(posed, capsys):
     out = posed / "mine"
     out.mkdir()
     (out / "images").symlink_to(posed / "photos")
-    before = everything(posed / "photos")
+    before = snapshot(posed / "photos")
     assert capture(posed, out) == 2
-    assert everything(posed / "photos") == before
-    # Put in the place of what a capture made, it is taken away itself, and what it leads to stays.
+    assert snapshot(posed / "photos") == before
+    # In place of capture's own folder the link is removed, and its target stays.
     (out / "images").unlink()
     assert capture(posed, out) == 0
     shutil.rmtree(out / "images")
     (out / "images").symlink_to(posed / "photos")
     assert capture(posed, out) == 0
-    assert everything(posed / "photos") == before and not (out / "images").is_symlink()
+    assert snapshot(posed / "photos") == before and not (out / "images").is_symlink()
 
 
 @pytest.mark.parametrize("what", ["photos", "labels", "masks", "depth", "from-colmap"])
-def test_what_is_read_may_not_lie_where_is_written(posed, capsys, what):
+def test_inputs_inside_the_output_are_refused(posed, capsys, what):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
-    before = everything(out)
+    before = snapshot(out)
     given = {"photos": posed / "photos", "from-colmap": posed / "model"}
     given[what] = out / {"photos": "images", "from-colmap": "sparse"}.get(what, "labels")
     words = [w for k, v in given.items() if k != "photos" for w in (f"--{k}", v)]
-    assert status("capture", given["photos"], *words, "-o", out) == 2
-    assert "choose another folder" in capsys.readouterr().err and everything(out) == before
+    assert run_cli("capture", given["photos"], *words, "-o", out) == 2
+    assert "choose another folder" in capsys.readouterr().err and snapshot(out) == before
 
 
-def test_what_the_user_puts_into_a_scene_stays_and_is_used(posed, capsys):
+def test_files_that_the_user_adds_are_kept_and_used(posed, capsys):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
     first, second = (view.name for view in load_scene(out).views[:2])
     mine = {
         out / "labels" / "more" / "notes.txt": b"mine",
-        (out / "labels" / second).with_suffix(".png"): None,  # in the place of capture's
+        (out / "labels" / second).with_suffix(".png"): None,  # replaces capture's file
         (out / "masks" / first).with_suffix(".png"): None,
         out / "depth" / f"{first}.npy": b"mine",
         out / "readme.txt": b"mine",
@@ -125,40 +117,40 @@ def test_what_the_user_puts_into_a_scene_stays_and_is_used(posed, capsys):
     used = {view.name: view for view in read_scene(out).views}
     assert used[first].mask_path is not None
     assert used[second].label_path is not None
-    assert used[first].label_path is None, "the one that capture made is gone"
+    assert used[first].label_path is None, "capture's own file is removed"
 
 
 @pytest.mark.parametrize(
-    ("name", "words", "told"),
+    ("name", "words", "message"),
     [
-        ("images/extra.jpg", (), "is not capture's"),
-        ("images/0000.jpg", (), "was changed since"),
-        ("sparse/1/notes.txt", (), "is not capture's"),
-        ("report.md", (), "was changed since"),
-        ("labels", (), "is not capture's"),
-        ("labels/mine.png", ("--labels", STREET / "labels"), "is yours"),
+        ("images/extra.jpg", (), "was not written by capture"),
+        ("images/0000.jpg", (), "has changed since"),
+        ("sparse/1/notes.txt", (), "was not written by capture"),
+        ("report.md", (), "has changed since"),
+        ("labels", (), "was not written by capture"),
+        ("labels/mine.png", ("--labels", STREET / "labels"), "is your file"),
     ],
 )
-def test_what_would_be_lost_is_named_before_any_work(posed, capsys, name, words, told):
+def test_files_that_would_be_lost_are_named_before_any_work(posed, capsys, name, words, message):
     out = posed / "scene"
     assert capture(posed, out) == 0
     name = name.replace("0000.jpg", load_scene(out).views[0].name)
     (out / name).parent.mkdir(exist_ok=True)
     (out / name).write_bytes(b"mine")
-    before = everything(out)
+    before = snapshot(out)
     capsys.readouterr()
     assert capture(posed, out, *words) == 2
     err = capsys.readouterr().err
-    assert told in err and str(out / name) in err and len(err.strip().splitlines()) == 1
-    assert everything(out) == before
+    assert message in err and str(out / name) in err and len(err.strip().splitlines()) == 1
+    assert snapshot(out) == before
 
 
-def test_what_comes_while_capture_works_is_not_lost_either(posed, capsys, monkeypatch):
+def test_files_added_during_a_capture_are_not_lost(posed, capsys, monkeypatch):
     from climatenerf.sfm import pipeline
 
     out = posed / "scene"
     assert capture(posed, out) == 0
-    before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    before = {k: v for k, v in snapshot(out).items() if not k.startswith("work/")}
     real = pipeline.write_report
 
     def meanwhile(*arguments):
@@ -167,12 +159,12 @@ def test_what_comes_while_capture_works_is_not_lost_either(posed, capsys, monkey
 
     monkeypatch.setattr(pipeline, "write_report", meanwhile)
     assert capture(posed, out) == 2
-    assert "late.jpg is not capture's" in capsys.readouterr().err
-    after = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    assert "late.jpg was not written by capture" in capsys.readouterr().err
+    after = {k: v for k, v in snapshot(out).items() if not k.startswith("work/")}
     assert after == {**before, "images/late.jpg": b"mine"}
 
 
-def test_a_record_without_a_list_is_read_with_care(posed, capsys):
+def test_record_of_earlier_versions_is_read(posed, capsys):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
     (out / RECORD).unlink()
@@ -184,34 +176,34 @@ def test_a_record_without_a_list_is_read_with_care(posed, capsys):
     (out / RECORD).unlink()
     (out / "images" / "extra.jpg").write_bytes(b"mine")
     assert capture(posed, out) == 2
-    assert "extra.jpg is not capture's" in capsys.readouterr().err
+    assert "extra.jpg was not written by capture" in capsys.readouterr().err
 
 
-def test_the_work_folder_may_be_deleted_and_a_scene_moved(posed):
+def test_capture_works_after_deleting_work_or_copying_the_scene(posed):
     out = posed / "scene"
     assert capture(posed, out) == 0
     shutil.rmtree(out / "work")
     assert capture(posed, out) == 0
     assert json.loads((out / "scene.json").read_text())["root_absolute"] == str(out)
-    shutil.copytree(out, posed / "copy", copy_function=shutil.copyfile)  # other times
+    shutil.copytree(out, posed / "copy", copy_function=shutil.copyfile)  # new modification times
     assert capture(posed, posed / "copy") == 0
 
 
-def test_stopped_while_a_scene_takes_its_place(posed, monkeypatch):
+def test_interrupted_installation_can_be_repeated(posed, monkeypatch):
     from climatenerf.sfm import scene_folder
 
     out = posed / "scene"
     assert capture(posed, out) == 0
     real, moved = os.replace, []
 
-    def stopped(source, target):
+    def interrupted_replace(source, target):
         if Path(source).parent.name == "new":
             moved.append(source)
             if len(moved) == 3:
                 raise KeyboardInterrupt
         real(source, target)
 
-    monkeypatch.setattr(scene_folder.os, "replace", stopped)
+    monkeypatch.setattr(scene_folder.os, "replace", interrupted_replace)
     assert capture(posed, out, "--camera-height", "1.7 m") == 130
     monkeypatch.undo()
     assert capture(posed, out) == 0 and len(load_scene(out).views) == 6
@@ -226,47 +218,48 @@ def marks_file(path, picture="0001.jpg", pixel=(10, 20)):
 
 
 @pytest.mark.parametrize(("picture", "pixel"), [("nowhere.jpg", (1, 2)), (None, (5000, 2))])
-def test_marks_that_cannot_be_used_leave_a_finished_scene(posed, capsys, picture, pixel):
+def test_unusable_marks_leave_a_finished_scene_unchanged(posed, capsys, picture, pixel):
     out = posed / "scene"
     assert capture(posed, out, "--camera-height", "1.7 m") == 0
     name = picture or load_scene(out).views[0].name
     marks = marks_file(posed / "marks.toml", name, pixel)
-    before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    before = {k: v for k, v in snapshot(out).items() if not k.startswith("work/")}
     assert capture(posed, out, "--known-length", "D=2 m", "--marks", marks) == 2
     err = capsys.readouterr().err
     assert "is unchanged" in err and "poses are kept" not in err
-    assert {k: v for k, v in everything(out).items() if not k.startswith("work/")} == before
+    assert {k: v for k, v in snapshot(out).items() if not k.startswith("work/")} == before
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [("DOOR", "a name and a length"), ("DOOR=2", "no unit"), ("DOOR=-2 m", "above 0"),
      ("DOOR=2 kg", "a length"), ("", "a name and a length"), ("=2 m", "wants a name"),
      ("DOOR=2 m", "run this once without --known-length")],
 )  # fmt: skip
-def test_known_lengths_are_looked_at_first(posed, capsys, text, told):
-    assert status("capture", posed / "absent", "-o", posed / "scene", "--known-length", text) == 2
+def test_known_lengths_are_checked_first(posed, capsys, text, message):
+    assert run_cli("capture", posed / "absent", "-o", posed / "scene", "--known-length", text) == 2
     err = capsys.readouterr().err
-    assert told in err and len(err.strip().splitlines()) == 1
+    assert message in err and len(err.strip().splitlines()) == 1
     assert not (posed / "scene").exists()
 
 
-def test_the_scale_that_is_assumed_names_flags_that_there_are(posed, capsys):
+def test_assumed_scale_names_the_flags_of_capture(posed, capsys):
     assert capture(posed, posed / "scene") == 0
     err = capsys.readouterr().err
     assert "give --camera-height or --known-length" in err and "--metric-input" not in err
 
 
-def test_gps_that_is_of_no_use_is_told_of(posed, capsys):
+def test_unusable_gps_gives_a_warning(posed, capsys):
     for path in (posed / "photos").iterdir():
-        data = exif(place=(47.3769, 8.5417, 400.0))
+        data = exif(gps=(47.3769, 8.5417, 400.0))
         Image.open(path).convert("RGB").save(path, format="JPEG", quality=95, exif=data)
     assert capture(posed, posed / "scene") == 0
-    told = "GPS of 6 photos is of no use here"
-    assert told in capsys.readouterr().err and told in (posed / "scene" / "report.md").read_text()
+    warning = "GPS of 6 photos is of no use here"
+    assert warning in capsys.readouterr().err
+    assert warning in (posed / "scene" / "report.md").read_text()
 
 
-def test_a_picture_that_does_not_fit_is_named_as_the_users(posed, capsys):
+def test_error_names_the_users_photo_not_its_copy(posed, capsys):
     first = sorted((posed / "photos").iterdir())[0]
     Image.new("RGB", (100, 100)).save(first, format="JPEG")
     assert capture(posed, posed / "scene") == 2
@@ -275,7 +268,7 @@ def test_a_picture_that_does_not_fit_is_named_as_the_users(posed, capsys):
 
 
 @pytest.mark.parametrize("what", ["nothing", "too few", "no model", "no video"])
-def test_refused_input_leaves_no_folder(posed, capsys, what):
+def test_refused_input_creates_no_folder(posed, capsys, what):
     (posed / "in").mkdir()
     given = [posed / "in"]
     if what == "too few":
@@ -286,21 +279,21 @@ def test_refused_input_leaves_no_folder(posed, capsys, what):
     elif what == "no video":
         given = [posed / "in" / "walk.mp4"]
         given[0].write_bytes(b"no video" * 100)
-    assert status("capture", *given, "-o", posed / "out") == 2
+    assert run_cli("capture", *given, "-o", posed / "out") == 2
     err = capsys.readouterr().err
     assert "Traceback" not in err and not (posed / "out").exists()
 
 
-def test_a_scene_folder_that_is_a_link_to_nowhere(posed, capsys):
+def test_output_that_is_a_broken_link_is_refused(posed, capsys):
     (posed / "out").symlink_to("absent")
     assert capture(posed, posed / "out") == 2
     assert "is a link to absent, which does not exist" in capsys.readouterr().err
 
 
-def test_a_run_that_fails_leaves_the_scene_as_it_was(posed, tmp_path, capsys):
+def test_failed_run_leaves_the_scene_unchanged(posed, tmp_path, capsys):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
-    before = {k: v for k, v in everything(out).items() if not k.startswith("work/")}
+    before = {k: v for k, v in snapshot(out).items() if not k.startswith("work/")}
     bad = tmp_path / "bad"
     bad.mkdir()
     (bad / "0001.png").write_text("no picture")
@@ -319,27 +312,27 @@ def test_a_run_that_fails_leaves_the_scene_as_it_was(posed, tmp_path, capsys):
         ("--features", "3"),
     ):
         assert capture(posed, out, *words) == 2, words
-        told = capsys.readouterr().err
-        assert "Traceback" not in told
-        assert {k: v for k, v in everything(out).items() if not k.startswith("work/")} == before
+        output = capsys.readouterr().err
+        assert "Traceback" not in output
+        assert {k: v for k, v in snapshot(out).items() if not k.startswith("work/")} == before
 
 
-def test_a_length_that_cannot_be_measured_keeps_the_poses(posed, tmp_path, capsys):
+def test_unmeasurable_length_keeps_the_poses(posed, tmp_path, capsys):
     marks = tmp_path / "marks.toml"
     marks.write_text('[D.from]\n"x.jpg" = [1, 2]\n"y.jpg" = [1, 2]\n[D.to]\n"x.jpg" = [1, 2]\n'
                      '"y.jpg" = [1, 2]\n')  # fmt: skip
     out = posed / "scene"
     assert capture(posed, out, "--known-length", "D=2 m", "--marks", marks) == 2
-    told = capsys.readouterr().err
-    assert "poses are kept" in told and "x.jpg" in told
+    output = capsys.readouterr().err
+    assert "poses are kept" in output and "x.jpg" in output
     assert len(load_scene(out).views) == 6 and (out / "mark.html").is_file()
 
 
-def test_poses_of_another_place_that_lie_there_are_not_taken(posed):
+def test_transforms_in_the_output_are_not_read(posed):
     out = posed / "scene"
     assert capture(posed, out) == 0
     given = load_scene(out)
-    assert status("export", out, "-o", posed / "exported") == 0
+    assert run_cli("export", out, "-o", posed / "exported") == 0
     data = json.loads((posed / "exported" / "transforms.json").read_text())
     for frame in data["frames"]:
         frame["transform_matrix"][0][3] *= 7
@@ -349,7 +342,7 @@ def test_poses_of_another_place_that_lie_there_are_not_taken(posed):
         np.testing.assert_array_equal(a.c2w, b.c2w)
 
 
-def test_files_of_an_earlier_run_do_not_stay(posed):
+def test_sidecars_of_an_earlier_run_are_removed(posed):
     out = posed / "scene"
     assert capture(posed, out, "--labels", STREET / "labels") == 0
     assert load_scene(out).views[0].label_path is not None
@@ -358,44 +351,44 @@ def test_files_of_an_earlier_run_do_not_stay(posed):
 
 
 @pytest.mark.parametrize("name", ["../photos/0001.jpg", "/etc/0001.jpg"])
-def test_names_that_lead_elsewhere_are_refused(posed, capsys, name):
+def test_picture_names_outside_the_photo_folder_are_refused(posed, capsys, name):
     model = posed / "model" / "sparse" / "0" / "images.txt"
     model.write_text(model.read_text().replace("0001.jpg", name))
     assert capture(posed, posed / "scene") == 2
-    assert "leads out of the photos' folder" in capsys.readouterr().err
+    assert "outside the folder of photos" in capsys.readouterr().err
     assert not (posed / "scene" / "photos").exists()
 
 
-def test_a_scene_among_the_photos_does_not_count_as_photos(posed, capsys):
+def test_scene_among_the_photos_is_skipped(posed, capsys):
     out = posed / "photos" / "scene"
     for _ in range(2):
         assert capture(posed, out) == 0
         assert "6 of 6 pictures" in capsys.readouterr().out
     assert capture(posed, posed / "photos" / "another") == 0
-    told = capsys.readouterr()
-    assert "6 of 6 pictures" in told.out
-    assert "Scenes among the photos are left out: scene." in told.err
+    output = capsys.readouterr()
+    assert "6 of 6 pictures" in output.out
+    assert "Scene folders among the photos are skipped: scene." in output.err
 
 
-def test_export_overwrites_no_points(posed, capsys):
+def test_export_does_not_overwrite_points(posed, capsys):
     assert capture(posed, posed / "scene") == 0
     (posed / "out").mkdir()
     (posed / "out" / "points.ply").write_text("mine")
-    assert status("export", posed / "scene", "-o", posed / "out") == 2
+    assert run_cli("export", posed / "scene", "-o", posed / "out") == 2
     assert "already exists" in capsys.readouterr().err
     assert (posed / "out" / "points.ply").read_text() == "mine"
 
 
-def test_gravity_of_photos_that_only_fit_when_turned(posed):
-    """Stored lying with a tag, posed as shown: what a phone tells is turned with the picture."""
+def test_gravity_of_photos_posed_as_shown(posed):
+    """Photos are stored rotated, poses are of pictures as shown: gravity is rotated, too."""
     truth = read_scene(STREET, holdout="0")
     for view in truth.views[:6]:
         pose = truth.c2w_world(view)
         x, y, z = pose[:3, :3].T @ np.array([0, 0, -1.0])
-        stored = (y, -x, z)  # before tag 6 turns it: (x, y) = (-y', x')
+        stored = (y, -x, z)  # before orientation 6: (x, y) = (-y', x')
         data = exif(6, gravity=(-stored[1], -stored[0], -stored[2]), camera=("Apple", "iPhone"))
-        lying = Image.open(view.path).convert("RGB").transpose(Image.Transpose.ROTATE_90)
-        lying.save(posed / "photos" / view.name, quality=95, exif=data)
+        rotated = Image.open(view.path).convert("RGB").transpose(Image.Transpose.ROTATE_90)
+        rotated.save(posed / "photos" / view.name, quality=95, exif=data)
     assert capture(posed, posed / "scene") == 0
     scene = load_scene(posed / "scene")
     assert scene.up_report["gravity"] < 3 and "gravity" in scene.up_report["used"]
@@ -403,11 +396,11 @@ def test_gravity_of_photos_that_only_fit_when_turned(posed):
     assert np.degrees(np.arccos(up[2])) < 2
 
 
-# From here on by structure from motion.
+# The tests below run structure from motion.
 
 
-def fitting_photos(folder, count=6):
-    """Photos of the street with names that no list or address likes."""
+def street_photos(folder, count=6):
+    """Photos of the street whose names have a meaning in lists and URLs."""
     pytest.importorskip("pycolmap")
     folder.mkdir()
     names = ["#1 house.jpg", "50%20 off?.jpg", "Bild\u202f3.jpg", "a\nb.jpg", "|ü|.JPG", "6.jpeg"]
@@ -417,11 +410,11 @@ def fitting_photos(folder, count=6):
 
 
 def sfm(photos, out):
-    return status("capture", photos, "-o", out, "--features", "2048")
+    return run_cli("capture", photos, "-o", out, "--features", "2048")
 
 
-def test_strange_names_and_two_runs_alike(tmp_path, capsys, monkeypatch):
-    photos = fitting_photos(tmp_path / "in")
+def test_unusual_names_and_reproducible_runs(tmp_path, capsys, monkeypatch):
+    photos = street_photos(tmp_path / "in")
     (photos / "broken.jpg").symlink_to("nowhere")
     (photos / os.fsdecode(b"caf\xe9.jpg")).write_bytes(b"no picture")
     poses, verified = [], []
@@ -430,47 +423,57 @@ def test_strange_names_and_two_runs_alike(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(here)
     for out in (tmp_path / "a", tmp_path / "b #1?x=%20y"):
         assert sfm(photos, out) == 0
-        assert not list(here.iterdir()), "no stray file in the folder where one works"
-        told = capsys.readouterr()
-        assert "broken.jpg is left out" in told.err and "Traceback" not in told.err
+        assert not list(here.iterdir()), "no files in the working directory"
+        output = capsys.readouterr()
+        assert "broken.jpg is left out" in output.err and "Traceback" not in output.err
         poses.append({view.name: view.c2w for view in load_scene(out).views})
         with contextlib.closing(sqlite3.connect(out / "work" / "database.db")) as connection:
-            words = "SELECT pair_id, rows, data FROM two_view_geometries ORDER BY pair_id"
-            verified.append(connection.execute(words).fetchall())
-    assert verified[0] == verified[1], "verification draws its samples by the seed"
+            query = "SELECT pair_id, rows, data FROM two_view_geometries ORDER BY pair_id"
+            verified.append(connection.execute(query).fetchall())
+    assert verified[0] == verified[1], "verification is reproducible"
     assert len(poses[0]) >= 5 and poses[0].keys() == poses[1].keys()
     for name in poses[0]:
         np.testing.assert_array_equal(poses[0][name], poses[1][name])
 
 
-def test_a_work_folder_that_was_damaged_is_mended(tmp_path, capsys):
-    photos, out = fitting_photos(tmp_path / "in"), tmp_path / "scene"
+def test_damaged_work_folder_is_repaired(tmp_path, capsys):
+    photos, out = street_photos(tmp_path / "in"), tmp_path / "scene"
     assert sfm(photos, out) == 0
     views = len(load_scene(out).views)
     work = out / "work"
+    imported = import_photos(photos, work, lambda done, total: None)
 
     def garble(name):
         return lambda: (work / name).write_bytes(b"\x00garbled")
 
-    first = sorted((work / "pictures").glob("*.json"))[0]
+    shutil.copytree(work, tmp_path / "intact")
     for damage in (
-        garble("poses.json"), garble("database.json"), garble("chosen/images.bin"),
+        garble("poses.json"), garble("chosen/images.bin"),
         lambda: (work / "poses.json").write_text('{"groups": 5}'),
         lambda: (work / "database.db").unlink(),
-        lambda: first.write_text("3"),
-        lambda: first.with_suffix(".jpg").unlink(),
         lambda: shutil.rmtree(work / "chosen"),
     ):  # fmt: skip
+        assert read_result(imported, work, 2048, 0) is not None
         damage()
+        assert read_result(imported, work, 2048, 0) is None
+        shutil.rmtree(work)
+        shutil.copytree(tmp_path / "intact", work)
+    first, second = sorted((work / "pictures").glob("*.json"))[:2]
+    for damages in (
+        [garble("poses.json"), garble("database.json")],
+        [garble("database.db"), lambda: first.write_text("3"), second.with_suffix(".jpg").unlink],
+    ):
+        for damage in damages:
+            damage()
         assert sfm(photos, out) == 0, capsys.readouterr().err
         assert len(load_scene(out).views) == views
 
 
-def test_a_worker_that_fails_is_told_in_a_sentence(tmp_path, capsys):
-    photos, out = fitting_photos(tmp_path / "in"), tmp_path / "scene"
+def test_failed_worker_gives_one_error_sentence(tmp_path, capsys):
+    photos, out = street_photos(tmp_path / "in"), tmp_path / "scene"
     (out / "work" / "database.db").mkdir(parents=True)
     (out / "work" / "made-by-capture.json").write_text("{}")
     (out / "work" / "database.db" / "x").write_text("x")
     assert sfm(photos, out) in (0, 2)
-    told = capsys.readouterr().err
-    assert "Traceback" not in told and "memory" not in told
+    output = capsys.readouterr().err
+    assert "Traceback" not in output and "memory" not in output

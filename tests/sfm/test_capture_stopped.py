@@ -1,4 +1,4 @@
-"""Captures that end before their time: a full disk, a folder that cannot be written, a kill."""
+"""Captures that end early: a full disk, a read-only folder, a signal."""
 
 import os
 import shutil
@@ -6,24 +6,23 @@ import signal
 import subprocess
 import sys
 import time
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.command_line import STREET
 
 pytest.importorskip("pycolmap")
-STREET = Path(str(files("climatenerf") / "assets" / "street"))
 CAPTURE = [sys.executable, "-m", "climatenerf", "capture"]
 
 
 @pytest.fixture
 def photos(tmp_path):
-    return some_photos(tmp_path / "photos", 6)
+    return street_photos(tmp_path / "photos", 6)
 
 
-def some_photos(folder, count):
+def street_photos(folder, count):
     folder.mkdir()
     for path in sorted((STREET / "images").iterdir())[:count]:
         shutil.copy(path, folder)
@@ -31,7 +30,7 @@ def some_photos(folder, count):
 
 
 def on_disk(folder, mounting, command):
-    """Runs a command with a disk of its own mounted at a folder; the files there are gone after."""
+    """Run a command with a temporary disk mounted at a folder; skip where that is not allowed."""
     inner = f'mount -t tmpfs {mounting} tmpfs "$0" && exec "$@"'
     words = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
     folder.mkdir(exist_ok=True)
@@ -39,12 +38,12 @@ def on_disk(folder, mounting, command):
         shutil.which("unshare") is None
         or subprocess.run([*words, inner, str(folder), "true"], capture_output=True).returncode
     ):
-        pytest.skip("this system lets nobody mount a disk of his own")
+        pytest.skip("needs permission to mount a disk in a user namespace")
     return subprocess.run([*words, inner, str(folder), *command], capture_output=True, text=True)
 
 
 @pytest.mark.parametrize("size", ["100k", "700k", "1500k"])
-def test_a_full_disk_is_one_sentence(photos, tmp_path, size):
+def test_full_disk_gives_one_error_sentence(photos, tmp_path, size):
     disk = tmp_path / "disk"
     done = on_disk(disk, f"-o size={size}", [*CAPTURE, photos, "-o", disk / "scene"])
     last = done.stderr.replace("\r", "\n").strip().splitlines()[-1]
@@ -52,7 +51,7 @@ def test_a_full_disk_is_one_sentence(photos, tmp_path, size):
     assert "Traceback" not in done.stderr and "left out" not in done.stderr
 
 
-def test_a_folder_that_cannot_be_written(photos, tmp_path):
+def test_read_only_folder_gives_one_error_sentence(photos, tmp_path):
     disk = tmp_path / "disk"
     done = on_disk(disk, "-o ro", [*CAPTURE, photos, "-o", disk / "scene"])
     assert done.returncode == 2 and "no permission" in done.stderr
@@ -64,57 +63,55 @@ def test_a_folder_that_cannot_be_written(photos, tmp_path):
     assert done.returncode == 2 and "is a file" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("how", "status"), [(signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 143)]
-)
-def test_killed_in_the_middle_and_run_again(tmp_path, how, status):
-    photos = some_photos(tmp_path / "photos", 14)
+def test_capture_resumes_after_signals(tmp_path):
+    photos = street_photos(tmp_path / "photos", 14)
     command = [*CAPTURE, str(photos), "-o", str(tmp_path / "scene")]
     database = tmp_path / "scene" / "work" / "database.db"
-    process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        # Where the tests themselves run in the background Ctrl-C is ignored, and that is inherited.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    for _ in range(600):
-        if database.exists():  # features are being looked for, six photos at a time
-            break
-        time.sleep(0.05)
-    process.send_signal(how)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == status and "Traceback" not in told
-    assert ("climatenerf: interrupted" in told) == (how != signal.SIGKILL)
-    for _ in range(100):
-        if not others(tmp_path):
-            break
-        time.sleep(0.1)
-    assert not others(tmp_path), "the worker ends with the process that began it"
-    assert not (tmp_path / "scene" / "scene.json").exists()
+    for number, status in ((signal.SIGKILL, -9), (signal.SIGINT, 130), (signal.SIGTERM, 143)):
+        process = subprocess.Popen(
+            command,
+            stderr=subprocess.PIPE,
+            text=True,
+            # Background processes ignore Ctrl-C, and their children inherit that.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        for _ in range(600):
+            if database.exists() and workers(tmp_path):  # features are being extracted
+                break
+            time.sleep(0.05)
+        process.send_signal(number)
+        _, output = process.communicate(timeout=60)
+        assert process.returncode == status and "Traceback" not in output
+        assert ("climatenerf: interrupted" in output) == (number != signal.SIGKILL)
+        for _ in range(100):
+            if not workers(tmp_path):
+                break
+            time.sleep(0.1)
+        assert not workers(tmp_path), "the worker ends with its parent"
+        assert not (tmp_path / "scene" / "scene.json").exists()
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode in (0, 2) and "Traceback" not in done.stderr
-    # These photos of the street may or may not make a place; that is the mapper's to say.
+    # Whether the mapper finds a model for these photos is not tested here.
     assert done.returncode == 0 or "fit together" in done.stderr
 
 
-def others(folder):
-    """Workers that are still at work in a folder."""
+def workers(folder):
+    """Return the running worker processes of captures below a folder."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cwd"):
         try:
-            words = path.with_name("cmdline").read_bytes()
+            command = path.with_name("cmdline").read_bytes()
             opened = [os.readlink(fd) for fd in path.with_name("fd").iterdir()]
         except OSError:
             continue
-        if b"climatenerf.sfm.worker" in words and any(str(folder) in name for name in opened):
+        if b"climatenerf.sfm.worker" in command and any(str(folder) in name for name in opened):
             found.append(path)
     return found
 
 
 @pytest.mark.slow
-def test_a_photo_of_200_megapixels(tmp_path):
-    """Of noise, so that it is no easy one; decoding it may take memory, but not many times over."""
+def test_photo_of_200_megapixels(tmp_path):
+    """Noise compresses badly; decoding must not copy the full picture several times."""
     from climatenerf.sfm.photo_import import MAX_SIDE, import_photos
 
     (tmp_path / "in").mkdir()

@@ -1,34 +1,24 @@
-"""Poses that are there already, through the command line: the embedded street as COLMAP text."""
+"""Import of an existing COLMAP model through the command line: the embedded street as text."""
 
 import shutil
-from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.command_line import STREET, run_cli
 from support.photo_builders import exif
 
-from climatenerf import cli
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.export import export_colmap
 from climatenerf.scene.images import load_labels
 
-STREET = Path(str(files("climatenerf") / "assets" / "street"))
 HOME = (47.3769, 8.5417)
-LAT_M, LON_M = 111177.0, 75520.0  # m per degree there
-
-
-def status(*words):
-    try:
-        return cli.main([str(word) for word in words])
-    except SystemExit as left:
-        return left.code
+LAT_M, LON_M = 111177.0, 75520.0  # m per degree at HOME
 
 
 @pytest.fixture(scope="module")
 def posed(tmp_path_factory):
-    """Twelve photos with GPS and gravity, of which the model knows all but the last."""
+    """Twelve photos with GPS and gravity; the model contains all but the last."""
     truth = read_scene(STREET, holdout="0")
     root = tmp_path_factory.mktemp("posed")
     export_colmap(truth, root)
@@ -41,7 +31,7 @@ def posed(tmp_path_factory):
         x, y, z = pose[:3, 3]
         g = pose[:3, :3].T @ np.array([0, 0, -1.0])
         data = exif(
-            place=(HOME[0] + 2 * y / LAT_M, HOME[1] + 2 * x / LON_M, z),
+            gps=(HOME[0] + 2 * y / LAT_M, HOME[1] + 2 * x / LON_M, z),
             gravity=(-g[1], -g[0], -g[2]),
             camera=("Apple", "iPhone 12"),
         )
@@ -51,48 +41,50 @@ def posed(tmp_path_factory):
     return truth, root
 
 
-def test_a_model_its_photos_and_their_labels_become_a_scene(posed, tmp_path, capsys):
+def test_model_photos_and_labels_become_a_scene(posed, tmp_path, capsys):
     truth, root = posed
     labels = STREET / "labels"
     out = tmp_path / "scene"
     words = ("capture", root / "photos", "--from-colmap", root, "-o", out, "--labels", labels)
-    assert status(*words) == 0
-    told = capsys.readouterr()
-    assert "11 of 12 pictures have poses" in told.out
-    assert "the COLMAP model has no pose for it" in told.err
+    assert run_cli(*words) == 0
+    output = capsys.readouterr()
+    assert "11 of 12 pictures have poses" in output.out
+    assert "it is not in the COLMAP model" in output.err
     scene = load_scene(out)
     assert len(scene.views) == 11 and scene.scale_source == "gps"
     by_name = {view.name: view for view in truth.views}
     for view in scene.views:
         # GPS was written for a street twice as large.
-        own, true = scene.c2w_world(view), truth.c2w_world(by_name[view.name])
-        np.testing.assert_allclose(own[:2, 3], 2 * true[:2, 3] + offset(scene, truth), atol=0.06)
+        estimated, true = scene.c2w_world(view), truth.c2w_world(by_name[view.name])
+        np.testing.assert_allclose(
+            estimated[:2, 3], 2 * true[:2, 3] + offset(scene, truth), atol=0.06
+        )
         assert view.path.read_bytes() == (root / "photos" / view.name).read_bytes()
         found, given = load_labels(view, scene), load_labels(by_name[view.name], truth)
         np.testing.assert_array_equal(found, given)
     assert scene.up_report["gravity"] < 1 and "gravity" in scene.up_report["used"]
     up = scene.world_from_input[2, :3] / scene.scale
     assert np.degrees(np.arccos(up[2])) < 1
-    assert "not known" in (out / "report.md").read_text()
-    # A scene folder of its own: the photos may go.
-    assert status("export", out, "-o", tmp_path / "out") == 0
+    assert "Reprojection error: unknown" in (out / "report.md").read_text()
+    # The scene folder is self-contained.
+    assert run_cli("export", out, "-o", tmp_path / "out") == 0
 
 
 def offset(scene, truth):
-    """The origin of GPS's frame in the street's, doubled: the median place of the photos."""
+    """Offset from the doubled street to the GPS frame, whose origin is the median position."""
     return -np.array([
         (scene.georeference["longitude"] - HOME[1]) * LON_M,
         (scene.georeference["latitude"] - HOME[0]) * LAT_M,
     ])  # fmt: skip
 
 
-def test_a_second_run_may_bring_labels_later(posed, tmp_path):
+def test_labels_can_be_added_in_a_second_run(posed, tmp_path):
     _, root = posed
     out = tmp_path / "scene"
     words = ("capture", root / "photos", "--from-colmap", root / "sparse", "-o", out)
-    assert status(*words) == 0
+    assert run_cli(*words) == 0
     assert all(view.label_path is None for view in load_scene(out).views)
-    assert status(*words, "--labels", STREET / "labels") == 0
+    assert run_cli(*words, "--labels", STREET / "labels") == 0
     assert all(view.label_path is not None for view in load_scene(out).views)
 
 
@@ -104,33 +96,33 @@ def test_a_second_run_may_bring_labels_later(posed, tmp_path):
         (lambda root, here: (root, root / "photos" / "none.jpg"), "does not exist"),
     ],
 )
-def test_what_does_not_fit_together(posed, tmp_path, capsys, change, words):
+def test_mismatched_inputs_give_one_error_sentence(posed, tmp_path, capsys, change, words):
     _, root = posed
     (tmp_path / "photos").mkdir()
     (tmp_path / "no-model").mkdir()
     model, photos = change(root, tmp_path)
     out = tmp_path / "scene"
-    assert status("capture", photos, "--from-colmap", model, "-o", out) == 2
-    told = capsys.readouterr().err
-    assert words in told and "Traceback" not in told
+    assert run_cli("capture", photos, "--from-colmap", model, "-o", out) == 2
+    output = capsys.readouterr().err
+    assert words in output and "Traceback" not in output
     assert not (out / "scene.json").exists()
 
 
-def test_photos_in_place_are_not_removed(posed, tmp_path, capsys):
+def test_photos_in_the_output_folder_are_not_removed(posed, tmp_path, capsys):
     _, root = posed
     mine = tmp_path / "mine"
     shutil.copytree(root / "photos", mine / "images")
     shutil.copytree(root / "sparse", mine / "sparse")
     before = sorted(p.name for p in mine.rglob("*"))
     for photos, out in ((mine / "images", mine), (mine, mine), (mine / "images", mine / "images")):
-        assert status("capture", photos, "--from-colmap", mine, "-o", out) == 2
+        assert run_cli("capture", photos, "--from-colmap", mine, "-o", out) == 2
         assert "another folder" in capsys.readouterr().err
         assert sorted(p.name for p in mine.rglob("*")) == before
 
 
-def test_flags_that_name_no_folder(posed, tmp_path, capsys):
+def test_sidecar_flags_need_existing_folders(posed, tmp_path, capsys):
     _, root = posed
     words = ("capture", root / "photos", "--from-colmap", root, "-o", tmp_path / "scene")
     for kind in ("labels", "masks", "depth"):
-        assert status(*words, f"--{kind}", tmp_path / "absent") == 2
+        assert run_cli(*words, f"--{kind}", tmp_path / "absent") == 2
         assert f"--{kind}" in capsys.readouterr().err

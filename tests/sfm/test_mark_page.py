@@ -1,4 +1,4 @@
-"""The page on which known lengths are marked, in a real browser where there is one."""
+"""The page for marking known lengths, in a browser if one is installed."""
 
 import html
 import re
@@ -38,7 +38,7 @@ addEventListener("load", () => {
 
 @pytest.fixture
 def page(tmp_path):
-    # Wider than the window, and one with a tag that would turn it.
+    # One picture wider than the window, and one with an EXIF orientation.
     photo(tmp_path / "images" / "wide one.jpg", (2000, 1000))
     photo(tmp_path / "images" / "tagged.jpg", (400, 200), exif(6))
     camera = Camera(2000, 1000, 900, 900, 1000, 500), Camera(400, 200, 300, 300, 200, 100)
@@ -50,15 +50,15 @@ def page(tmp_path):
     return tmp_path / "mark.html"
 
 
-def test_names_do_not_end_the_script(tmp_path):
+def test_file_names_cannot_end_the_script(tmp_path):
     view = View("</script>.jpg", tmp_path / "images" / "</script>.jpg", 0, np.eye(4))
     scene = Scene(tmp_path, "test", (Camera(4, 4, 4, 4, 2, 2),), (view,))
     write_mark_page(tmp_path / "mark.html", scene)
     assert (tmp_path / "mark.html").read_text().count("</script>") == 1
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page in")
-def test_clicks_become_marks_in_the_pictures_own_pixels(page, tmp_path):
+@pytest.mark.skipif(BROWSER is None, reason="needs Chromium")
+def test_clicks_become_marks_in_stored_pixels(page, tmp_path):
     page.write_text(page.read_text() + CLICKS)
     command = [
         BROWSER,
@@ -80,6 +80,8 @@ def test_clicks_become_marks_in_the_pictures_own_pixels(page, tmp_path):
     assert marks["from"]["wide one.jpg"] == pytest.approx((500, 500), abs=3)
     assert marks["to"]["wide one.jpg"] == pytest.approx((1500, 500), abs=3)
     assert marks["from"]["tagged.jpg"] == pytest.approx((200, 100), abs=3), "pixels as stored"
-    assert marks["to"]["tagged.jpg"] == pytest.approx((200, 50), abs=3), "the last click counts"
+    assert marks["to"]["tagged.jpg"] == pytest.approx((200, 50), abs=3), (
+        "the last click replaces earlier ones"
+    )
     assert '["A \\"b\\"".to]' in toml
-    assert done.stdout.count("<span") == 5, "a dot for each mark"
+    assert done.stdout.count("<span") == 5, "one dot per mark"

@@ -1,4 +1,5 @@
-import json
+"""Import of photos and videos: orientation, formats, damaged files, reuse and pairs to match."""
+
 import shutil
 import subprocess
 from pathlib import Path
@@ -19,7 +20,7 @@ from climatenerf.sfm.reconstruct import (
 )
 
 
-def quiet(*_):
+def no_progress(*_):
     pass
 
 
@@ -28,8 +29,8 @@ def fill(folder, count=4):
         photo(folder / f"{i}.jpg", seed=i)
 
 
-# Stored pixels so that the picture as shown has its red block at the upper left.
-TURN = {
+# Transpose from the picture as shown to the stored pixels.
+STORED = {
     1: None,
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -42,21 +43,21 @@ TURN = {
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pictures_stand_as_they_are_meant_to_be_seen(tmp_path, orientation):
+def test_pictures_are_upright(tmp_path, orientation):
     fill(tmp_path / "in", 3)
     shown = photo(tmp_path / "x.png", (80, 48))
-    stored = shown if TURN[orientation] is None else shown.transpose(TURN[orientation])
-    stored.save(tmp_path / "in" / "turned.jpg", quality=98, exif=exif(orientation))
-    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    one = next(p for p in taken.pictures if p.source == "turned.jpg")
+    stored = shown if STORED[orientation] is None else shown.transpose(STORED[orientation])
+    stored.save(tmp_path / "in" / "rotated.jpg", quality=98, exif=exif(orientation))
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    one = next(p for p in imported.pictures if p.source == "rotated.jpg")
     assert (one.width, one.height) == (80, 48)
-    image = Image.open(taken.folder / one.name)
+    image = Image.open(imported.folder / one.name)
     assert image.getexif().get(0x0112, 1) == 1
     r, g, _ = image.getpixel((4, 4))
     assert r > 200 and g < 60
 
 
-def test_all_kinds_and_sizes_and_what_shares_a_camera(tmp_path, monkeypatch):
+def test_formats_sizes_and_camera_groups(tmp_path, monkeypatch):
     folder = tmp_path / "in"
     photo(folder / "a.jpg", (400, 300), exif(equivalent=26))
     photo(folder / "b.jpg", (400, 300), exif(equivalent=26), seed=1)
@@ -67,12 +68,12 @@ def test_all_kinds_and_sizes_and_what_shares_a_camera(tmp_path, monkeypatch):
     (folder / "notes.txt").write_text("not a photo")
     photo(folder / ".thumbnails" / "a.jpg")
     monkeypatch.chdir(folder / "sub")
-    taken = import_photos(Path(".."), tmp_path / "work", quiet)
-    assert [p.source for p in taken.pictures] == [
+    imported = import_photos(Path(".."), tmp_path / "work", no_progress)
+    assert [p.source for p in imported.pictures] == [
         "a.jpg", "b.jpg", "c.jpg", "grey.png", "sub/a.png", "wide.webp",
     ]  # fmt: skip
-    assert len({p.name for p in taken.pictures}) == 6
-    assert sorted(len(group) for group in camera_groups(taken.pictures)) == [1, 1, 1, 1, 2]
+    assert len({p.name for p in imported.pictures}) == 6
+    assert sorted(len(group) for group in camera_groups(imported.pictures)) == [1, 1, 1, 1, 2]
 
 
 def test_heic(tmp_path):
@@ -80,78 +81,77 @@ def test_heic(tmp_path):
     pi_heif.register_heif_opener()
     fill(tmp_path / "in", 3)
     (tmp_path / "in" / "bad.heic").write_bytes(b"\x00" * 100)
-    # Stored lying, with a tag that turns it and a phone's EXIF: written by pillow-heif 1.4.
+    # Stored rotated, with an orientation and a phone's EXIF; written by pillow-heif 1.4.
     shutil.copy(Path(__file__).with_name("upright.heic"), tmp_path / "in")
-    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    assert len(taken.pictures) == 4 and "bad.heic" in taken.unusable
-    one = next(p for p in taken.pictures if p.source == "upright.heic")
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    assert len(imported.pictures) == 4 and "bad.heic" in imported.unusable
+    one = next(p for p in imported.pictures if p.source == "upright.heic")
     assert (one.width, one.height) == (48, 64) and one.exif.camera == "Apple iPhone 12"
     assert one.exif.focal == pytest.approx(26 / 43.2666 * 80 / 64, rel=1e-3)
     assert one.exif.gps == pytest.approx((47.3769, 8.5417, 410))
     assert one.exif.down_as_shown == pytest.approx((0.08, 0.87, 0.48), abs=0.02)
-    r, g, _ = Image.open(taken.folder / one.name).getpixel((4, 4))
+    r, g, _ = Image.open(imported.folder / one.name).getpixel((4, 4))
     assert r > 200 and g < 60, "the red block is at the upper left"
-    again = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    assert again.pictures == taken.pictures, "the record keeps all of it"
+    again = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    assert again.pictures == imported.pictures, "the record stores all fields"
 
 
-def test_what_is_no_picture_is_left_out_with_the_reason(tmp_path):
+def test_unusable_files_are_skipped_with_a_reason(tmp_path):
     fill(tmp_path / "in")
     (tmp_path / "in" / "text.png").write_text("I am a text file\n" * 50)
     (tmp_path / "in" / "empty.jpg").write_bytes(b"")
     whole = (tmp_path / "in" / "0.jpg").read_bytes()
     (tmp_path / "in" / "cut.jpg").write_bytes(whole[: len(whole) // 2])
-    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    assert len(taken.pictures) == 4
-    assert set(taken.unusable) == {"text.png", "empty.jpg", "cut.jpg"}
-    assert "empty" in taken.unusable["empty.jpg"]
-    assert "is no picture" in taken.unusable["text.png"]
-    assert "damaged or cut off" in taken.unusable["cut.jpg"]
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    assert len(imported.pictures) == 4
+    assert set(imported.unusable) == {"text.png", "empty.jpg", "cut.jpg"}
+    assert "empty" in imported.unusable["empty.jpg"]
+    assert "is not a picture" in imported.unusable["text.png"]
+    assert "damaged or cut off" in imported.unusable["cut.jpg"]
     (tmp_path / "in" / "gone.jpg").symlink_to("nowhere")
     (tmp_path / "in" / "folder.jpg").mkdir()
-    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    assert "link to a file that is not there" in taken.unusable["gone.jpg"]
-    for words in taken.unusable.values():
-        assert "<" not in words and "Errno" not in words
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    assert "link to a file that does not exist" in imported.unusable["gone.jpg"]
+    for message in imported.unusable.values():
+        assert "<" not in message and "Errno" not in message
 
 
-@pytest.mark.parametrize("count", [0, 2])
-def test_too_few(tmp_path, count):
-    (tmp_path / "in").mkdir()
-    fill(tmp_path / "in", count)
-    with pytest.raises(UserError, match="no photos" if count == 0 else "2 usable"):
-        import_photos(tmp_path / "in", tmp_path / "work", quiet)
+def test_too_few_usable_pictures_name_the_cause(tmp_path):
+    fill(tmp_path / "in", 2)
+    (tmp_path / "in" / "empty.jpg").write_bytes(b"")
+    with pytest.raises(UserError, match="2 usable .*; unusable: empty.jpg is empty"):
+        import_photos(tmp_path / "in", tmp_path / "work", no_progress)
 
 
-def test_large_pictures_are_made_smaller_and_huge_ones_refused(tmp_path, monkeypatch):
+def test_large_pictures_are_reduced_and_huge_ones_refused(tmp_path, monkeypatch):
     fill(tmp_path / "in", 3)
     monkeypatch.setattr(module, "MAX_SIDE", 100)
     monkeypatch.setattr(module, "MAX_PIXELS", 100_000)
     photo(tmp_path / "in" / "large.jpg", (300, 150))
     photo(tmp_path / "in" / "huge.png", (600, 400))
-    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    large = next(p for p in taken.pictures if p.source == "large.jpg")
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    large = next(p for p in imported.pictures if p.source == "large.jpg")
     assert (large.width, large.height) == (100, 50)
-    assert "600x400" in taken.unusable["huge.png"] or "exceeds" in taken.unusable["huge.png"]
+    assert "600x400" in imported.unusable["huge.png"] or "exceeds" in imported.unusable["huge.png"]
 
 
-def test_a_second_run_reads_nothing_again_but_what_changed(tmp_path, monkeypatch):
+def test_second_run_reads_only_changed_files(tmp_path, monkeypatch):
     fill(tmp_path / "in")
-    first = import_photos(tmp_path / "in", tmp_path / "work", quiet)
+    first = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
     opened = []
     original = module.open_upright
     monkeypatch.setattr(module, "open_upright", lambda p: opened.append(p.name) or original(p))
-    assert import_photos(tmp_path / "in", tmp_path / "work", quiet).pictures == first.pictures
+    assert import_photos(tmp_path / "in", tmp_path / "work", no_progress).pictures == first.pictures
     assert not opened
     photo(tmp_path / "in" / "2.jpg", (48, 64), seed=9)
     record = first.folder / "1.json"
     record.write_text(record.read_text()[:20])  # killed while writing
-    again = import_photos(tmp_path / "in", tmp_path / "work", quiet)
+    again = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
     assert opened == ["1.jpg", "2.jpg"]
     assert (again.pictures[2].width, again.pictures[2].height) == (48, 64)
 
 
-def test_blur_shows_in_the_sharpness():
+def test_blur_reduces_sharpness():
     rng = np.random.default_rng(0)
     sharp = Image.fromarray(rng.integers(0, 255, (480, 640, 3), dtype=np.uint8))
     soft = sharp.resize((160, 120)).resize((640, 480))
@@ -178,36 +178,29 @@ def video(tmp_path):
     return path
 
 
-def test_the_sharpest_frame_of_each_interval(video, tmp_path, monkeypatch):
+def test_sharpest_frame_of_each_interval_is_used(video, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "VIDEO_FRAMES", 6)
-    taken = import_photos(video, tmp_path / "work", quiet)
-    assert taken.is_video and 5 <= len(taken.pictures) <= 7
-    sharp = [p.sharpness for p in taken.pictures]
-    assert min(sharp) > 0.5 * max(sharp), "no blurred one was taken"
+    imported = import_photos(video, tmp_path / "work", no_progress)
+    assert imported.is_video and 5 <= len(imported.pictures) <= 7
+    sharp = [p.sharpness for p in imported.pictures]
+    assert min(sharp) > 0.5 * max(sharp), "no blurred frame"
     stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "work" / "frames").glob("*.jpg")}
-    import_photos(video, tmp_path / "work", quiet)
-    assert stamps == {p: p.stat().st_mtime_ns for p in stamps}, "frames are kept"
+    import_photos(video, tmp_path / "work", no_progress)
+    assert stamps == {p: p.stat().st_mtime_ns for p in stamps}, "frames are reused"
 
 
-def test_a_video_that_cannot_be_decoded(tmp_path):
+def test_unusable_sources_name_a_remedy(tmp_path):
     (tmp_path / "bad.mp4").write_bytes(b"not a video" * 100)
     with pytest.raises(UserError, match="cannot be decoded"):
-        import_photos(tmp_path / "bad.mp4", tmp_path / "work", quiet)
+        import_photos(tmp_path / "bad.mp4", tmp_path / "work", no_progress)
     (tmp_path / "song.mp3").write_bytes(b"x")
     with pytest.raises(UserError, match="neither .*; give the folder"):
-        import_photos(tmp_path / "song.mp3", tmp_path / "work", quiet)
+        import_photos(tmp_path / "song.mp3", tmp_path / "work", no_progress)
     with pytest.raises(UserError, match="does not exist"):
-        import_photos(tmp_path / "absent", tmp_path / "work", quiet)
+        import_photos(tmp_path / "absent", tmp_path / "work", no_progress)
 
 
-def test_records_are_plain_json(tmp_path):
-    fill(tmp_path / "in", 3)
-    taken = import_photos(tmp_path / "in", tmp_path / "work", quiet)
-    record = json.loads((taken.folder / "0.json").read_text())
-    assert record["source"] == "0.jpg" and record["width"] == 64
-
-
-def test_which_pictures_are_compared():
+def test_pairs_to_match():
     assert len(image_pairs(20, False)) == 190
     assert (
         len(image_pairs(EXHAUSTIVE_UP_TO, False)) == EXHAUSTIVE_UP_TO * (EXHAUSTIVE_UP_TO - 1) / 2
@@ -218,18 +211,10 @@ def test_which_pictures_are_compared():
         assert len(pairs) < 0.5 * n * (n - 1) / 2
         for i in range(n - 1):
             assert (i, i + 1) in pairs
-        assert (0, n // 10 * 10 - 10) in pairs, "a loop from the end to the start is seen"
+        assert (0, n // 10 * 10 - 10) in pairs, "a loop closure from end to start"
 
 
-def test_a_scene_among_the_photos_is_not_taken_for_photos(tmp_path):
-    fill(tmp_path / "in", 3)
-    work = tmp_path / "in" / "scene" / "work"
-    import_photos(tmp_path / "in", work, quiet)
-    photo(tmp_path / "in" / "scene" / "images" / "x.jpg")
-    assert len(import_photos(tmp_path / "in", work, quiet).pictures) == 3
-
-
-def test_pictures_without_pose_get_a_second_chance():
+def test_pictures_without_pose_are_matched_again():
     assert retry_pairs([True, False, True], [(0, 1)]) == [(1, 2)]
     assert retry_pairs([True, True, True], [(0, 1)]) == []
     assert retry_pairs([True, False, True], image_pairs(3, False)) == []
@@ -239,8 +224,8 @@ def test_pictures_without_pose_get_a_second_chance():
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", ["jpg", "webp", "tif"])
-def test_odd_exif_is_no_reason_to_fail(tmp_path, kind):
-    """Bytes of the EXIF block changed at random: the photo is read, or left out with a reason."""
+def test_damaged_exif_does_not_fail(tmp_path, kind):
+    """Random bytes of the EXIF block are changed: the photo is read, or skipped with a reason."""
     data = exif(6, 4.2, 26, (47.0, 8.0, 400.0), gravity=(0.0, -1.0, 0.0), lens="back")
     photo(tmp_path / f"whole.{kind}", (40, 30), data)
     whole = bytearray((tmp_path / f"whole.{kind}").read_bytes())
@@ -260,14 +245,14 @@ def test_odd_exif_is_no_reason_to_fail(tmp_path, kind):
 
 @pytest.mark.parametrize("mode", ["RGB", "L", "RGBA", "CMYK", "I;16", "P"])
 @pytest.mark.parametrize("kind", ["tif", "png", "jpg"])
-def test_pictures_of_every_mode_are_turned_once(tmp_path, kind, mode):
+def test_pictures_of_every_mode_are_rotated_once(tmp_path, kind, mode):
     if kind == "jpg" and mode in ("RGBA", "I;16", "P"):
-        pytest.skip("JPEG knows no such mode")
+        pytest.skip("JPEG does not support this mode")
     if kind == "png" and mode == "CMYK":
-        pytest.skip("PNG knows no such mode")
+        pytest.skip("PNG does not support this mode")
     bright = 60000 if mode == "I;16" else 230
     values = np.zeros((30, 40), np.uint16 if mode == "I;16" else np.uint8)
-    values[:10, :10] = bright  # upper left as stored: upper right when turned by tag 6
+    values[:10, :10] = bright  # upper left as stored: upper right with orientation 6
     image = Image.fromarray(values)
     image = image if mode == "I;16" else image.convert(mode)
     data = Image.Exif()

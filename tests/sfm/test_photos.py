@@ -1,4 +1,4 @@
-"""Which pictures below a folder count as the user's photos."""
+"""Search for the user's photos below a folder."""
 
 import pytest
 from support.photo_builders import photo
@@ -20,28 +20,28 @@ def folder(tmp_path):
 
 
 @pytest.mark.parametrize("mark", ["scene.json", RECORD, f"work/{OLD_RECORD}"])
-def test_pictures_of_another_scene_are_no_photos(folder, mark):
+def test_pictures_of_scene_folders_are_skipped(folder, mark):
     scene = folder / "more" / "scene"
     photo(scene / "images" / "a.jpg")
     photo(scene / "work" / "pictures" / "a.jpg")
     (scene / mark).write_text("{}")
     found = find_photos(folder, [])
     assert names(found) == ["0.jpg", "1.jpg", "2.jpg"]
-    assert found.notes == ("Scenes among the photos are left out: more/scene.",)
-    assert find_photos(folder, [scene]).notes == (), "of the one that is made nothing is said"
+    assert found.notes == ("Scene folders among the photos are skipped: more/scene.",)
+    assert find_photos(folder, [scene]).notes == (), "no note about an excluded scene"
 
 
-def test_a_scene_that_is_given_itself(folder):
+def test_photos_of_a_scene_folder_are_its_images(folder):
     for i in range(3):
         photo(folder / "images" / f"{i}.jpg")
         photo(folder / "work" / "pictures" / f"{i}.jpg")
     (folder / "scene.json").write_text("{}")
     found = find_photos(folder, [])
     assert found.folder == folder / "images" and names(found) == ["0.jpg", "1.jpg", "2.jpg"]
-    assert len(found.notes) == 1 and "is a scene" in found.notes[0]
+    assert len(found.notes) == 1 and "is a scene folder" in found.notes[0]
 
 
-def test_labels_beside_images_are_no_photos(tmp_path):
+def test_sidecar_folders_beside_images_are_skipped(tmp_path):
     for kind in ("images", "labels", "masks", "depth"):
         for i in range(3):
             photo(tmp_path / "in" / kind / f"{i}.png")
@@ -53,13 +53,13 @@ def test_labels_beside_images_are_no_photos(tmp_path):
     assert find_photos(tmp_path / "in", given).notes == ()
 
 
-def test_what_is_given_for_labels_is_no_photo_wherever_it_lies(folder):
+def test_excluded_folders_are_skipped(folder):
     photo(folder / "classes" / "0.png")
     assert len(find_photos(folder, [folder / "classes"]).files) == 3
     assert len(find_photos(folder, []).files) == 4
 
 
-def test_links_that_lead_in_a_circle(folder, tmp_path):
+def test_circular_links_are_visited_once(folder, tmp_path):
     (folder / "loop").symlink_to(".")
     (folder / "sub").mkdir()
     (folder / "sub" / "up").symlink_to("..")
@@ -70,9 +70,9 @@ def test_links_that_lead_in_a_circle(folder, tmp_path):
     assert names(find_photos(folder, [])) == ["0.jpg", "1.jpg", "2.jpg", "a/0.jpg", "a/1.jpg"]
 
 
-def test_none_and_too_few_with_a_remedy(tmp_path):
+def test_too_few_photos_name_a_remedy(tmp_path):
     (tmp_path / "in").mkdir()
-    with pytest.raises(UserError, match="holds no photos .*; give the folder that has them"):
+    with pytest.raises(UserError, match="contains no photos .*; give the folder with photos"):
         find_photos(tmp_path / "in", [])
     (tmp_path / "in" / "walk.mp4").write_bytes(b"x")
     with pytest.raises(UserError, match="give the video itself, such as .*walk.mp4"):

@@ -1,3 +1,5 @@
+"""Coverage of ground and sky, and the text and plot of the report."""
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -27,7 +29,7 @@ def scene_of(poses, tmp_path, focal=50.0):
     return Scene(tmp_path, "test", (camera,), views, points, up_report={"used": "lines"})
 
 
-def test_sky_that_a_picture_looks_at(tmp_path):
+def test_sky_coverage_is_a_solid_angle(tmp_path):
     # Straight up with half angle 45 degrees: 1 - cos of a square cone; bounds of its circles.
     seen = sky_coverage(scene_of([look((0, 0, 1))], tmp_path))
     total = 1 - np.sin(np.radians(10))
@@ -38,9 +40,9 @@ def test_sky_that_a_picture_looks_at(tmp_path):
     assert sky_coverage(scene_of([look((0, 0, -1))], tmp_path)) == 0
 
 
-def test_ground_that_three_pictures_look_at(tmp_path):
+def test_ground_coverage_needs_three_views(tmp_path):
     down = [look((0, 0.01, -1), (x, 0, 1.6)) for x in (0, 0.1, 0.2)]
-    # Each sees a square of 3.2 m; asked for is a disc of 8 m.
+    # Each shows a square of 3.2 m; coverage is measured on a disc of radius 8 m.
     assert ground_coverage(scene_of(down, tmp_path)) == pytest.approx(
         3.2 * 3.0 / (np.pi * 8**2), rel=0.25
     )
@@ -48,21 +50,18 @@ def test_ground_that_three_pictures_look_at(tmp_path):
     assert ground_coverage(scene_of([look((0, 0.1, 1))] * 4, tmp_path)) == 0
 
 
-def test_the_report_names_what_to_do(tmp_path):
+def test_report_names_remedies(tmp_path):
     scene = scene_of([look((0, 1, -0.1), (x, 0, 1.6)) for x in range(5)], tmp_path)
     pictures = tuple(Picture(f"{i}.jpg", f"{i}.jpg", 100, 100, Exif(), 1.0, 0.5) for i in range(6))
     imported = PhotoImport(tmp_path, pictures, {"bad.png": "bad.png is empty"}, False)
     model = Model({}, tuple(v.name for v in scene.views), (5, 3), 0.71, 200)
-    unposed = [
-        Unposed(
-            "5.jpg", "5.jpg", "blurred (9% of the usual detail)", "take it again", (("4.jpg", 12),)
-        )
-    ]
+    reason = "blurred (9% of the usual detail)"
+    unposed = [Unposed("5.jpg", "5.jpg", reason, "take it again", (("4.jpg", 12),))]
     text, picture = write_report(tmp_path, scene, imported, model, unposed)
-    words = text.read_text()
-    assert "5 of 6" in words and "0.71 px" in words and "5, 3" in words
+    report = text.read_text()
+    assert "5 of 6" in report and "0.71 px" in report and "5, 3" in report
     row = "| 5.jpg | blurred (9% of the usual detail) | take it again | 4.jpg (12) |"
-    assert row in words
-    assert "bad.png is empty" in words
+    assert row in report
+    assert "bad.png is empty" in report
     pixels = np.asarray(Image.open(picture)).reshape(-1, 3)
     assert (pixels == (200, 40, 30)).all(-1).sum() > 50, "cameras are drawn"

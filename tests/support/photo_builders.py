@@ -1,4 +1,4 @@
-"""Photos with EXIF, written by the tests themselves."""
+"""Build photos with EXIF for tests."""
 
 import struct
 from pathlib import Path
@@ -10,13 +10,14 @@ Base, GPS = ExifTags.Base, ExifTags.GPS
 
 
 def degrees(value: float) -> tuple[float, float, float]:
+    """Return degrees, minutes and seconds of an absolute angle."""
     value = abs(value)
     minutes = (value % 1) * 60
     return float(int(value)), float(int(minutes)), (minutes % 1) * 60
 
 
 def apple_note(vector):
-    """An iPhone's maker note with an acceleration vector, g, behind another entry."""
+    """Return an iPhone's maker note with an acceleration vector in g, behind another entry."""
     entries = struct.pack(">HHII", 1, 9, 1, 14) + struct.pack(">HHII", 8, 10, 3, 14 + 2 + 24 + 4)
     numbers = [part for value in vector for part in (round(value * 10000), 10000)]
     head = b"Apple iOS\0\0\1MM" + struct.pack(">H", 2)
@@ -27,12 +28,22 @@ def exif(
     orientation=1,
     focal=None,
     equivalent=None,
-    place=None,
+    gps=None,
     camera=("Maker", "Model 5"),
     gravity=None,
     lens=None,
 ):
-    """An EXIF block: mm, 35 mm equivalent, (latitude, longitude, altitude), a phone's vector."""
+    """Return an EXIF block.
+
+    Args:
+        orientation: EXIF orientation, 1 to 8.
+        focal: focal length, mm.
+        equivalent: 35 mm equivalent focal length, mm.
+        gps: (latitude deg, longitude deg, altitude m).
+        camera: maker and model.
+        gravity: acceleration vector of an iPhone, g.
+        lens: name of the lens.
+    """
     data = Image.Exif()
     data[Base.Orientation] = orientation
     if camera:
@@ -46,18 +57,18 @@ def exif(
         detail[Base.MakerNote] = apple_note(gravity)
     if lens is not None:
         detail[Base.LensModel] = lens
-    if place is not None:
-        gps = data.get_ifd(ExifTags.IFD.GPSInfo)
-        gps[GPS.GPSLatitudeRef] = "N" if place[0] >= 0 else "S"
-        gps[GPS.GPSLatitude] = degrees(place[0])
-        gps[GPS.GPSLongitudeRef] = "E" if place[1] >= 0 else "W"
-        gps[GPS.GPSLongitude] = degrees(place[1])
-        gps[GPS.GPSAltitude] = place[2]
+    if gps is not None:
+        tags = data.get_ifd(ExifTags.IFD.GPSInfo)
+        tags[GPS.GPSLatitudeRef] = "N" if gps[0] >= 0 else "S"
+        tags[GPS.GPSLatitude] = degrees(gps[0])
+        tags[GPS.GPSLongitudeRef] = "E" if gps[1] >= 0 else "W"
+        tags[GPS.GPSLongitude] = degrees(gps[1])
+        tags[GPS.GPSAltitude] = gps[2]
     return data
 
 
 def photo(path: Path, size=(64, 48), data=None, seed=0, **options) -> Image.Image:
-    """Noise with a red block in the upper left corner as shown, stored as EXIF says."""
+    """Save noise with a red block in the upper left corner; return the image."""
     path.parent.mkdir(parents=True, exist_ok=True)
     pixels = np.random.default_rng(seed).integers(60, 200, (size[1], size[0], 3), dtype=np.uint8)
     image = Image.fromarray(pixels)

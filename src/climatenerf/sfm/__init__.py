@@ -1,1 +1,1 @@
-"""From bare photos or a video to posed pictures: structure from motion with pycolmap."""
+"""Structure from motion with pycolmap: posed pictures from photos or a video."""

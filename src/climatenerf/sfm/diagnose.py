@@ -1,4 +1,4 @@
-"""Why pictures got no pose, and what to do about it."""
+"""Diagnose why pictures have no pose, and suggest a remedy."""
 
 import contextlib
 import sqlite3
@@ -10,15 +10,14 @@ from jaxtyping import Float
 
 from climatenerf.sfm.photo_import import PhotoImport
 
-MIN_MATCHES = 30  # verified ones that a picture needs with a posed one
-BLURRED = 0.08  # of the median sharpness; a sharp picture of plain walls has more
-SOFT = 0.3  # of the median sharpness: blurred, or of a plain subject
-DARK, BRIGHT = 0.08, 0.92  # mean grey value
-MAX_ROTATION_ERROR = (
-    0.02  # deviation from a rotation; a step of a hundredth of the distance makes as much
-)
-MIN_HOMOGRAPHY_FRACTION = 0.9  # of the pairs that one homography explains
-_HOMOGRAPHY_CONFIGS = (4, 5, 6)  # COLMAP's planar, panoramic, and either
+MIN_MATCHES = 30  # verified matches that link two pictures
+MAX_BLURRED = 0.08  # sharpness over its median; sharp pictures of plain walls have more
+MAX_SOFT = 0.3  # sharpness over its median: blurred, or of a subject with little detail
+MIN_BRIGHTNESS, MAX_BRIGHTNESS = 0.08, 0.92  # mean grey value
+# Largest |M M^T - I| of a rotation. A translation by 1 % of the distance gives about as much.
+MAX_ROTATION_ERROR = 0.02
+MIN_HOMOGRAPHY_FRACTION = 0.9  # of the pairs that a single homography must explain
+_HOMOGRAPHY_CONFIGS = (4, 5, 6)  # COLMAP's "planar", "panoramic" and "planar or panoramic"
 _PAIR = 2147483647  # COLMAP numbers the pair (a, b), a < b, as a * _PAIR + b
 
 
@@ -27,11 +26,11 @@ class Unposed:
     """A picture without pose.
 
     Attributes:
-        name: of the picture.
-        source: the file it came from.
-        reason: probable reason, one clause.
+        name: file name of the picture.
+        source: original file.
+        reason: probable cause, one clause.
         remedy: what to photograph again, one clause.
-        neighbours: the pictures that it fits best, with the number of verified matches.
+        neighbours: the best matching pictures, with their numbers of verified matches.
     """
 
     name: str
@@ -42,12 +41,12 @@ class Unposed:
 
 
 def read_only(database: Path) -> sqlite3.Connection:
-    """Opens COLMAP's database without changing it; "#", "?" and "%" in its path are quoted."""
+    """Open COLMAP's database read-only. The URI quotes "#", "?" and "%" in the path."""
     return sqlite3.connect(database.resolve().as_uri() + "?mode=ro", uri=True, timeout=1.0)
 
 
 def verified_matches(database: Path) -> dict[tuple[str, str], int]:
-    """Number of geometrically verified matches of each pair of pictures that has any."""
+    """Return the number of geometrically verified matches of each pair of pictures, if > 0."""
     with contextlib.closing(read_only(database)) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         rows = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0")
@@ -59,7 +58,13 @@ def verified_matches(database: Path) -> dict[tuple[str, str], int]:
 
 
 def diagnose(imported: PhotoImport, registered: tuple[str, ...], database: Path) -> list[Unposed]:
-    """The probable reason for each picture without pose, the likeliest first."""
+    """Return the probable cause for each picture without pose.
+
+    Args:
+        imported: all pictures.
+        registered: names of the pictures with poses.
+        database: COLMAP's database.
+    """
     pairs = verified_matches(database)
     partners: dict[str, list[tuple[str, int]]] = {}
     for (a, b), count in pairs.items():
@@ -76,34 +81,38 @@ def diagnose(imported: PhotoImport, registered: tuple[str, ...], database: Path)
         to_posed = max((n for other, n in best if other in posed), default=0)
         detail = picture.sharpness / max(typical, 1e-9)
         near = f" (best: {sources[best[0][0]]}, {best[0][1]} matches)" if best else ""
-        if picture.brightness < DARK or picture.brightness > BRIGHT:
-            side = "dark" if picture.brightness < DARK else "bright"
-            reason, remedy = f"far too {side}", "take it again with the exposure locked"
-        elif detail < BLURRED:
+        if picture.brightness < MIN_BRIGHTNESS or picture.brightness > MAX_BRIGHTNESS:
+            side = "dark" if picture.brightness < MIN_BRIGHTNESS else "bright"
+            reason, remedy = f"far too {side}", "take it again with locked exposure"
+        elif detail < MAX_BLURRED:
             reason = f"blurred ({detail:.0%} of the usual detail)"
-            remedy = "take it again, holding still"
+            remedy = "take it again with a steady camera"
         elif to_posed >= MIN_MATCHES:
-            reason = f"fits others{near} but its place stays ambiguous"
-            remedy = "take two more from beside it, a step apart"
+            reason = f"it matches others{near}, but its pose is ambiguous"
+            remedy = "take two more beside it, a step apart"
         elif best and best[0][1] >= MIN_MATCHES:
-            reason = f"fits only pictures that are cut off from the rest{near}"
-            remedy = "take pictures that lead from these to the others, two thirds in common"
-        elif detail < SOFT:
+            reason = f"it matches only pictures that are not connected to the rest{near}"
+            remedy = "take pictures between these and the others that overlap by two thirds"
+        elif detail < MAX_SOFT:
             reason = f"few matches{near}; it has {detail:.0%} of the usual detail"
-            remedy = "if it looks blurred take it again, else take pictures that lead to it"
+            remedy = "take it again if it is blurred, else take more pictures around it"
         else:
-            reason = f"too little in common with any other{near}"
-            remedy = "take pictures between it and its neighbours, two thirds in common"
+            reason = f"too little overlap with any other picture{near}"
+            remedy = "take pictures between it and its neighbours that overlap by two thirds"
         unposed.append(Unposed(picture.name, picture.source, reason, remedy, tuple(best)))
     return unposed
 
 
 def is_pure_rotation(imported: PhotoImport, database: Path) -> bool:
-    """Whether the pictures differ by turning the camera alone: then they hold no depth.
+    """Return True if the camera only rotated between the pictures, so that they have no parallax.
 
-    Two such pictures are mapped onto each other by K R K^-1 (Hartley & Zisserman 2004, 8.4.2): with
-    the right focal length what is left of the homography is a rotation. Of a plane seen from two
-    places it never is.
+    The homography between two such pictures is K R K^-1 (Hartley and Zisserman 2004, 8.4.2). With
+    the right focal length, M = K^-1 H K is then a rotation. For a plane seen from two positions it
+    is not a rotation at any focal length.
+
+    Args:
+        imported: all pictures.
+        database: COLMAP's database with verified pairs.
     """
     sizes = {picture.name: (picture.width, picture.height) for picture in imported.pictures}
     with contextlib.closing(read_only(database)) as connection:
@@ -125,7 +134,13 @@ def is_pure_rotation(imported: PhotoImport, database: Path) -> bool:
 def _rotation_errors(
     maps: Float[np.ndarray, "n 3 3"], shapes: Float[np.ndarray, "n 2 2"], focal: float
 ) -> Float[np.ndarray, "n"]:
-    """|M M^T - I| of M = K2^-1 H K1, for a focal length over the longer side."""
+    """Return |M M^T - I| of M = K2^-1 H K1, scaled to determinant 1.
+
+    Args:
+        maps: homographies H from the first to the second picture of each pair, in pixels.
+        shapes: (width, height) of both pictures of each pair, pixels.
+        focal: focal length over the longer side.
+    """
     k = np.zeros((len(shapes), 2, 3, 3))
     k[..., 0, 0] = k[..., 1, 1] = focal * shapes.max(-1)
     k[..., :2, 2], k[..., 2, 2] = shapes / 2, 1.0

@@ -1,4 +1,4 @@
-"""What a photo's EXIF tells of its camera and place."""
+"""Read camera, focal length, GPS position and gravity from a photo's EXIF and XMP."""
 
 import math
 import re
@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 from PIL import ExifTags, Image
 
-FULL_FRAME = math.hypot(36.0, 24.0)  # mm: the 35 mm equivalent keeps the diagonal's angle (CIPA)
+FULL_FRAME = math.hypot(36.0, 24.0)  # mm; CIPA's 35 mm equivalent keeps the diagonal angle
 SUBSECONDS = ExifTags.Base.SubsecTimeOriginal
-MAX_ROLL = 2.0  # degrees of a gimbal: beyond, the camera was being turned
+MAX_ROLL = 2.0  # degrees; a gimbal with a larger roll was moving
 Down = tuple[float, float, float]
-# Where a direction (x right, y down) comes to lie when a picture is turned as EXIF's tag says.
+# A direction (x right, y down) in stored pixels -> the same in the picture as shown, by EXIF tag.
 _ROTATE = {
     1: lambda x, y: (x, y),
     3: lambda x, y: (-x, -y),
@@ -23,16 +23,16 @@ _UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # FocalPlaneResolutionUnit in mm
 
 @dataclass(frozen=True)
 class Exif:
-    """What is known of a photo before any picture is compared.
+    """Metadata of a photo.
 
     Attributes:
-        camera: Words that differ between cameras and lenses; "" if nothing is known.
-        focal: Focal length over the longer side of the picture; None if unknown.
-        gps: (latitude deg, longitude deg, altitude m) ; altitude NaN if unknown.
-        down: Direction of gravity as the camera's own sensor told, unit vector in the axes of the
-            picture as stored (x right, y down, z forward); None if unknown.
-        orientation: How the stored picture is turned to be shown, EXIF's 1 to 8.
-        taken: When, as text that sorts by time; "" if unknown.
+        camera: text that differs between cameras and lenses; "" if unknown.
+        focal: focal length over the longer side of the picture, both in pixels; None if unknown.
+        gps: (latitude deg, longitude deg, altitude m); altitude NaN if unknown.
+        down: direction of gravity from the camera's sensor, unit vector in the axes of the picture
+            as stored (x right, y down, z forward); None if unknown.
+        orientation: EXIF orientation 1 to 8, from the stored picture to the picture as shown.
+        taken: time of exposure as text that sorts by time; "" if unknown.
     """
 
     camera: str = ""
@@ -44,15 +44,15 @@ class Exif:
 
     @property
     def down_as_shown(self) -> tuple[float, float, float] | None:
-        """`down` in the axes of the picture as shown; None for mirrored ones."""
-        turn = _ROTATE.get(self.orientation)
-        if self.down is None or turn is None:
+        """`down` in the axes of the picture as shown; None for mirrored orientations."""
+        rotate = _ROTATE.get(self.orientation)
+        if self.down is None or rotate is None:
             return None
-        return *turn(*self.down[:2]), self.down[2]
+        return *rotate(*self.down[:2]), self.down[2]
 
 
 def read_exif(image: Image.Image) -> Exif:
-    """EXIF of an opened picture; what is absent or nonsense stays unknown."""
+    """Return the EXIF of an opened picture; missing and implausible values are unknown."""
     base = image.getexif()
     detail = base.get_ifd(ExifTags.IFD.Exif)
     words = [base.get(ExifTags.Base.Make), base.get(ExifTags.Base.Model)]
@@ -64,44 +64,47 @@ def read_exif(image: Image.Image) -> Exif:
     orientation = orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
     down = _gimbal_gravity(image.info.get("xmp"))
     if down is None and "front" not in camera.lower():  # selfies are mirrored
-        # A HEIC decoder turns the picture itself, and tells here which tag it obeyed.
+        # A HEIC decoder rotates the picture itself and stores the tag that it applied.
         decoder = image.info.get("original_orientation") or 1
         upright = decoder == orientation == 1 and image.width < image.height
-        # A copy that was stored upright: the sensor's own pictures are wide.
+        # A portrait picture without a tag is an upright copy: the sensor's rows are its long side.
         down = _phone_gravity(detail.get(ExifTags.Base.MakerNote), 6 if upright else decoder)
     words = [detail.get(tag) for tag in (ExifTags.Base.DateTimeOriginal, SUBSECONDS)]
     taken = ".".join(str(word).strip("\0 ") for word in words if word) if words[0] else ""
     found = Exif(camera, _focal(detail, *image.size), gps, down, orientation, taken)
     shown = found.down_as_shown
-    # A picture that would stand on its head has a stale tag: then the axes are not known.
+    # If gravity would point up in the picture, the orientation tag is stale: the axes are unknown.
     return replace(found, down=None) if shown and shown[1] < -0.5 else found
 
 
 def _phone_gravity(note: object, decoder: object) -> Down | None:
-    """Gravity from an iPhone's maker note, tag 8 (ExifTool's AccelerationVector), three numbers, g.
+    """Return gravity from tag 8 of an iPhone's maker note (ExifTool's AccelerationVector, in g).
 
-    They follow Core Motion: x to the right of the screen, y to its top, z out of it, and the
-    vector points down. The sensor lies: its picture's right is the phone's bottom, its lower edge
-    the phone's left.
+    The vector points down, in Core Motion's axes: x to the right of the screen, y to its top, z out
+    of it. The sensor's rows run along the phone: the right of its picture is the bottom of the
+    phone, its lower edge the left side.
 
     Args:
         note: the maker note.
-        decoder: orientation tag by which the picture was turned before it came here.
+        decoder: orientation tag that the decoder has already applied.
+
+    Returns:
+        Unit vector in the axes of the decoded picture; None if the note has no usable vector.
     """
     g = _apple_vector(note)
     if g is None:
         return None
     x, y, z = -g[1], -g[0], -g[2]
-    turn = _ROTATE.get(decoder)  # type: ignore[call-overload]
+    rotate = _ROTATE.get(decoder)  # type: ignore[call-overload]
     length = math.hypot(x, y, z)
-    if turn is None or not 0.9 < length < 1.1:  # a hand that shakes adds to gravity
+    if rotate is None or not 0.9 < length < 1.1:  # motion of the hand adds to gravity
         return None
-    x, y = turn(x, y)
+    x, y = rotate(x, y)
     return x / length, y / length, z / length
 
 
 def _apple_vector(note: object) -> list[float] | None:
-    """Tag 8 of Apple's maker note: a big-endian TIFF directory 14 bytes after its start."""
+    """Return tag 8 of Apple's maker note: a big-endian TIFF directory at byte 14."""
     if not isinstance(note, bytes) or not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
         return None
     try:
@@ -117,7 +120,7 @@ def _apple_vector(note: object) -> list[float] | None:
 
 
 def _gimbal_gravity(xmp: object) -> Down | None:
-    """Gravity from the pitch that a DJI drone's gimbal keeps, where its roll is kept at 0."""
+    """Return gravity from the pitch of a DJI drone's gimbal in the XMP; None if it rolls."""
     if not isinstance(xmp, bytes | str):
         return None
     text = xmp if isinstance(xmp, str) else xmp.decode(errors="replace")
@@ -132,21 +135,22 @@ def _gimbal_gravity(xmp: object) -> Down | None:
 
 
 def _focal(detail: dict, width: int, height: int) -> float | None:
+    """Return the focal length over the longer side; None if unknown or implausible."""
     longer = max(width, height)
     equivalent = _number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     if equivalent:
         return _plausible(equivalent / FULL_FRAME * math.hypot(width, height) / longer)
     focal = _number(detail.get(ExifTags.Base.FocalLength))
-    dense = _number(detail.get(ExifTags.Base.FocalPlaneXResolution))
+    resolution = _number(detail.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _UNITS.get(detail.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
-    if focal and dense and unit:
-        return _plausible(focal * dense / unit / longer)
+    if focal and resolution and unit:
+        return _plausible(focal * resolution / unit / longer)
     return None
 
 
-def _plausible(share: float) -> float | None:
-    """From fisheye (0.2) to a long tele lens (20)."""
-    return share if 0.2 < share < 20 else None
+def _plausible(focal: float) -> float | None:
+    """Return the value if it lies between a fisheye's (0.2) and a long tele lens' (20)."""
+    return focal if 0.2 < focal < 20 else None
 
 
 def _gps(tags: dict) -> tuple[float, float, float] | None:
@@ -162,7 +166,8 @@ def _gps(tags: dict) -> tuple[float, float, float] | None:
     return latitude, longitude, math.nan if altitude is None else altitude
 
 
-def _degrees(parts: object, side: object) -> float | None:
+def _degrees(parts: object, reference: object) -> float | None:
+    """Convert degrees, minutes and seconds with N, S, E or W to signed degrees."""
     if not isinstance(parts, tuple | list) or len(parts) != 3:
         return None
     numbers = [_number(part) for part in parts]
@@ -170,11 +175,11 @@ def _degrees(parts: object, side: object) -> float | None:
         return None
     d, m, s = (float(number or 0) for number in numbers)
     value = d + m / 60 + s / 3600
-    return -value if str(side).strip("\0 ").upper() in ("S", "W") else value
+    return -value if str(reference).strip("\0 ").upper() in ("S", "W") else value
 
 
 def _number(value: object) -> float | None:
-    """A finite number, or None for anything else (a ratio of 0/0 among it)."""
+    """Return a finite number; None for anything else, such as a ratio 0/0."""
     try:
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):

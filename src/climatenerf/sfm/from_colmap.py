@@ -1,4 +1,4 @@
-"""Poses that COLMAP has found before: its model and the photos, as a scene folder."""
+"""Import an existing COLMAP model and its photos into a scene folder."""
 
 import math
 import shutil
@@ -20,36 +20,36 @@ from climatenerf.sfm.reconstruct import Model, Progress
 def import_posed(
     photos: Path, root: Path, out: Path, excluded: Collection[Path], progress: Progress
 ) -> tuple[PhotoImport, Model, list[Unposed]]:
-    """Copies photos and model as they are into `out/images` and `out/sparse/0`.
+    """Copy the photos and the model unchanged into `out/images` and `out/sparse/0`.
 
     Args:
-        photos: the folder that the model's picture names are relative to.
-        root: COLMAP's folder: a model, or with `sparse/0`.
-        out: folder to write into.
-        excluded: folders whose pictures are no photos of the user's.
-        progress: told (stage, share of it that is done).
+        photos: folder to which the picture names of the model are relative.
+        root: a COLMAP model, or a folder with `sparse/0`.
+        out: folder to write to.
+        excluded: folders whose pictures are not photos of the user.
+        progress: callback with (stage, finished fraction of the stage).
 
     Returns:
-        The pictures with poses, the model, and the photos that it has no pose for.
+        The pictures with poses, the model, and the photos without pose.
 
     Raises:
-        UserError: no model, or its pictures are not among the photos.
+        UserError: there is no model, or its pictures are not among the photos.
     """
     if not photos.is_dir():
-        raise UserError(f"{photos} is no folder; give the photos that {root} has poses for")
+        raise UserError(f"{photos} is not a folder; give the folder of the photos in {root}")
     model = largest_model(root)
     capture = read_colmap(model)
     for view in capture.views:
         if Path(view.name).is_absolute() or ".." in Path(view.name).parts:
             raise UserError(
-                f"{model} names the picture {view.name}, which leads out of the photos' folder;"
-                " run COLMAP with --image_path at the folder that holds them all"
+                f"{model} names the picture {view.name}, which is outside the folder of photos;"
+                " run COLMAP with an --image_path that contains all of them"
             )
     names = [view.name for view in capture.views if (photos / view.name).is_file()]
     if len(names) < MIN_PHOTOS:
         raise UserError(
-            f"{photos} has {len(names)} of the {len(capture.views)} pictures that {model} has poses"
-            f" for (such as {capture.views[0].name}); give the folder that COLMAP was given"
+            f"{photos} contains {len(names)} of the {len(capture.views)} pictures of {model}"
+            f" (such as {capture.views[0].name}); give COLMAP's --image_path"
         )
     make_folder(out / "sparse" / "0")
     try:
@@ -66,20 +66,20 @@ def import_posed(
     pictures = tuple(_picture(photos, name) for name in names)
     lenses = {view.name: capture.cameras[view.camera] for view in capture.views}
     points = 0 if capture.points is None else len(capture.points)
-    found = Model(lenses, tuple(names), (len(names),), None, points)
-    known = {photos / name for name in names}
-    reason, remedy = "the COLMAP model has no pose for it", "leave out --from-colmap to pose it"
-    found_there = photos_in(photos, excluded)
-    others = [path for path in found_there.files if path not in known]
-    left = [path.relative_to(photos).as_posix() for path in others]
-    unposed = [Unposed(name, name, reason, remedy, ()) for name in left]
-    return PhotoImport(out / "images", pictures, {}, False, found_there.notes), found, unposed
+    reconstruction = Model(lenses, tuple(names), (len(names),), None, points)
+    posed = {photos / name for name in names}
+    reason, remedy = "it is not in the COLMAP model", "omit --from-colmap to compute its pose"
+    present = photos_in(photos, excluded)
+    others = [path for path in present.files if path not in posed]
+    other_names = [path.relative_to(photos).as_posix() for path in others]
+    unposed = [Unposed(name, name, reason, remedy, ()) for name in other_names]
+    return PhotoImport(out / "images", pictures, {}, False, present.notes), reconstruction, unposed
 
 
 def _picture(photos: Path, name: str) -> Picture:
     try:
         with Image.open(photos / name) as image:
             exif, size = read_exif(image), image.size
-    except Exception:  # whatever is wrong with it, the scene's reader says it
+    except Exception:  # the reader of the scene reports any damage
         exif, size = Exif(), (0, 0)
     return Picture(name, name, *size, exif, math.nan, math.nan)

@@ -1,4 +1,4 @@
-"""A page to mark the ends of known lengths in a scene's pictures: click, copy, save."""
+"""An HTML page on which the user marks the ends of known lengths in a scene's pictures."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ _PAGE = """<!doctype html>
 body { font: 15px sans-serif; margin: 1em; }
 textarea { width: 100%; height: 14em; font: 13px monospace; }
 figure { position: relative; width: fit-content; margin: .3em 0 1em; }
-/* Poses are of the pixels as stored, so no tag may turn the picture here. */
+/* Poses refer to pixels as stored, so EXIF must not rotate the pictures. */
 img { max-width: 100%; cursor: crosshair; display: block; image-orientation: none; }
 figure span { position: absolute; color: #fff; background: #c22; font-size: 11px; padding: 0 3px;
   transform: translate(6px, -6px); pointer-events: none; }
@@ -22,12 +22,12 @@ figure span::before { content: ""; position: absolute; left: -9px; top: 3px; wid
   height: 6px; border-radius: 3px; background: #c22; }
 </style>
 <h1>Mark known lengths</h1>
-<p>Choose a name and an end, then click where that end is in two pictures or more, taken from places
+<p>Choose a name and an end. Then click on that end in two or more pictures from camera positions
 well apart. A new click on a picture moves the mark. Save the text as <code>marks.toml</code> beside
-this page, then give <code>--known-length "NAME=2.0 m"</code>.</p>
+this page and add <code>--known-length "NAME=2.0 m"</code> to the command.</p>
 <p>Name <input id="name" value="DOOR"> end
 <select id="end"><option>from</option><option>to</option></select>
-<button onclick="marks = {}; show()">begin anew</button></p>
+<button onclick="marks = {}; show()">clear all</button></p>
 <textarea id="toml" readonly></textarea>
 <div id="pictures"></div>
 <script>
@@ -36,16 +36,16 @@ let marks = {}, images = {};
 function show() {
   let text = "";
   for (const [name, ends] of Object.entries(marks))
-    for (const [end, places] of Object.entries(ends)) {
+    for (const [end, pixels] of Object.entries(ends)) {
       text += "[" + JSON.stringify(name) + "." + end + "]\\n";
-      for (const [picture, [x, y]] of Object.entries(places))
+      for (const [picture, [x, y]] of Object.entries(pixels))
         text += JSON.stringify(picture) + " = [" + x + ", " + y + "]\\n";
     }
   document.getElementById("toml").value = text;
   for (const dot of document.querySelectorAll("figure span")) dot.remove();
   for (const [name, ends] of Object.entries(marks))
-    for (const [end, places] of Object.entries(ends))
-      for (const [picture, [x, y]] of Object.entries(places)) {
+    for (const [end, pixels] of Object.entries(ends))
+      for (const [picture, [x, y]] of Object.entries(pixels)) {
         const image = images[picture], dot = document.createElement("span");
         dot.textContent = name + " " + end;
         dot.style.left = 100 * x / image.marked.width + "%";
@@ -57,7 +57,7 @@ for (const picture of pictures) {
   const title = document.createElement("div"), image = document.createElement("img");
   const figure = document.createElement("figure");
   images[picture.name] = image;
-  image.marked = picture;  // its naturalWidth is that of the picture as a tag turns it
+  image.marked = picture;  // naturalWidth is the width after rotation by EXIF
   title.textContent = picture.name;
   image.src = picture.file;
   image.loading = "lazy";
@@ -79,7 +79,12 @@ for (const picture of pictures) {
 
 
 def write_mark_page(path: Path, scene: Scene) -> None:
-    """Writes the page; pictures are named relative to it."""
+    """Write the page. Pictures are linked relative to it.
+
+    Args:
+        path: file to write.
+        scene: scene with the pictures.
+    """
     root = path.parent.absolute()
     pictures = [
         {
@@ -92,6 +97,6 @@ def write_mark_page(path: Path, scene: Scene) -> None:
         }
         for view in scene.views
     ]
-    # Names may hold anything: "</script>" in one must not end the script.
+    # Escape "<": a file name with "</script>" must not end the script.
     listed = json.dumps(pictures).replace("<", "\\u003c")
     write_bytes(path, _PAGE.replace("PICTURES", listed, 1).encode())

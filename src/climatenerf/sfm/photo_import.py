@@ -1,4 +1,4 @@
-"""Photos of any kind, or a video, as upright pictures in a work folder, with what EXIF says."""
+"""Import photos or frames of a video as upright JPEG pictures with their EXIF metadata."""
 
 import contextlib
 import errno
@@ -21,11 +21,11 @@ from climatenerf.scene.images import EXIF_TRANSPOSES, to_rgb
 from climatenerf.sfm.exif import Exif, read_exif
 from climatenerf.sfm.photos import MIN_PHOTOS, find_photos, is_video, too_few_photos
 
-MAX_SIDE = 2000  # pixels: more than a radiance field of a place resolves, and features need less
-MAX_PIXELS = 400_000_000  # of a picture that is decoded at all: 1.2 GB
+MAX_SIDE = 2000  # pixels; more than a radiance field resolves and than features need
+MAX_PIXELS = 400_000_000  # largest picture that is decoded: 1.2 GB in memory
 JPEG_QUALITY = 96
-VIDEO_FRAMES = 100  # frames taken from a video, the sharpest of as many intervals
-CANDIDATES_PER_INTERVAL = 5  # looked at in each interval
+VIDEO_FRAMES = 100  # intervals of a video; the sharpest frame of each is used
+CANDIDATES_PER_INTERVAL = 5  # decoded frames per interval
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,13 @@ class Picture:
     """One upright picture in the work folder.
 
     Attributes:
-        name: File name in `pictures/`.
-        source: File it was made from, relative to what the user gave.
-        width: Pixels, as shown.
-        height: Pixels, as shown.
-        exif: What its EXIF says; the focal length is for the picture as shown.
-        sharpness: Variance of the Laplacian of grey values at 640 pixels' width.
-        brightness: Mean grey value, [0,1].
+        name: file name in `pictures/`.
+        source: original file, relative to the folder that the user gave.
+        width: width as shown, pixels.
+        height: height as shown, pixels.
+        exif: metadata of the original file.
+        sharpness: variance of the Laplacian of grey values at a width of 640 pixels.
+        brightness: mean grey value, [0, 1].
     """
 
     name: str
@@ -53,7 +53,15 @@ class Picture:
 
 @dataclass(frozen=True)
 class PhotoImport:
-    """All usable pictures, what could not be used with the reason, and notes for the user."""
+    """Result of an import.
+
+    Attributes:
+        folder: folder of the pictures.
+        pictures: all usable pictures.
+        unusable: cause for each original file that cannot be used.
+        is_video: True if the pictures are frames of a video, in order.
+        notes: sentences for the user.
+    """
 
     folder: Path
     pictures: tuple[Picture, ...]
@@ -68,18 +76,18 @@ def import_photos(
     progress: Callable[[int, int], None],
     excluded: Collection[Path] = (),
 ) -> PhotoImport:
-    """Makes upright pictures of at most `MAX_SIDE` pixels from photos or a video.
+    """Convert photos or a video to upright pictures of at most `MAX_SIDE` pixels per side.
 
-    Finished pictures are kept, so that an interrupted run goes on where it was.
+    Pictures from an earlier run are reused if their original has not changed.
 
     Args:
         source: folder of photos, or a video file.
-        work: work folder; pictures go to `work/pictures`.
-        progress: told (done, all).
-        excluded: folders whose pictures are no photos; the scene that is being made is one always.
+        work: work folder; pictures are written to `work/pictures`.
+        progress: callback with (done, total).
+        excluded: folders whose pictures are not photos. The parent of `work` is always excluded.
 
     Raises:
-        UserError: nothing to read, a video that cannot be decoded, or fewer than three pictures.
+        UserError: no photos, a video that cannot be decoded, or fewer than three usable pictures.
     """
     video = is_video(source)
     if video:
@@ -88,9 +96,9 @@ def import_photos(
         found = find_photos(source, (work.parent, *excluded))
         files, base, notes = found.files, found.folder, found.notes
     folder = make_folder(work / "pictures")
-    pictures, unusable, taken = [], {}, set()
+    pictures, unusable, used_names = [], {}, set()
     for index, path in enumerate(files):
-        name = _unique_name(path.relative_to(base), taken)
+        name = _unique_name(path.relative_to(base), used_names)
         picture = _read_cached(path, folder / name)
         if picture is None:
             try:
@@ -109,55 +117,56 @@ def import_photos(
 
 
 def _printable(path: Path) -> str:
-    """A path as text that can be printed and kept, whatever bytes its name is made of."""
+    """Return a path as printable text; bytes that are not UTF-8 are replaced."""
     return path.as_posix().encode("utf-8", "replace").decode()
 
 
-def _unique_name(path: Path, taken: set[str]) -> str:
-    """A flat JPEG name of plain letters: folders become part of it; two photos never share one.
+def _unique_name(path: Path, used_names: set[str]) -> str:
+    """Return an unused JPEG file name of plain ASCII characters that includes the folders' names.
 
-    COLMAP's lists and a page's addresses give a meaning to blanks, "#", "%" and more.
+    Blanks, "#", "%" and others have a meaning in COLMAP's lists and in URLs.
     """
     stem = re.sub(r"[^A-Za-z0-9._-]+", "_", "_".join([*path.parts[:-1], path.stem]))
     stem = stem.strip("._") or "photo"
     name, number = f"{stem}.jpg", 1
-    while name.lower() in taken:
+    while name.lower() in used_names:
         number += 1
         name = f"{stem}_{number}.jpg"
-    taken.add(name.lower())
+    used_names.add(name.lower())
     return name
 
 
 def _read_cached(path: Path, out: Path) -> Picture | None:
-    """The picture that an earlier run has made of this very photo, if it has."""
-    record = out.with_suffix(".json")
+    """Return the picture that an earlier run made of the same, unchanged photo; None if none."""
     try:
-        known = read_json(record)
-        if known.pop("stamp") != [*_stamp(path), out.stat().st_size]:
+        record = read_json(out.with_suffix(".json"))
+        if record.pop("stamp") != [*_stamp(path), out.stat().st_size]:
             return None
-        return picture_from_json(known)
+        return picture_from_json(record)
     except (UserError, OSError, ValueError, KeyError, TypeError):
-        return None  # none yet, half written or of an older version: made again
+        return None  # missing, incomplete or of an unknown version: convert the photo again
 
 
 def _write_picture(path: Path, base: Path, out: Path, image: Image.Image, exif: Exif) -> Picture:
+    """Write a picture and its JSON record to the work folder."""
     with atomic_path(out) as temporary:
         image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     grey = small_grey(image)
     source = _printable(path.relative_to(base))
-    measured = sharpness(grey), float(grey.mean() / 255)
-    picture = Picture(out.name, source, *image.size, exif, *measured)
+    brightness = float(grey.mean() / 255)
+    picture = Picture(out.name, source, *image.size, exif, sharpness(grey), brightness)
     stamp = [*_stamp(path), out.stat().st_size]
     write_json(out.with_suffix(".json"), {**asdict(picture), "stamp": stamp})
     return picture
 
 
 def _stamp(path: Path) -> list[int]:
+    """Return size and modification time of a file, to detect changes."""
     return [path.stat().st_size, path.stat().st_mtime_ns]
 
 
 def picture_from_json(data: dict) -> Picture:
-    """A picture from the JSON of its fields; numbers that were not finite come back as NaN."""
+    """Return a picture from the JSON of its fields; null in a vector becomes NaN."""
     exif = dict(data["exif"])
     if "place" in exif:  # a record of an earlier version
         exif["gps"] = exif.pop("place")
@@ -168,10 +177,10 @@ def picture_from_json(data: dict) -> Picture:
 
 
 def open_upright(path: Path) -> tuple[Image.Image, Exif]:
-    """A photo as it is meant to be seen, in RGB of at most `MAX_SIDE` pixels, with its EXIF.
+    """Return a photo upright, in sRGB, with at most `MAX_SIDE` pixels per side; and its EXIF.
 
     Raises:
-        UserError: empty, damaged, no picture at all, or too large to decode.
+        UserError: the file is empty, damaged, not a picture, or too large to decode.
     """
     name = _printable(Path(path.name))
     if path.suffix.lower() in (".heic", ".heif"):
@@ -180,56 +189,59 @@ def open_upright(path: Path) -> tuple[Image.Image, Exif]:
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{name} is empty")
-        # Through an open file: Pillow garbles turned TIFFs that it maps into memory by their name.
+        # Open the file here: Pillow corrupts rotated TIFFs that it memory-maps by name.
         with path.open("rb") as file, Image.open(file) as image:
             if image.width * image.height > MAX_PIXELS:
-                raise UserError(f"{name} has {image.width}x{image.height} pixels: too large")
+                raise UserError(
+                    f"{name} has {image.width}x{image.height} pixels, above the limit of"
+                    f" {MAX_PIXELS / 1e6:g} megapixels; make it smaller"
+                )
             exif, profile = read_exif(image), image.info.get("icc_profile")
-            image.draft("RGB", (MAX_SIDE, MAX_SIDE))  # a JPEG is decoded smaller at once
+            image.draft("RGB", (MAX_SIDE, MAX_SIDE))  # decodes a JPEG at a reduced size
             image.load()
-            # A TIFF's decoder has turned the picture already and taken the tag away.
-            kept = image.getexif().get(ExifTags.Base.Orientation, 1) == exif.orientation
-            turn = EXIF_TRANSPOSES.get(exif.orientation) if kept else None
-            # Made smaller before all else: a copy of 200 megapixels takes 600 MB.
+            # A TIFF decoder rotates the picture itself and removes the tag.
+            pending = image.getexif().get(ExifTags.Base.Orientation, 1) == exif.orientation
+            transpose = EXIF_TRANSPOSES.get(exif.orientation) if pending else None
+            # Reduce the size first: each full copy of 200 megapixels takes 600 MB.
             small = image if image.mode in ("RGB", "L") else Image.fromarray(to_rgb(image))
             small.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS, reducing_gap=3.0)
-            small = small.convert("RGB") if turn is None else small.transpose(turn).convert("RGB")
-            return _as_srgb(small, profile), exif
+            upright = small if transpose is None else small.transpose(transpose)
+            return _to_srgb(upright.convert("RGB"), profile), exif
     except UserError:
         raise
-    except Exception as error:  # decoders raise all kinds for damaged files
+    except Exception as error:  # decoders raise any exception for damaged files
         raise UserError(f"{name} {_cause(error)}") from error
     finally:
         Image.MAX_IMAGE_PIXELS = limit
 
 
 def _cause(error: Exception) -> str:
-    """What is wrong with a photo, said of it; a decoder's own words name its internals."""
+    """Return the cause of a failed decoding; decoders' own messages name their internals."""
     if isinstance(error, UnidentifiedImageError):
-        return "is no picture, or is damaged from its first bytes on"
+        return "is not a picture, or is damaged from its first bytes on"
     if isinstance(error, FileNotFoundError):
-        return "is a link to a file that is not there"
+        return "is a link to a file that does not exist"
     if isinstance(error, PermissionError):
         return "may not be read; change its permissions"
     if isinstance(error, IsADirectoryError):
         return "is a folder with the name of a picture"
     if isinstance(error, Image.DecompressionBombError):
-        return f"exceeds {MAX_PIXELS / 1e6:g} megapixels: too large"
+        return f"exceeds {MAX_PIXELS / 1e6:g} megapixels; make it smaller"
     if isinstance(error, MemoryError):
-        return "takes more memory to read than there is"
+        return "needs more memory to decode than available; make it smaller"
     return "is damaged or cut off"
 
 
-def _as_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Colours that a wider profile (a phone's Display P3) means, in sRGB."""
+def _to_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
+    """Convert from the ICC profile's colour space (a phone's Display P3) to sRGB."""
     if not profile:
         return image
     try:
-        given = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        converted = ImageCms.profileToProfile(image, given, ImageCms.createProfile("sRGB"))
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"))
         return converted or image
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
-        return image  # a profile of another kind (grey, CMYK) or damaged
+        return image  # the profile is damaged or not for RGB (grey, CMYK)
 
 
 def _register_heif(name: str) -> None:
@@ -237,35 +249,40 @@ def _register_heif(name: str) -> None:
         import pi_heif
     except ImportError as error:
         raise UserError(
-            f'{name} is HEIC; run `pip install "climatenerf[capture]"` to read it'
+            f'{name} is a HEIC file; run `pip install "climatenerf[capture]"` to read it'
         ) from error
     pi_heif.register_heif_opener()
 
 
 def small_grey(image: Image.Image) -> UInt8[np.ndarray, "h w"]:
-    """Grey values at 640 pixels' width, for measures that are to be comparable."""
+    """Return grey values at a width of 640 pixels, so that statistics are comparable."""
     height = max(8, round(640 * image.height / image.width))
     return np.asarray(image.convert("L").resize((640, height), Image.Resampling.BILINEAR))
 
 
 def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Variance of the Laplacian."""
+    """Return the variance of the 4-neighbour Laplacian, without the border pixels."""
     g = grey.astype(np.float32)
-    around = g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:]
-    return float((around - 4 * g[1:-1, 1:-1]).var())
+    neighbours = g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:]
+    return float((neighbours - 4 * g[1:-1, 1:-1]).var())
 
 
 def extract_frames(video: Path, folder: Path, progress: Callable[[int, int], None]) -> list[Path]:
-    """The sharpest frame of each of `VIDEO_FRAMES` intervals, as JPEG files named by number.
+    """Extract the sharpest frame of each of `VIDEO_FRAMES` intervals as numbered JPEG files.
+
+    Args:
+        video: the video file.
+        folder: folder for the frames; complete frames of an earlier run are reused.
+        progress: callback with (done, total).
 
     Raises:
-        UserError: ffmpeg is missing or cannot decode the video.
+        UserError: ffmpeg is missing or cannot decode the video, or the disk is full.
     """
-    done = folder / "done.json"
+    record_path = folder / "done.json"
     stamp = _stamp(video)
     with contextlib.suppress(UserError, KeyError):
-        frames, known = sorted(folder.glob("[0-9]*.jpg")), read_json(done)
-        if known["stamp"] == stamp and known["frames"] == len(frames):
+        frames, record = sorted(folder.glob("[0-9]*.jpg")), read_json(record_path)
+        if record["stamp"] == stamp and record["frames"] == len(frames):
             return frames
     try:
         import imageio_ffmpeg
@@ -275,37 +292,46 @@ def extract_frames(video: Path, folder: Path, progress: Callable[[int, int], Non
     except (ImportError, RuntimeError, OSError) as error:
         raise UserError(
             f"{video} cannot be decoded ({str(error).strip().splitlines()[-1]});"
-            " convert it to MP4 (H.264), or give photos"
+            " convert it to MP4 (H.264), or give photos instead"
         ) from error
     shutil.rmtree(folder, ignore_errors=True)
     make_folder(folder)
     if not count or not seconds or seconds <= 0:
-        raise UserError(f"{video} holds no frames; record it again or give photos")
-    wanted = min(count, VIDEO_FRAMES * CANDIDATES_PER_INTERVAL)
-    # Of a short video all frames are candidates: at a higher rate some would come twice.
-    rate = [] if wanted == count else [f"fps={wanted / seconds:.6f}"]
+        raise UserError(f"{video} contains no frames; record it again, or give photos instead")
+    sampled = min(count, VIDEO_FRAMES * CANDIDATES_PER_INTERVAL)
+    # All frames of a short video are candidates: a higher rate would duplicate some.
+    rate = [] if sampled == count else [f"fps={sampled / seconds:.6f}"]
     scale = ",".join([*rate, f"scale='min({MAX_SIDE},iw)':-2"])
     command = [ffmpeg, "-y", "-loglevel", "error", "-nostdin", "-i", str(video), "-vf", scale]
     command += ["-fps_mode", "passthrough", "-q:v", "2", str(folder / "candidate_%05d.jpg")]
-    words = _run_ffmpeg(command, folder, lambda: progress(_count(folder), 2 * wanted))
+    message = _run_ffmpeg(command, folder, lambda: progress(_count(folder), 2 * sampled))
     candidates = sorted(folder.glob("candidate_*.jpg"))
     if not candidates:
-        raise UserError(f"{video} cannot be decoded ({words}); convert it to MP4, or give photos")
-    kept = []
-    for some in np.array_split(np.array(candidates), min(VIDEO_FRAMES, len(candidates))):
-        best = max(some, key=lambda path: sharpness(small_grey(Image.open(path))))
-        target = folder / f"{len(kept):04d}.jpg"
-        best.rename(target)
-        kept.append(target)
-        progress(wanted + len(kept), wanted + min(VIDEO_FRAMES, len(candidates)))
+        raise UserError(
+            f"{video} cannot be decoded ({message}); convert it to MP4 (H.264), or give photos"
+            " instead"
+        )
+    frames = []
+    intervals = min(VIDEO_FRAMES, len(candidates))
+    for interval in np.array_split(np.array(candidates), intervals):
+        sharpest = max(interval, key=lambda path: sharpness(small_grey(Image.open(path))))
+        target = folder / f"{len(frames):04d}.jpg"
+        sharpest.rename(target)
+        frames.append(target)
+        progress(sampled + len(frames), sampled + intervals)
     for path in folder.glob("candidate_*.jpg"):
         path.unlink()
-    write_json(done, {"stamp": stamp, "frames": len(kept)})
-    return kept
+    write_json(record_path, {"stamp": stamp, "frames": len(frames)})
+    return frames
 
 
-def _run_ffmpeg(command: list[str], folder: Path, meanwhile: Callable[[], None]) -> str:
-    """Runs ffmpeg to its end; returns its last words.
+def _run_ffmpeg(command: list[str], folder: Path, on_wait: Callable[[], None]) -> str:
+    """Run ffmpeg and return the last line of its messages.
+
+    Args:
+        command: program and arguments.
+        folder: folder of the frames and, meanwhile, of the log.
+        on_wait: called about twice a second.
 
     Raises:
         UserError: the disk is full.
@@ -315,17 +341,17 @@ def _run_ffmpeg(command: list[str], folder: Path, meanwhile: Callable[[], None])
         process = subprocess.Popen(command, stderr=file)
     try:
         while process.poll() is None:
-            meanwhile()
+            on_wait()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(0.5)
     finally:
         process.kill()
         process.wait()
-    words = log.read_text(errors="replace").strip()
+    messages = log.read_text(errors="replace").strip()
     log.unlink()
-    if "No space left" in words or (process.returncode and shutil.disk_usage(folder).free < 1e6):
+    if "No space left" in messages or (process.returncode and shutil.disk_usage(folder).free < 1e6):
         raise explain(OSError(errno.ENOSPC, ""), folder)
-    return words.splitlines()[-1] if words else "no frame came out"
+    return messages.splitlines()[-1] if messages else "no frame was decoded"
 
 
 def _count(folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""Which files below a folder are the user's photos: not those of scenes, labels or hidden ones."""
+"""Find the user's photos below a folder; skip scenes, sidecars and hidden files."""
 
 import os
 from collections.abc import Collection, Iterator
@@ -18,9 +18,9 @@ class Photos:
     """The photos below a folder.
 
     Attributes:
-        folder: that their names are relative to.
-        files: sorted.
-        notes: sentences about what was left out though it holds pictures.
+        folder: base folder of the files.
+        files: paths of the photos, sorted.
+        notes: sentences for the user about folders with pictures that were skipped.
     """
 
     folder: Path
@@ -29,26 +29,28 @@ class Photos:
 
 
 def find_photos(source: Path, excluded: Collection[Path]) -> Photos:
-    """The photos of a place: those of a folder, or the pictures of a scene that is there already.
+    """Find the photos of a folder. For a scene folder, these are the pictures in `images`.
 
     Args:
-        source: folder to look in.
-        excluded: folders whose files are none.
+        source: folder to search.
+        excluded: folders whose files are not photos.
 
     Raises:
-        UserError: fewer than a place needs.
+        UserError: fewer than `MIN_PHOTOS` photos.
     """
     notes = []
     if is_scene(source) and (source / "images").is_dir():
-        notes.append(f"{source} is a scene; the pictures in {source / 'images'} are the photos.")
+        notes.append(
+            f"{source} is a scene folder; the pictures in {source / 'images'} are used as photos."
+        )
         source = source / "images"
     found = photos_in(source, excluded)
     if not found.files:
         videos = sorted(p for p in source.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
-        remedy = f"the video itself, such as {videos[0]}" if videos else "the folder that has them"
-        said = " ".join(("", *found.notes))
+        remedy = f"the video itself, such as {videos[0]}" if videos else "the folder with photos"
+        details = " ".join(("", *found.notes))
         raise UserError(
-            f"{source} holds no photos (JPEG, PNG, HEIC, TIFF, WebP); give {remedy}{said}"
+            f"{source} contains no photos (JPEG, PNG, HEIC, TIFF, WebP); give {remedy}{details}"
         )
     if len(found.files) < MIN_PHOTOS:
         raise too_few_photos(source, len(found.files), "")
@@ -56,18 +58,18 @@ def find_photos(source: Path, excluded: Collection[Path]) -> Photos:
 
 
 def too_few_photos(source: Path, count: int, why: str) -> UserError:
-    """The sentence for `count` pictures that can be used, and the reason for those that cannot."""
+    """Return the error for `count` usable pictures; `why` is the cause for the unusable ones."""
     return UserError(
-        f"{source} holds {count} usable pictures, and a place needs at least {MIN_PHOTOS}"
+        f"{source} contains {count} usable pictures, and a scene needs at least {MIN_PHOTOS}"
         f" (40 to 100 are good); take more{why}"
     )
 
 
 def is_video(source: Path) -> bool:
-    """Whether what the user gave is a video and not a folder.
+    """Return True if the source is a video and False if it is a folder.
 
     Raises:
-        UserError: it is neither, or does not exist.
+        UserError: the source is neither, or does not exist.
     """
     if not source.exists():
         raise UserError(f"{source} does not exist; give a folder of photos or a video")
@@ -76,44 +78,46 @@ def is_video(source: Path) -> bool:
     if source.suffix.lower() not in VIDEO_SUFFIXES:
         kinds = ", ".join(sorted(suffix[1:] for suffix in VIDEO_SUFFIXES))
         raise UserError(
-            f"{source} is neither a folder of photos nor a video ({kinds}); give the folder that"
-            " holds the photos"
+            f"{source} is neither a folder of photos nor a video ({kinds}); give the folder with"
+            " the photos"
         )
     return True
 
 
 def photos_in(folder: Path, excluded: Collection[Path]) -> Photos:
-    """All photos below a folder, through linked folders too, each real folder once.
+    """Return all photos below a folder.
 
-    Hidden ones, those of scenes, and labels, masks and depths beside `images` are left out.
+    Linked folders are followed, each real folder once. Hidden files, scene folders, and labels,
+    masks and depths beside `images` are skipped.
 
     Args:
-        folder: to look in.
-        excluded: folders whose files are none.
+        folder: folder to search.
+        excluded: folders whose files are not photos.
     """
-    none = {path.resolve() for path in excluded}
+    excluded_folders = {path.resolve() for path in excluded}
     files: list[Path] = []
     scenes: list[Path] = []
-    extras: list[Path] = []
+    sidecars: list[Path] = []
     for here, folders, names in walk_once(folder):
-        seen = [here / name for name in folders if not name.startswith(".")]
-        seen = [path for path in seen if path.resolve() not in none]
-        scenes += [path for path in seen if is_scene(path)]
+        candidates = [here / name for name in folders if not name.startswith(".")]
+        candidates = [path for path in candidates if path.resolve() not in excluded_folders]
+        scenes += [path for path in candidates if is_scene(path)]
         if "images" in folders:
-            extras += [path for path in seen if path.name in SIDECAR_KINDS]
-        folders[:] = [path.name for path in seen if path not in scenes and path not in extras]
+            sidecars += [path for path in candidates if path.name in SIDECAR_KINDS]
+        skipped = {*scenes, *sidecars}
+        folders[:] = [path.name for path in candidates if path not in skipped]
         files += [here / name for name in names if _is_photo(name)]
-    return Photos(folder, tuple(sorted(files)), tuple(_notes(folder, scenes, extras)))
+    return Photos(folder, tuple(sorted(files)), tuple(_notes(folder, scenes, sidecars)))
 
 
 def _is_photo(name: str) -> bool:
     return not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES
 
 
-def _notes(folder: Path, scenes: list[Path], extras: list[Path]) -> Iterator[str]:
+def _notes(folder: Path, scenes: list[Path], sidecars: list[Path]) -> Iterator[str]:
     if scenes:
         listed = ", ".join(os.path.relpath(path, folder) for path in sorted(scenes))
-        yield f"Scenes among the photos are left out: {listed}."
-    if extras:
-        flags = " ".join(f"--{path.name} {path}" for path in sorted(extras))
-        yield f"What lies beside images/ is left out of the photos; to use it, give {flags}."
+        yield f"Scene folders among the photos are skipped: {listed}."
+    if sidecars:
+        flags = " ".join(f"--{path.name} {path}" for path in sorted(sidecars))
+        yield f"Folders beside images/ are not searched for photos; to use them, add {flags}."

@@ -1,6 +1,6 @@
-"""Poses by structure from motion: features, matches, incremental mapping, undistortion (COLMAP).
+"""Structure from motion with COLMAP: features, matches, incremental mapping, undistortion.
 
-Each stage leaves its result in the work folder, so that a run that was stopped goes on.
+Each stage stores its result in the work folder, so that a repeated run resumes.
 """
 
 import contextlib
@@ -20,33 +20,35 @@ from climatenerf.sfm.diagnose import is_pure_rotation, read_only
 from climatenerf.sfm.photo_import import PhotoImport, Picture
 from climatenerf.sfm.photos import MIN_PHOTOS
 
-EXHAUSTIVE_UP_TO = 120  # photos; beyond, and for video, neighbours in time and loops are compared
-OVERLAP = 10  # neighbours in time to each side
-EXTRACTION_BATCH = 6  # in one call for features: the bar moves in between
-TILE = 16  # pictures against as many in one call for matches
-ASSUMED_FOCAL = 1.2  # over the longer side, where EXIF says nothing
-MAX_RETRY_PAIRS = 10_000  # of the second chance: ten minutes or so
-MAX_ATTEMPTS = 4  # of the mapper at most
-MIN_AGREEMENT = 0.95  # of the observations: two models that explain as much are sound
-INITIAL_ANGLE = 16.0  # degrees between the first two photos
-RETRY_ANGLE = 4.0  # degrees between the first two photos, on the second try
+# Photos. Larger sets and videos match neighbours in time and loop closures only.
+EXHAUSTIVE_UP_TO = 120
+OVERLAP = 10  # neighbours in time on each side
+EXTRACTION_BATCH = 6  # pictures per call of the feature extraction; progress is reported between
+TILE = 16  # pictures per side of a block of pairs in one call of the matcher
+ASSUMED_FOCAL = 1.2  # focal length over the longer side, without EXIF
+MAX_RETRY_PAIRS = 10_000  # pairs of the second matching: about ten minutes
+MAX_ATTEMPTS = 4  # runs of the mapper
+MIN_AGREEMENT = 0.95  # ratio of the observations of two models that count as equally good
+INITIAL_ANGLE = 16.0  # smallest triangulation angle of the first two photos, degrees
+RETRY_ANGLE = 4.0  # the same if the first angle gives no model, degrees
 
 DATABASE, CHOSEN, RESULT = "database.db", "chosen", "poses.json"  # in the work folder
-NO_PYCOLMAP = 'poses need pycolmap; run `pip install "climatenerf[capture]"`'
-MIN_POINTS = 30  # of a model: with fewer its poses mean nothing
+NO_PYCOLMAP = 'computing poses needs pycolmap; run `pip install "climatenerf[capture]"`'
+MIN_POINTS = 30  # sparse points of a model; poses from fewer are unreliable
 
 Progress = Callable[[str, float], None]
+"""Callback with (name of the stage, finished fraction of the stage, 0 to 1)."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """What structure from motion found.
+    """Result of structure from motion.
 
     Attributes:
-        lenses: the camera of each picture as it was taken in, before undistortion.
-        registered: names of the pictures that have poses.
-        groups: number of pictures in each connected group found, largest first.
-        reprojection_error: mean, pixels; None if it is not known.
+        lenses: camera of each picture before undistortion, by name.
+        registered: names of the pictures with poses.
+        groups: number of pictures in each connected group, largest first.
+        reprojection_error: mean over observations, pixels; None if unknown.
         points: number of sparse points.
     """
 
@@ -58,24 +60,24 @@ class Model:
 
 
 def load_pycolmap():
-    """The module, or how to get it.
+    """Import pycolmap and return the module.
 
     Raises:
-        UserError: it is not installed.
+        UserError: pycolmap is not installed.
     """
     try:
         import pycolmap
     except ImportError as error:
         raise UserError(NO_PYCOLMAP) from error
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # errors are told in our words
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # errors are raised as UserError
     return pycolmap
 
 
 def require_pycolmap() -> None:
-    """Says how to get the module if it is not there, without loading it: it catches signals.
+    """Check that pycolmap is installed, without importing it: the import replaces signal handlers.
 
     Raises:
-        UserError: it is not installed.
+        UserError: pycolmap is not installed.
     """
     if "pycolmap" in sys.modules and sys.modules["pycolmap"] is None:
         load_pycolmap()
@@ -86,21 +88,21 @@ def require_pycolmap() -> None:
 def reconstruct(
     imported: PhotoImport, work: Path, out: Path, features: int, seed: int, progress: Progress
 ) -> None:
-    """Poses of as many pictures as possible, the largest connected group, and flat pictures.
+    """Compute the poses of the largest connected group of pictures and undistort them.
 
-    COLMAP may end the process (a full disk) and does not hear Ctrl-C: see `worker`. The result is
-    for `read_result`.
+    COLMAP may end the process (on a full disk) and ignores Ctrl-C; see `worker`. `read_result`
+    returns the result.
 
     Args:
         imported: the pictures.
-        work: work folder, with what earlier runs left there.
-        out: folder to write undistorted pictures (`images`) and their model (`sparse`) into.
-        features: most features in a picture.
-        seed: of all random choices.
-        progress: told (stage, share of it that is done).
+        work: work folder; results of earlier runs in it are reused.
+        out: folder for the undistorted pictures (`images`) and their model (`sparse`).
+        features: largest number of features per picture.
+        seed: random seed.
+        progress: progress callback.
 
     Raises:
-        UserError: no two pictures fit together, or all are taken from one spot.
+        UserError: no pictures match, or all were taken from one position.
     """
     pycolmap = load_pycolmap()
     if read_result(imported, work, features, seed) is None:
@@ -123,8 +125,8 @@ def _find_poses(
     _match(pycolmap, database, names, pairs, seed, progress)
     if is_pure_rotation(imported, database):
         raise UserError(
-            "all pictures were taken from one spot: they differ by turning the camera alone and"
-            " hold no depth; walk around the place and take each photo a step further"
+            "all pictures were taken from one spot: the camera only rotated, so there is no"
+            " parallax; walk around the scene and take each photo a step further"
         )
     (work / RESULT).unlink(missing_ok=True)
     models = _map(pycolmap, imported, database, work / "models", seed, progress)
@@ -146,7 +148,7 @@ def _find_poses(
 
 
 def names_in_order(imported: PhotoImport) -> list[str]:
-    """Names of the pictures in the order they were taken, where all know it, else by name."""
+    """Return the names of the pictures by time if all have one, else in alphabetical order."""
     pictures = imported.pictures
     if all(picture.exif.taken for picture in pictures):
         pictures = sorted(pictures, key=lambda picture: (picture.exif.taken, picture.name))
@@ -158,21 +160,21 @@ def _registered(model) -> set[str]:
 
 
 def group_sizes(models: list[set[str]]) -> list[int]:
-    """Pictures in the largest model, then those that each further one has beyond the larger ones.
+    """Return the number of pictures of each model that no larger model contains, largest first.
 
-    The mapper tries again with pictures that it has placed; a group is what no larger one holds.
+    The mapper may register a picture in several models. Groups below `MIN_PHOTOS` are omitted.
     """
-    seen: set[str] = set()
+    counted: set[str] = set()
     sizes = []
     for names in sorted(models, key=len, reverse=True):
-        if len(names - seen) >= MIN_PHOTOS:
-            sizes.append(len(names - seen))
-        seen |= names
+        if len(names - counted) >= MIN_PHOTOS:
+            sizes.append(len(names - counted))
+        counted |= names
     return sizes
 
 
 def read_result(imported: PhotoImport, work: Path, features: int, seed: int) -> Model | None:
-    """What a run over the same pictures with the same settings has found; None if none has."""
+    """Return the result of an earlier run with the same pictures and settings; None if none."""
     try:
         result = read_json(work / RESULT)
         if (
@@ -189,7 +191,7 @@ def read_result(imported: PhotoImport, work: Path, features: int, seed: int) -> 
             points=int(result["points"]),
         )
     except (UserError, KeyError, TypeError, ValueError):
-        return None  # none yet, or damaged: found anew
+        return None  # missing or damaged: compute the poses again
 
 
 def _inputs(imported: PhotoImport, features: int, seed: int) -> dict:
@@ -197,30 +199,30 @@ def _inputs(imported: PhotoImport, features: int, seed: int) -> dict:
 
 
 def _stamps(imported: PhotoImport) -> dict[str, int]:
-    """When each picture was written: a changed photo makes a new one."""
+    """Return the modification time of each picture, ns: a changed photo gives a new picture."""
     return {p.name: (imported.folder / p.name).stat().st_mtime_ns for p in imported.pictures}
 
 
 def _reset_if_changed(imported: PhotoImport, database: Path, features: int) -> None:
-    """Begins anew where a picture was replaced or taken away, or other features are wanted.
+    """Delete the database if a picture was replaced or removed, or if `features` has changed.
 
-    Pictures that have come in are added to what is there.
+    New pictures do not delete it; they are added.
     """
     record = database.with_name("database.json")
     stamps = _stamps(imported)
-    kept = False
+    valid = False
     with contextlib.suppress(UserError, ValueError, KeyError, AttributeError):
         before = read_json(record)
-        kept = all(stamps.get(name) == stamp for name, stamp in before["pictures"].items())
-        kept &= before["features"] == features
-    if not kept:
+        valid = all(stamps.get(name) == stamp for name, stamp in before["pictures"].items())
+        valid &= before["features"] == features
+    if not valid:
         for path in [database, *database.parent.glob(f"{database.name}-*")]:
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(True)
     write_json(record, {"features": features, "pictures": stamps})
 
 
 def camera_groups(pictures: tuple[Picture, ...]) -> list[list[Picture]]:
-    """Pictures that one camera and lens took in one size: they share intrinsics."""
+    """Group the pictures of one camera, lens and size: they share intrinsics."""
     groups: dict[tuple, list[Picture]] = {}
     for picture in pictures:
         focal = None if picture.exif.focal is None else round(picture.exif.focal, 3)
@@ -230,11 +232,11 @@ def camera_groups(pictures: tuple[Picture, ...]) -> list[list[Picture]]:
 
 
 def _import(pycolmap, imported: PhotoImport, database: Path) -> None:
-    known = set(_names(database))
+    present = set(_names(database))
     if not database.exists():
         pycolmap.Database.open(database).close()
     for group in camera_groups(imported.pictures):
-        new = [picture.name for picture in group if picture.name not in known]
+        new = [picture.name for picture in group if picture.name not in present]
         if not new:
             continue
         options = pycolmap.ImageReaderOptions()
@@ -259,32 +261,41 @@ def _extract(
     options.sift.max_num_features = features
     for start in range(0, len(names), EXTRACTION_BATCH):
         progress("features", start / len(names))
-        some = names[start : start + EXTRACTION_BATCH]
-        pycolmap.extract_features(database, imported.folder, some, extraction_options=options)
+        batch = names[start : start + EXTRACTION_BATCH]
+        pycolmap.extract_features(database, imported.folder, batch, extraction_options=options)
     progress("features", 1.0)
 
 
 def image_pairs(n: int, is_video: bool) -> list[tuple[int, int]]:
-    """Which pictures are compared: all with all, or in long sequences neighbours and loops.
+    """Return the pairs of pictures to match: all pairs, or neighbours and loop closures.
 
-    Neighbours are those up to `OVERLAP` apart, and 16, 32, ... apart; every tenth picture is
-    compared with every tenth, which closes loops without a vocabulary to download.
+    Neighbours are at most `OVERLAP` apart, or 16 or 32 apart. All pairs of every tenth picture
+    close loops without a vocabulary tree, which would have to be downloaded.
+
+    Args:
+        n: number of pictures, in order of time.
+        is_video: True to restrict the pairs whatever the number of pictures.
     """
     if n <= EXHAUSTIVE_UP_TO and not is_video:
         return [(i, j) for i in range(n) for j in range(i + 1, n)]
     steps = [*range(1, OVERLAP + 1), 16, 32]
-    near = {(i, i + step) for i in range(n) for step in steps if i + step < n}
-    some = range(0, n, OVERLAP)
-    return sorted(near | {(i, j) for i in some for j in some if i < j})
+    neighbours = {(i, i + step) for i in range(n) for step in steps if i + step < n}
+    every_tenth = range(0, n, OVERLAP)
+    return sorted(neighbours | {(i, j) for i in every_tenth for j in every_tenth if i < j})
 
 
 def retry_pairs(posed: list[bool], done: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Pictures without pose with all others, as far as they were not compared: a second chance."""
-    known = set(done)
+    """Return the unmatched pairs that contain a picture without pose, at most `MAX_RETRY_PAIRS`.
+
+    Args:
+        posed: whether each picture has a pose.
+        done: pairs that were matched before.
+    """
+    matched = set(done)
     n = len(posed)
-    every = ((i, j) for i in range(n) for j in range(i + 1, n) if not (posed[i] and posed[j]))
-    more = [pair for pair in every if pair not in known]
-    return more[:: -(-len(more) // MAX_RETRY_PAIRS)] if more else []
+    candidates = ((i, j) for i in range(n) for j in range(i + 1, n) if not (posed[i] and posed[j]))
+    pairs = [pair for pair in candidates if pair not in matched]
+    return pairs[:: -(-len(pairs) // MAX_RETRY_PAIRS)] if pairs else []
 
 
 def _match(
@@ -299,7 +310,7 @@ def _match(
     pycolmap.set_random_seed(seed)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
-    # Tile by tile, so that a picture's features are read once for many comparisons.
+    # Blocks of pairs, so that the features of a picture are read once for many pairs.
     tiles: dict[tuple[int, int], list[str]] = {}
     for i, j in pairs:
         key = (i // TILE, j // TILE)
@@ -321,17 +332,21 @@ def _match(
 def _map(
     pycolmap, imported: PhotoImport, database: Path, folder: Path, seed: int, progress: Progress
 ) -> list:
-    """Incremental mapping, several times: one wrong link bends a whole model, but not in each.
+    """Run the incremental mapper with several seeds and return the models of the best run.
 
-    A bent model explains fewer of the matches, so the one with most observations is taken as soon
-    as another agrees with it. Where nothing comes out a smaller baseline is accepted.
+    A wrong match can deform a whole model, but rarely in every run. A deformed model explains fewer
+    observations. So the run whose best model has most observations wins, as soon as a second run
+    has nearly as many. If no run gives a model, a smaller triangulation angle is allowed.
+
+    Raises:
+        UserError: no run gives a model.
     """
-    for least_angle in (INITIAL_ANGLE, RETRY_ANGLE):
-        tries: list[tuple[int, list]] = []
+    for min_angle in (INITIAL_ANGLE, RETRY_ANGLE):
+        attempts: list[tuple[int, list]] = []
         for number in range(MAX_ATTEMPTS):
             start = seed + number
             found = _map_once(
-                pycolmap, imported, database, folder, start, least_angle, progress, number
+                pycolmap, imported, database, folder, start, min_angle, progress, number
             )
             good = [
                 m
@@ -339,17 +354,17 @@ def _map(
                 if m.num_reg_images() >= MIN_PHOTOS and m.num_points3D() >= MIN_POINTS
             ]
             best = max((m.compute_num_observations() for m in good), default=0)
-            tries.append((best, good))
-            ranked = sorted((count for count, _ in tries), reverse=True)
+            attempts.append((best, good))
+            ranked = sorted((count for count, _ in attempts), reverse=True)
             if len(ranked) > 1 and ranked[1] >= MIN_AGREEMENT * ranked[0]:
                 break
-        best, good = max(tries, key=lambda one: one[0])
+        best, good = max(attempts, key=lambda attempt: attempt[0])
         if best:
             return good
     raise UserError(
-        "no three of the pictures fit together: they show too little in common, are blurred, or"
-        " were taken from nearly one spot; walk around the place and take each photo a step"
-        " further, with two thirds of the view in common"
+        "no three of the pictures fit together: they overlap too little, are blurred, or were taken"
+        " from nearly one position; walk around the scene and take each photo a step further, with"
+        " two thirds of overlap"
     )
 
 
@@ -359,7 +374,7 @@ def _map_once(
     database: Path,
     folder: Path,
     seed: int,
-    least_angle: float,
+    min_angle: float,
     progress: Progress,
     number: int,
 ) -> dict:
@@ -370,29 +385,30 @@ def _map_once(
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.min_model_size = MIN_PHOTOS
-    options.mapper.init_min_tri_angle = least_angle
-    # It places pictures that share hardly a point with the rest, and places some of them wrongly.
+    options.mapper.init_min_tri_angle = min_angle
+    # The fallback registers pictures that share few points with the rest, and some of them wrongly.
     options.structure_less_registration_fallback = False
-    placed, stage = 0, f"poses, try {number + 1}"
+    count, stage = 0, f"poses, attempt {number + 1}"
 
-    def one_more() -> None:
-        nonlocal placed
-        placed += 1
-        progress(stage, min(0.99, placed / len(imported.pictures)))
+    def count_picture() -> None:
+        nonlocal count
+        count += 1
+        progress(stage, min(0.99, count / len(imported.pictures)))
 
     found = pycolmap.incremental_mapping(
-        database, imported.folder, folder, options, next_image_callback=one_more
+        database, imported.folder, folder, options, next_image_callback=count_picture
     )
     progress(stage, 1.0)
     return found
 
 
 def _names(database: Path) -> list[str]:
+    """Return the names of the pictures in the database; delete a damaged database."""
     if not database.is_file():
         return []
     try:
         with contextlib.closing(read_only(database)) as connection:
             return [row[0] for row in connection.execute("SELECT name FROM images")]
     except sqlite3.Error:
-        database.unlink()  # half written: begun anew
+        database.unlink()  # incomplete: start again
         return []

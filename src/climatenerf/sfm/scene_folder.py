@@ -1,7 +1,7 @@
-"""A scene folder that capture writes and the user adds to: whose file is whose.
+"""Ownership of files in a scene folder that capture writes and the user may add to.
 
-A record in the folder lists what capture wrote there, with a digest of each file. What is not in
-it, or was changed since, is the user's and is never removed.
+A record in the folder lists the files that capture wrote, each with a digest. Files that are not in
+the record, or have changed since, belong to the user and are never removed.
 """
 
 import contextlib
@@ -16,62 +16,62 @@ from climatenerf.core.storage import explain, make_folder, read_json, write_json
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import FILE_NAME
 
-WORK = "work"  # folder in the scene: may be deleted when all is well
-RECORD = ".made-by-capture.json"  # beside `scene.json`, so that it outlives the work folder
-OLD_RECORD = "made-by-capture.json"  # in the work folder; it lists no files
-SIDECAR_KINDS = ("labels", "masks", "depth")  # folders that the user may fill too
+WORK = "work"  # subfolder for intermediate results; may be deleted after a complete capture
+RECORD = ".made-by-capture.json"  # beside `scene.json`, so that it survives deletion of `work`
+OLD_RECORD = "made-by-capture.json"  # record of earlier versions in `work`, without a list of files
+SIDECAR_KINDS = ("labels", "masks", "depth")  # subfolders to which the user may add files
 ENTRIES = (
     "images", "sparse", *SIDECAR_KINDS, FILE_NAME, "points.ply", "points_seen.npz", "report.md",
     "report.png", "mark.html",
 )  # fmt: skip
-IGNORED_NAMES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # left where folders are looked at
+IGNORED_NAMES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # files that file managers create
 
-# Path in the scene folder -> digests that a file of capture's may have there: one, or two while a
-# new scene takes the place of an old one.
+# Path in the scene folder -> valid digests of capture's file: one, or two while a new scene
+# replaces an old one.
 Record = dict[str, tuple[str, ...]]
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether a folder is a scene, or one that capture has begun."""
+    """Return True for a scene folder, complete or started by capture."""
     return any((folder / name).is_file() for name in (FILE_NAME, RECORD, f"{WORK}/{OLD_RECORD}"))
 
 
 def walk_once(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
-    """`os.walk` through linked folders too, each real folder once; links come last.
+    """Iterate like `os.walk`, but follow links and visit each real folder once; links come last.
 
-    As with `os.walk`, the list of folders may be changed to keep out of some.
+    As with `os.walk`, the caller may edit the list of folders to skip some.
     """
-    seen = set()
-    for place, folders, names in os.walk(top, followlinks=True):
-        here = Path(place)
-        if here.resolve() in seen:
+    visited = set()
+    for root, folders, names in os.walk(top, followlinks=True):
+        here = Path(root)
+        if here.resolve() in visited:
             folders.clear()
             continue
-        seen.add(here.resolve())
+        visited.add(here.resolve())
         folders.sort(key=lambda name, here=here: ((here / name).is_symlink(), name))
         yield here, folders, names
 
 
 def check_output(out: Path, given: Collection[str]) -> list[str]:
-    """The user's own files that a new scene leaves where they are, as paths in the folder.
+    """Return the user's files that a new scene keeps, as paths relative to the folder.
 
     Args:
-        out: the scene folder; it may be absent.
-        given: the kinds that are to be written anew.
+        out: the scene folder; it may be missing.
+        given: the kinds of sidecars that capture will write.
 
     Raises:
-        UserError: something that is not capture's would be lost.
+        UserError: a file of the user would be lost.
     """
     record = read_record(out)
     if record is None or (out / WORK).is_symlink():
         for name in (*ENTRIES, WORK):
             if os.path.lexists(out / name):
                 raise UserError(
-                    f"{out} already holds {name}, which no earlier capture made; choose another"
+                    f"{out} already contains {name}, which capture did not write; choose another"
                     " folder with -o"
                 )
         return []
-    kept = []
+    user_files = []
     for path in _files(out):
         key = _key(path, out)
         if path.name in IGNORED_NAMES or _digest(path) in record.get(key, ()):
@@ -79,33 +79,37 @@ def check_output(out: Path, given: Collection[str]) -> list[str]:
         kind = key.split("/")[0]
         if kind in given:
             raise UserError(
-                f"{path} is yours, and --{kind} would write {out / kind} anew; move it into the"
-                f" folder that --{kind} names, or leave --{kind} out"
+                f"{path} is your file, and --{kind} replaces all of {out / kind}; move it into the"
+                f" folder that --{kind} names, or omit --{kind}"
             )
-        if key == kind or kind not in SIDECAR_KINDS:  # a file where a folder should be, too
-            how = "was changed since capture wrote it" if key in record else "is not capture's"
+        if key == kind or kind not in SIDECAR_KINDS:  # also a file in place of a folder
+            reason = (
+                "has changed since capture wrote it"
+                if key in record
+                else "was not written by capture"
+            )
             raise UserError(
-                f"{path} {how} and would be lost; move it away, or choose another folder with -o"
+                f"{path} {reason} and would be lost; move it away, or choose another folder with -o"
             )
-        kept.append(key)
-    return kept
+        user_files.append(key)
+    return user_files
 
 
 def start_scene(out: Path) -> Path:
-    """The folder in which a scene is made before it takes its place, empty."""
+    """Create and return an empty folder in which a scene is built before it is installed."""
     record = read_record(out) or {}
-    write_record(out, record)  # first: what is there without it would bar the next run
+    write_record(out, record)  # first: without it the next run would refuse the other files
     new = make_folder(out / WORK) / "new"
     shutil.rmtree(new, ignore_errors=True)
     return make_folder(new)
 
 
 def discard_scene(out: Path, fresh: bool) -> None:
-    """Clears away a scene that did not come to be; all of the folder if it holds nothing of use.
+    """Delete an unfinished scene; also the whole folder if it contains nothing else.
 
     Args:
         out: the scene folder.
-        fresh: whether it was absent before.
+        fresh: True if the folder did not exist before.
     """
     shutil.rmtree(out / WORK / "new", ignore_errors=True)
     if fresh and not any(p.name != RECORD for p in out.rglob("*") if not p.is_dir()):
@@ -113,30 +117,30 @@ def discard_scene(out: Path, fresh: bool) -> None:
 
 
 def install_scene(out: Path, new: Path, given: Collection[str]) -> list[str]:
-    """Moves a finished scene to its place; what an earlier capture made goes, the user's stays.
+    """Move a finished scene into its folder; replace capture's old files and keep the user's.
 
     Args:
         out: the scene folder.
         new: the finished scene, on the same disk.
-        given: the kinds that are written anew.
+        given: the kinds of sidecars that capture writes.
 
     Returns:
-        The user's files that stay.
+        The user's files that are kept, as paths relative to the folder.
 
     Raises:
-        UserError: the user has put something in the way meanwhile, or a file cannot be moved.
+        UserError: the user has added a file that would be lost, or a file cannot be moved.
     """
-    kept = check_output(out, given)
-    told = read_json(new / FILE_NAME)
-    write_json(new / FILE_NAME, {**told, "root_absolute": str(out.absolute())})
+    user_files = check_output(out, given)
+    description = read_json(new / FILE_NAME)
+    write_json(new / FILE_NAME, {**description, "root_absolute": str(out.absolute())})
     before = read_record(out) or {}
     record = {_key(path, new): (_digest(path),) for path in _files(new)}
     both = {key: before.get(key, ()) + record.get(key, ()) for key in {**before, **record}}
-    write_record(out, both)  # stopped from here on, either file is known for capture's
+    write_record(out, both)  # if interrupted from here on, old and new files are both valid
     try:
         for name in ENTRIES:
-            if any(key.startswith(f"{name}/") for key in kept):
-                _remove_except(out / name, out, kept)
+            if any(key.startswith(f"{name}/") for key in user_files):
+                _remove_except(out / name, out, user_files)
                 continue
             _remove(out / name)
             if (new / name).exists():
@@ -144,55 +148,56 @@ def install_scene(out: Path, new: Path, given: Collection[str]) -> list[str]:
         shutil.rmtree(new, ignore_errors=True)
     except OSError as error:
         raise explain(error, out) from error
-    with contextlib.suppress(UserError):  # the larger record serves as well
+    with contextlib.suppress(UserError):  # the record of both is valid, too
         write_record(out, record)
-    return kept
+    return user_files
 
 
-def _remove(place: Path) -> None:
-    if place.is_dir() and not place.is_symlink():
-        shutil.rmtree(place)
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
     else:
-        place.unlink(missing_ok=True)
+        path.unlink(missing_ok=True)
 
 
-def _remove_except(place: Path, out: Path, kept: Collection[str]) -> None:
-    """Removes what is not kept from a folder; what lies behind a link is not of this folder."""
-    for here, folders, names in os.walk(place):
+def _remove_except(folder: Path, out: Path, user_files: Collection[str]) -> None:
+    """Remove all files of a folder but the user's; do not follow links."""
+    for here, folders, names in os.walk(folder):
         if Path(here).is_symlink():
             return
         folders[:] = [name for name in folders if not (Path(here) / name).is_symlink()]
         for path in (Path(here) / name for name in names):
-            if _key(path, out) not in kept:
+            if _key(path, out) not in user_files:
                 path.unlink()
 
 
 def read_record(out: Path) -> Record | None:
-    """What capture wrote into a folder; None if it never did.
+    """Return the record of a folder; None if capture never wrote to it.
 
-    A record of the former kind has no list: what its scene names and is not younger than the scene
-    counts as written by capture.
+    The record of earlier versions has no list of files. For these, the files that the scene names
+    and that are not newer than the scene count as written by capture.
     """
     if (out / RECORD).is_file():
         with contextlib.suppress(UserError, KeyError, AttributeError, TypeError):
             files = read_json(out / RECORD)["files"]
             return {str(path): tuple(map(str, digests)) for path, digests in files.items()}
-        return {}  # damaged: nothing is sure to be capture's
+        return {}  # damaged: no file is certain to be capture's
     if (out / WORK / OLD_RECORD).is_file():
         return {_key(path, out): (_digest(path),) for path in _old_record_files(out)}
     return None
 
 
 def write_record(out: Path, record: Record) -> None:
-    """Writes down which files capture wrote.
+    """Write the record of the files that capture wrote.
 
     Raises:
-        UserError: it cannot be written.
+        UserError: the record cannot be written.
     """
     write_json(out / RECORD, {"files": record})
 
 
 def _old_record_files(out: Path) -> list[Path]:
+    """Return the files that count as written by an earlier version of capture."""
     try:
         scene, when = load_scene(out), (out / FILE_NAME).stat().st_mtime_ns
     except (UserError, OSError):
@@ -214,24 +219,24 @@ def _old_record_files(out: Path) -> list[Path]:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """All files in the places of a scene, those behind links too."""
+    """Yield all files of the scene's entries in a folder, through links too."""
     for name in ENTRIES:
-        place = folder / name
-        if place.is_dir():
-            for here, _, names in walk_once(place):
-                yield from (here / one for one in sorted(names))
-        elif os.path.lexists(place):
-            yield place
+        entry = folder / name
+        if entry.is_dir():
+            for here, _, names in walk_once(entry):
+                yield from (here / file_name for file_name in sorted(names))
+        elif os.path.lexists(entry):
+            yield entry
 
 
 def _key(path: Path, folder: Path) -> str:
-    """A path in a folder as text that JSON can hold, whatever bytes its name is made of."""
+    """Return a path relative to a folder as text for JSON; other bytes than UTF-8 are escaped."""
     relative = path.relative_to(folder if path.is_relative_to(folder) else folder.absolute())
     return relative.as_posix().encode("utf-8", "backslashreplace").decode()
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file; "" of what cannot be read, which is no file of capture's."""
+    """Return the SHA-256 of a file; "" if it cannot be read (then it is not capture's)."""
     try:
         if not path.is_file():
             return ""

@@ -1,8 +1,8 @@
-"""Labels, masks and depths that the user has for the photos, brought into the scene's pictures.
+"""Import the user's labels, masks and depths for photos as sidecars of the scene's pictures.
 
-The scene's pictures are upright and without lens distortion, the photos are not: each file is
-turned as its photo was, and looked up pixel by pixel through the photo's lens (nearest neighbours,
-since a class or a depth between two others means nothing).
+The scene's pictures are upright and undistorted, the photos are not. Each file is rotated like its
+photo and resampled through the photo's lens. Sampling is nearest-neighbour, since classes and
+depths must not be interpolated.
 """
 
 from collections.abc import Mapping
@@ -20,20 +20,20 @@ from climatenerf.scene.scene import Scene, View
 
 SUFFIXES = {"labels": (".png",), "masks": (".png",), "depth": (".npz", ".npy", ".png")}
 READERS = {"labels": read_labels, "masks": read_mask, "depth": read_depth}
-OUTSIDE = {"labels": 255, "masks": 0, "depth": np.nan}  # where the photo does not reach
+OUTSIDE = {"labels": 255, "masks": 0, "depth": np.nan}  # value outside the photo
 FIELDS = {"labels": "label_path", "masks": "mask_path", "depth": "depth_path"}
-SAME_SHAPE = 0.02  # relative difference of two pictures' width over height
+SAME_SHAPE = 0.02  # largest relative difference of the aspect ratios of two equal shapes
 
 
 @dataclass(frozen=True)
 class Photo:
-    """The photo that a view comes from.
+    """The photo behind a view.
 
     Attributes:
-        source: path relative to the photos' folder.
-        lens: its camera, before undistortion.
-        orientation: EXIF's tag, 1 to 8.
-        shown: whether the lens is that of the picture as shown, not as stored.
+        source: path relative to the folder of photos.
+        lens: camera of the photo, before undistortion.
+        orientation: EXIF orientation, 1 to 8.
+        shown: True if `lens` describes the picture as shown, False if as stored.
     """
 
     source: str
@@ -43,13 +43,13 @@ class Photo:
 
 
 def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Photo]) -> Scene:
-    """The scene with the user's files of one kind for its views, written into its folder.
+    """Write the user's files of one kind into a scene's folder and return the scene with them.
 
     Args:
-        scene: whose `root` has none of this kind yet.
+        scene: the scene; its `root` has no files of this kind yet.
         kind: "labels", "masks" or "depth".
         folder: the user's files, named like the photos: `A/IMG_1.png` or `A/IMG_1.jpg.png`.
-        photos: of each view, by its name.
+        photos: the photo of each view, by the view's name.
 
     Raises:
         UserError: no file for any view, or a file that cannot be used.
@@ -58,26 +58,26 @@ def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, 
     if not any(found.values()):
         wanted = Path(photos[scene.views[0].name].source).with_suffix(SUFFIXES[kind][0])
         raise UserError(
-            f"--{kind} {folder} holds nothing for any photo; name the files like {wanted}"
+            f"--{kind} {folder} contains no file for any photo; name the files like {wanted}"
         )
     values = {name: READERS[kind](path) for name, path in found.items() if path is not None}
-    as_stored, sure = _infer_stored(values, photos)
+    as_stored, certain = _infer_stored(values, photos)
     views = []
     for view in scene.views:
         if view.name in values:
             photo = photos[view.name]
-            one = _to_lens_frame(values.pop(view.name), photo, as_stored, found[view.name])
-            one = _resample(one, photo.lens, scene.cameras[view.camera], OUTSIDE[kind])
-            view = replace(view, **{FIELDS[kind]: _write(scene.root / kind, kind, view, one)})
+            sidecar = _to_lens_frame(values.pop(view.name), photo, as_stored, found[view.name])
+            sidecar = _resample(sidecar, photo.lens, scene.cameras[view.camera], OUTSIDE[kind])
+            view = replace(view, **{FIELDS[kind]: _write(scene.root / kind, kind, view, sidecar)})
         views.append(view)
     warnings = list(scene.warnings)
     missing = sum(path is None for path in found.values())
     if missing:
         warnings.append(f"{missing} of {len(views)} pictures have no {kind}.")
-    if not sure:
+    if not certain:
         warnings.append(
-            f"Some photos are turned by half or mirrored by their EXIF; their {kind} are taken to"
-            " be made of the photos as shown, not as stored: look at them."
+            f"EXIF rotates some photos by 180 degrees or mirrors them. Their {kind} are assumed to"
+            " match the photos as shown, not as stored; check them."
         )
     return replace(scene, views=tuple(views), warnings=tuple(warnings))
 
@@ -85,16 +85,19 @@ def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, 
 def _infer_stored(
     values: Mapping[str, np.ndarray], photos: Mapping[str, Photo]
 ) -> tuple[bool, bool]:
-    """Whether files are of photos as stored, told by the shapes of those on edge; and if surely."""
+    """Infer from shapes whether the files match the photos as stored; and whether that is certain.
+
+    Only photos that EXIF rotates by 90 degrees show the difference in the shape of their file.
+    """
     stored = shown = 0
-    for name, one in values.items():
+    for name, sidecar in values.items():
         photo = photos[name]
         if photo.orientation >= 5 and photo.lens.width != photo.lens.height:
-            same = _same_shape(one, photo.lens)
+            same = _same_shape(sidecar, photo.lens)
             stored += same != photo.shown
             shown += same == photo.shown
-    unclear = any(photos[name].orientation in (2, 3, 4) for name in values)
-    return stored > shown, bool(stored or shown) or not unclear
+    ambiguous = any(photos[name].orientation in (2, 3, 4) for name in values)
+    return stored > shown, bool(stored or shown) or not ambiguous
 
 
 def _same_shape(values: np.ndarray, lens: Camera) -> bool:
@@ -105,9 +108,13 @@ def _same_shape(values: np.ndarray, lens: Camera) -> bool:
 def _to_lens_frame(
     values: np.ndarray, photo: Photo, as_stored: bool, path: Path | None
 ) -> np.ndarray:
-    """The file in the frame of the photo's lens."""
-    on_edge = photo.orientation >= 5
-    if on_edge and photo.lens.width != photo.lens.height:
+    """Rotate a file's values to the pixel axes of the photo's lens.
+
+    Raises:
+        UserError: the file has another aspect ratio than the photo.
+    """
+    quarter_turn = photo.orientation >= 5
+    if quarter_turn and photo.lens.width != photo.lens.height:
         as_stored = _same_shape(values, photo.lens) != photo.shown
     if as_stored and photo.shown:
         values = orient(values, photo.orientation)
@@ -115,22 +122,24 @@ def _to_lens_frame(
         values = orient(values, {6: 8, 8: 6}.get(photo.orientation, photo.orientation))
     if not _same_shape(values, photo.lens):
         raise UserError(
-            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, another shape than its photo"
-            f" ({photo.lens.width}x{photo.lens.height}); make it from the whole photo"
+            f"{path} has {values.shape[1]}x{values.shape[0]} pixels, but its photo has another"
+            f" aspect ratio ({photo.lens.width}x{photo.lens.height} pixels); make the file from the"
+            " whole photo"
         )
     return values
 
 
 def orient(values: np.ndarray, orientation: int) -> np.ndarray:
-    """An array of stored pixels as EXIF's tag wants it shown."""
-    turns = {
+    """Return an array of stored pixels [h, w] as shown by the EXIF orientation."""
+    operations = {
         2: np.fliplr, 3: lambda a: np.rot90(a, 2), 4: np.flipud, 5: np.transpose,
         6: lambda a: np.rot90(a, -1), 7: lambda a: np.rot90(a, 2).T, 8: np.rot90,
     }  # fmt: skip
-    return turns[orientation](values) if orientation in turns else values
+    return operations[orientation](values) if orientation in operations else values
 
 
 def _find_file(folder: Path, kind: str, source: str, name: str) -> Path | None:
+    """Return the file of a view: named like its photo, with or without folders, or the view."""
     for base in (Path(source), Path(source).name, Path(name)):
         for suffix in SUFFIXES[kind]:
             for candidate in (folder / base).with_suffix(suffix), folder / f"{base}{suffix}":
@@ -140,13 +149,13 @@ def _find_file(folder: Path, kind: str, source: str, name: str) -> Path | None:
 
 
 def _resample(values: np.ndarray, lens: Camera, target: Camera, outside: float) -> np.ndarray:
-    """Values at the target camera's pixels, looked up in a file for the other lens' picture."""
+    """Resample values [h, w] of the lens' picture at the target camera's pixels, nearest."""
     scale = np.array([values.shape[1] / lens.width, values.shape[0] / lens.height])
-    at = target.pixel_centres() if lens == target else lens.project(target.directions())
-    inside = (at >= 0).all(-1) & (at[..., 0] < lens.width) & (at[..., 1] < lens.height)
-    x, y = (np.where(inside[..., None], at, 0.0) * scale).astype(np.int64).T
-    found = values[np.minimum(y, len(values) - 1), np.minimum(x, values.shape[1] - 1)].T
-    return np.where(inside, found, np.array(outside).astype(values.dtype))
+    pixel = target.pixel_centres() if lens == target else lens.project(target.directions())
+    inside = (pixel >= 0).all(-1) & (pixel[..., 0] < lens.width) & (pixel[..., 1] < lens.height)
+    x, y = (np.where(inside[..., None], pixel, 0.0) * scale).astype(np.int64).T
+    sampled = values[np.minimum(y, len(values) - 1), np.minimum(x, values.shape[1] - 1)].T
+    return np.where(inside, sampled, np.array(outside).astype(values.dtype))
 
 
 def _write(folder: Path, kind: str, view: View, values: np.ndarray) -> Path:

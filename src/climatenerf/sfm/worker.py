@@ -1,8 +1,8 @@
-"""Structure from motion in a process of its own.
+"""Run structure from motion in a subprocess.
 
-COLMAP ends its process where a disk is full or memory is short. Here that becomes a sentence,
-Ctrl-C takes effect at once, and what was finished stays in the work folder. The two sides speak
-JSON lines.
+COLMAP ends its process on a full disk or when memory runs out. The parent turns that into a
+`UserError`, Ctrl-C takes effect at once, and finished stages stay in the work folder. Parent and
+worker exchange JSON lines over pipes.
 """
 
 import contextlib
@@ -21,23 +21,23 @@ from climatenerf.core.storage import explain, plain
 from climatenerf.sfm.photo_import import PhotoImport, picture_from_json
 from climatenerf.sfm.reconstruct import Model, Progress, read_result, reconstruct
 
-NEARLY_FULL = 20_000_000  # bytes free, below which a crash is put down to the disk
+MIN_FREE_BYTES = 20_000_000  # with less free space a crash is attributed to the full disk
 LOG = "colmap.log"
 
-# COLMAP matches on threads of its own. Where each of them lets OpenBLAS gather a team as well, the
-# approximate neighbours of two pictures differed between equal runs (one in a hundred, under load).
+# COLMAP matches on its own threads. If each of them also starts OpenBLAS threads, the approximate
+# nearest neighbours of two pictures can differ between equal runs (1 in 100, under load).
 WORKER_ENVIRONMENT = {"OMP_NUM_THREADS": "1"}
 
 
 def reconstruct_in_subprocess(
     imported: PhotoImport, work: Path, out: Path, features: int, seed: int, progress: Progress
 ) -> Model:
-    """`reconstruct` in another process; arguments and errors are its own.
+    """Run `reconstruct` in a subprocess, with the same arguments, and return its result.
 
     Raises:
-        UserError: as `reconstruct`, or the process ended before its time.
+        UserError: as `reconstruct`, or the subprocess ended early.
     """
-    order = {
+    request = {
         "imported": asdict(imported),
         "work": work,
         "out": out,
@@ -55,24 +55,24 @@ def reconstruct_in_subprocess(
             stdout=subprocess.PIPE,
             stderr=log,
             env={**os.environ, **WORKER_ENVIRONMENT},
-            start_new_session=True,  # Ctrl-C is for this side, which ends the other one
+            start_new_session=True,  # Ctrl-C reaches the parent only, which ends the worker
         )
     assert process.stdin is not None and process.stdout is not None
     finished = False
     try:
-        # The pipe stays open: its end tells the worker that this side is gone.
-        process.stdin.write(json.dumps(plain(order)).encode() + b"\n")
+        # The pipe stays open: the worker exits when it closes.
+        process.stdin.write(json.dumps(plain(request)).encode() + b"\n")
         process.stdin.flush()
         for line in process.stdout:
-            words = json.loads(line)
-            if "error" in words:
-                raise UserError(words["error"])
-            if "stage" in words:
-                progress(words["stage"], words["share"])
-            finished = "done" in words
+            message = json.loads(line)
+            if "error" in message:
+                raise UserError(message["error"])
+            if "stage" in message:
+                progress(message["stage"], message["fraction"])
+            finished = "done" in message
         process.wait(10)
     except (BrokenPipeError, subprocess.TimeoutExpired):
-        pass  # why it ended is told below
+        pass  # `_failure` finds the cause
     finally:
         process.kill()
         process.wait()
@@ -86,51 +86,56 @@ def reconstruct_in_subprocess(
 
 
 def _failure(work: Path, status: int) -> str:
-    """The probable cause of a worker's end, and the remedy."""
-    if shutil.disk_usage(work).free < NEARLY_FULL:
+    """Return the probable cause of a worker's early end, and the remedy."""
+    if shutil.disk_usage(work).free < MIN_FREE_BYTES:
         return (
-            f"the disk is full: could not go on in {work}; free some space or choose another folder"
-            " (what was already saved is unharmed)"
+            f"the disk is full: could not write to {work}; free some space or choose another folder"
+            " (files that were already saved are intact)"
         )
     if status == -signal.SIGKILL:
-        return "finding poses was ended from outside, likely for memory; try --features 2048"
-    words = (work / LOG).read_text(errors="replace").strip().splitlines()
-    last = next((line for line in reversed(words) if "] " in line or "Error" in line), "")
-    last = last or f"it ended with status {status}"
-    return f"finding poses failed ({last.strip()[:300]}); see {work / LOG}, and run it again"
+        return (
+            "the computation of poses was killed, probably for lack of memory; try --features 2048"
+        )
+    lines = (work / LOG).read_text(errors="replace").strip().splitlines()
+    last = next((line for line in reversed(lines) if "] " in line or "Error" in line), "")
+    last = last or f"exit status {status}"
+    return (
+        f"the computation of poses failed ({last.strip()[:300]}); see {work / LOG}, and run the"
+        " command again"
+    )
 
 
 def main() -> None:
-    """The worker's side: an order on standard input, progress and errors on standard output."""
-    order = json.loads(sys.stdin.readline())
+    """Run the worker: read a request from standard input, write progress to standard output."""
+    request = json.loads(sys.stdin.readline())
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    # COLMAP, too, may write to standard output: it goes where errors go.
-    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    # COLMAP may also write to standard output: redirect that to standard error.
+    output = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
 
-    def say(words: dict) -> None:
-        answers.write(json.dumps(words) + "\n")
+    def send(message: dict) -> None:
+        output.write(json.dumps(message) + "\n")
 
-    told = order["imported"]
+    fields = request["imported"]
     imported = PhotoImport(
-        folder=Path(told["folder"]),
-        pictures=tuple(picture_from_json(picture) for picture in told["pictures"]),
-        unusable=told["unusable"],
-        is_video=told["is_video"],
+        folder=Path(fields["folder"]),
+        pictures=tuple(picture_from_json(picture) for picture in fields["pictures"]),
+        unusable=fields["unusable"],
+        is_video=fields["is_video"],
     )
     try:
         reconstruct(
             imported,
-            Path(order["work"]),
-            Path(order["out"]),
-            order["features"],
-            order["seed"],
-            lambda stage, share: say({"stage": stage, "share": share}),
+            Path(request["work"]),
+            Path(request["out"]),
+            request["features"],
+            request["seed"],
+            lambda stage, fraction: send({"stage": stage, "fraction": fraction}),
         )
     except UserError as error:
-        say({"error": str(error)})
+        send({"error": str(error)})
     else:
-        say({"done": True})
+        send({"done": True})
 
 
 def _exit_with_parent() -> None:
