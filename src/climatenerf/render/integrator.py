@@ -18,6 +18,7 @@ from torch import Tensor
 from climatenerf.core.samples import MIN_WEIGHT, Samples, offsets_of
 from climatenerf.field.compositing import RENDER_STEP, chunks, composited
 from climatenerf.ops import compositing
+from climatenerf.render.measurements import MIN_FRACTION, LightShares, measure, total
 from climatenerf.weather import media
 from climatenerf.weather.world import (
     SKY_OPACITY,
@@ -30,7 +31,6 @@ from climatenerf.weather.world import (
 )
 
 HIDDEN = 1e-3  # transmittance below which matter is not looked for
-MIN_FRACTION = 1.0 / 2048  # of a pixel, that a surface must have to be shaded: below an 8-bit step
 BOUNCES = 2  # hits on surfaces; beyond, rays see the world without surfaces
 SECONDARY_STEP = 5.0  # marching step of rays behind a hit, which blur; RENDER_STEP: of camera rays
 
@@ -87,7 +87,7 @@ def _trace(
             meets |= (surface.distance(rays_o, rays_d) < torch.inf) | surface.inside(rays_o)
         if not bool(meets.all()):
             dry, wet = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
-            parts = [_trace_field(world, rays_o[dry], rays_d[dry], t_min[dry], step_scale)]
+            parts = [_trace_field(world, rays_o[dry], rays_d[dry], t_min[dry], bounces)]
             if wet.numel():
                 rotation = None if sample_rotation is None else sample_rotation[wet]
                 given = rays_o[wet], rays_d[wet], pixel_angle[wet], rotation, t_min[wet]
@@ -110,7 +110,7 @@ def _trace(
         t = torch.where(nearest == index, t_surface, torch.inf)
         behind += surface.fraction_behind(world, along, rays_o, rays_d, t, pixel_angle)
     front = weights * (1 - behind)
-    surface_weight = _sum(weights * behind, samples.offsets)
+    surface_weight = total(weights * behind, samples.offsets)
     surface_weight = surface_weight + transmittance * (t_surface < torch.inf)
     sky_weight = transmittance * (t_surface == torch.inf)
     arrive = partial(_arrive, world, surfaces, rays_o, rays_d)
@@ -141,8 +141,8 @@ def _trace(
             continue
         if t_bottom is None:
             # 1e-6: a surface with nothing behind it would give 0/0.
-            weight_behind = _sum(weights * behind, samples.offsets).clamp_min(1e-6)
-            t_bottom = _sum(weights * behind * samples.t, samples.offsets) / weight_behind
+            weight_behind = total(weights * behind, samples.offsets).clamp_min(1e-6)
+            t_bottom = total(weights * behind * samples.t, samples.offsets) / weight_behind
         rotation = None if sample_rotation is None else sample_rotation[hit]
         rays = rays_o[hit], rays_d[hit], t_surface[hit], t_bottom[hit], pixel_angle[hit], rotation
         shaded, own_normal, extra = surface.shade(
@@ -154,31 +154,10 @@ def _trace(
         for name, values in extra.items():
             layers[name][hit] = values
 
-    # --- Layers -------------------------------------------------------------------------------
-    matter_weight = _sum(front, samples.offsets)
-    # Of the nearer kind alone: a trace of far water must not move the depth of near matter.
-    depth = _sum(front * samples.t, samples.offsets) / matter_weight.clamp_min(TINY)
-    depth = torch.where(surface_weight > matter_weight, t_surface, depth)
-    depth = torch.where(sky_weight < SKY_OPACITY, depth, endless)
-    normal = torch.where((surface_weight > 0.5)[:, None], normal, torch.zeros(n, 3))
-    passed = torch.ones(n)
-    for medium in world.media:
-        own = media.transmittance([medium], rays_o, rays_d, depth)
-        layers[medium.mask] = 1 - own
-        passed = passed * own
-    for index, matter in enumerate(world.matters, start=1):
-        weight = _sum(front * (kind == index), samples.offsets)
-        layers[matter.mask] = weight
-        mine = keep[kind[keep] == index]
-        x = rays_o[ray[mine]] + samples.t[mine, None] * rays_d[ray[mine]]
-        height = matter.thickness(x)[:, None]
-        thickness = compositing.accumulate(front[mine], height, offsets_of(ray[mine], n))[:, 0]
-        thickness = thickness / weight.clamp_min(TINY) * (weight > MIN_FRACTION)
-        layers[matter.thickness_layer] = thickness
-        if bounces == BOUNCES:
-            seen = ((weight > 0.5) & (surface_weight <= 0.5)).nonzero()[:, 0]
-            normal[seen] = matter.normal(rays_o[seen] + depth[seen, None] * rays_d[seen])
-    return RenderOutput(rgb, depth, normal, passed, layers)
+    if bounces < BOUNCES:
+        return _radiance_alone(rgb)
+    shares = LightShares(along, kind, front, surface_weight, sky_weight, t_surface)
+    return measure(world, rays_o, rays_d, rgb, shares, normal, layers)
 
 
 def _radiance(
@@ -189,17 +168,26 @@ def _radiance(
     return _trace(world, rays_o, rays_d, pixel_angle, None, start, bounces).rgb
 
 
+def _radiance_alone(rgb: Float[Tensor, "n 3"]) -> RenderOutput:
+    """Output of secondary rays, of which only the radiance is used."""
+    nothing = torch.zeros(rgb.shape[0])
+    return RenderOutput(rgb, nothing, torch.zeros_like(rgb), nothing)
+
+
 def _trace_field(
-    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
+    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, bounces: int
 ) -> RenderOutput:
     """What rays see of the scene without weather: as `_trace`, in one launch on a GPU."""
     n = t_min.shape[0]
+    step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
     rgb, transmittance, length = composited(
         world.field, rays_o, rays_d, t_min, step_scale, appearance=world.appearance
     )
     skyward = (transmittance > MIN_WEIGHT).nonzero()[:, 0]
     sky = world.field.sky(rays_d[skyward], world.appearance)
     rgb = rgb.index_add(0, skyward, transmittance[skyward, None] * sky)
+    if bounces < BOUNCES:
+        return _radiance_alone(rgb)
     depth = length / (1 - transmittance).clamp_min(TINY)
     nothing = torch.zeros(n)
     return RenderOutput(
@@ -290,7 +278,3 @@ def _arrive(
             through = surface.attenuate(radiance, o, d, t)
             arriving = torch.where(within[:, None], through, arriving)
     return arriving
-
-
-def _sum(values: Float[Tensor, "s"], offsets: Int[Tensor, "n+1"]) -> Float[Tensor, "n"]:
-    return compositing.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]

@@ -1,4 +1,4 @@
-"""How brightly a fitted scene is lit: what a white sheet on open ground would show."""
+"""Irradiance of a fitted scene on open level ground, from its light field."""
 
 import math
 
@@ -14,22 +14,22 @@ from climatenerf.render.volume import camera_rays
 from climatenerf.scene.scene import Scene, View
 from climatenerf.weather.world import World
 
-PLACES = 8
-DIRECTIONS = 256
-SINKS = -0.2  # rays that sink less may show walls and trees
-GROUND_ALBEDO = 0.12  # to the eye: grass .08, soil and asphalt .1, concrete .3
+CAMERAS = 8  # from which light is gathered
+DIRECTIONS = 256  # from each
+MAX_DZ = -0.2  # steeper rays show ground; others may show walls and trees
+GROUND_ALBEDO = 0.12  # photopic: grass .08, soil and asphalt .1, concrete .3
 
 
 @torch.no_grad()
 def scene_irradiance(
     field: RadianceField, scene: Scene, appearance: Float[Tensor, "1 e"] | None = None
 ) -> Float[Tensor, "3"]:
-    """Irradiance E on open level ground, linear, from the fitted light field.
+    """Return the linear irradiance E on open level ground.
 
-    The larger of two estimates, since photos clip the sun and bright sky: the cosine-weighted mean
-    of what is seen upwards, and the ground's mean radiance over an albedo of 0.12. The colour is
-    half that of the light from above, half white. A white sheet is at most as bright as
-    the picture can show: who photographs snow exposes for it.
+    Photos clip the sun and bright sky, so E is the larger of two estimates: the cosine-weighted
+    mean of the radiance from above, and the ground's mean radiance over an albedo of 0.12. Its
+    colour is half that of the light from above, half white. E is at most pi: a white sheet is at
+    most as bright as the picture can show, as in a photo that is exposed for snow.
 
     Args:
         field: the fitted field.
@@ -38,18 +38,19 @@ def scene_irradiance(
         appearance: exposure and light of a photo; None: the mean of all photos.
     """
     views = scene.of_split("train")
-    some = views[:: max(1, len(views) // PLACES)][:PLACES]
+    chosen = views[:: max(1, len(views) // CAMERAS)][:CAMERAS]
     up = _cosine_directions(DIRECTIONS)
-    eyes = torch.tensor(np.stack([scene.c2w_world(view)[:3, 3] for view in some])).float()
+    eyes = torch.tensor(np.stack([scene.c2w_world(view)[:3, 3] for view in chosen])).float()
     world = World(field, appearance=appearance)
-    above = _radiance(world, eyes.repeat_interleave(DIRECTIONS, 0), up.repeat(len(some), 1))
+    above = _radiance(world, eyes.repeat_interleave(DIRECTIONS, 0), up.repeat(len(chosen), 1))
     above = above.mean(0)
-    ground_o, ground_d = _photographed_ground(scene, some)
+    ground_o, ground_d = _photographed_ground(scene, chosen)
     if not ground_d.shape[0]:
         return math.pi * above / luma(above).clamp_min(1.0)
     lit = luma(_radiance(world, ground_o, ground_d)).mean() / GROUND_ALBEDO
     brightness = luma(above)
-    # Photos are balanced to the light on what they show, so half of the tint is not the light's.
+    # White balance adapts to the scene, so only half of the tint is the light's.
+    # 1e-6: a black sky would give 0/0.
     colour = 0.5 * (above + brightness)
     colour = colour * torch.clamp(lit / brightness.clamp_min(1e-6), min=1.0, max=3.0)
     return math.pi * colour / luma(colour).clamp_min(1.0)
@@ -60,20 +61,20 @@ def _radiance(world: World, o: Tensor, d: Tensor) -> Float[Tensor, "n 3"]:
 
 
 def _photographed_ground(scene: Scene, views: tuple[View, ...]) -> tuple[Tensor, Tensor]:
-    """Rays of a coarse grid of the views' pixels that sink by more than `SINKS`."""
+    """Origins (m) and unit directions of a coarse grid of the views' pixels that look down."""
     origins, directions = [torch.empty(0, 3)], [torch.empty(0, 3)]
     for view in views:
         camera = scene.cameras[view.camera]
         small = camera.resized(16, max(1, round(16 * camera.height / camera.width)))
         o, d = camera_rays(small, scene.c2w_world(view))
-        down = d[:, 2] < SINKS
+        down = d[:, 2] < MAX_DZ
         origins.append(o[down])
         directions.append(d[down])
     return torch.cat(origins), torch.cat(directions)
 
 
 def _cosine_directions(n: int) -> Float[Tensor, "n 3"]:
-    """Upward directions whose mean is the cosine-weighted mean (Malley's method, spiral)."""
+    """Upward unit directions, cosine-distributed (Malley's method on a spiral)."""
     i = torch.arange(n) + 0.5
     radius, angle = (i / n).sqrt(), i * (math.pi * (3 - math.sqrt(5)))
     return torch.stack([radius * angle.cos(), radius * angle.sin(), (1 - i / n).sqrt()], dim=-1)

@@ -1,5 +1,5 @@
-"""Weather: its parameters and its physics.
+"""Weather effects: each a package of parameters, physics and entity, listed in `registry`.
 
-`parameters`, `units`, `description` and `spectrum` load no torch; the rest of the physics (`smog`,
-`flood`, `waves`, `fresnel`, `snow`) does.
+`effect`, `registry`, `weather`, `description`, `units` and the `parameters` of each effect load no
+torch; `world`, `media` and the physics do.
 """

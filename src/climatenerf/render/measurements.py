@@ -1,0 +1,72 @@
+"""Depth, normals and measured layers of camera rays, from how their light is divided."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from climatenerf.core.samples import MIN_WEIGHT, offsets_of
+from climatenerf.ops import compositing
+from climatenerf.weather import media
+from climatenerf.weather.world import SKY_OPACITY, TINY, RaySamples, RenderOutput, World
+
+MIN_FRACTION = 1.0 / 2048  # of a pixel, below an 8-bit step: less is neither shaded nor measured
+
+
+@dataclass(frozen=True)
+class LightShares:
+    """How the light of n rays is divided among samples, surfaces and sky."""
+
+    along: RaySamples
+    kind: Int[Tensor, "s"]
+    """Of each sample: 0 the field's, k the k-th matter's."""
+    front: Float[Tensor, "s"]
+    """Weight of each sample in front of the surface."""
+    surface: Float[Tensor, "n"]
+    """Weight of what the surface shows."""
+    sky: Float[Tensor, "n"]
+    """Weight of the sky."""
+    t_surface: Float[Tensor, "n"]
+    """Ray length to the surface, m; +inf without."""
+
+
+def measure(
+    world: World,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    rgb: Float[Tensor, "n 3"],
+    shares: LightShares,
+    surface_normal: Float[Tensor, "n 3"],
+    layers: dict[str, Float[Tensor, "n"]],
+) -> RenderOutput:
+    """Measure what camera rays see; `layers` holds those of the surfaces, others are added."""
+    samples, ray, n = shares.along.samples, shares.along.ray, rgb.shape[0]
+    matter_weight = total(shares.front, samples.offsets)
+    # Of the nearer kind alone: a trace of far water must not move the depth of near matter.
+    depth = total(shares.front * samples.t, samples.offsets) / matter_weight.clamp_min(TINY)
+    depth = torch.where(shares.surface > matter_weight, shares.t_surface, depth)
+    depth = torch.where(shares.sky < SKY_OPACITY, depth, torch.inf)
+    normal = torch.where((shares.surface > 0.5)[:, None], surface_normal, torch.zeros(n, 3))
+    passed = torch.ones(n)
+    for medium in world.media:
+        own = media.transmittance([medium], rays_o, rays_d, depth)
+        layers[medium.mask] = 1 - own
+        passed = passed * own
+    for index, matter in enumerate(world.matters, start=1):
+        weight = total(shares.front * (shares.kind == index), samples.offsets)
+        layers[matter.mask] = weight
+        mine = ((shares.kind == index) & (shares.front > MIN_WEIGHT)).nonzero()[:, 0]
+        x = rays_o[ray[mine]] + samples.t[mine, None] * rays_d[ray[mine]]
+        height = matter.thickness(x)[:, None]
+        thickness = compositing.accumulate(shares.front[mine], height, offsets_of(ray[mine], n))
+        thickness = thickness[:, 0] / weight.clamp_min(TINY) * (weight > MIN_FRACTION)
+        layers[matter.thickness_layer] = thickness
+        seen = ((weight > 0.5) & (shares.surface <= 0.5)).nonzero()[:, 0]
+        normal[seen] = matter.normal(rays_o[seen] + depth[seen, None] * rays_d[seen])
+    return RenderOutput(rgb, depth, normal, passed, layers)
+
+
+def total(values: Float[Tensor, "s"], offsets: Int[Tensor, "n+1"]) -> Float[Tensor, "n"]:
+    """Sum of the samples' values along each ray."""
+    return compositing.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]
