@@ -168,7 +168,7 @@ def test_larger_of_two_unconnected_groups_is_kept(tmp_path, capsys):
         mirrored.save(tmp_path / "in" / f"there-{path.stem}.jpg", quality=95)
     assert run_cli("capture", tmp_path / "in", "-o", tmp_path / "scene") == 0
     output = capsys.readouterr()
-    assert re.search(r"2 groups that do not fit together \(1\d, [789] pictures\)", output.err)
+    assert re.search(r"2 unconnected groups \(1\d, [789] pictures\)", output.err)
     assert "not connected to the rest" in output.err
     names = [view.name for view in load_scene(tmp_path / "scene").views]
     assert len(names) >= 12 and all(name.startswith("here-") for name in names)

@@ -425,7 +425,7 @@ def test_unusual_names_and_reproducible_runs(tmp_path, capsys, monkeypatch):
         assert sfm(photos, out) == 0
         assert not list(here.iterdir()), "no files in the working directory"
         output = capsys.readouterr()
-        assert "broken.jpg is left out" in output.err and "Traceback" not in output.err
+        assert "broken.jpg is skipped" in output.err and "Traceback" not in output.err
         poses.append({view.name: view.c2w for view in load_scene(out).views})
         with contextlib.closing(sqlite3.connect(out / "work" / "database.db")) as connection:
             query = "SELECT pair_id, rows, data FROM two_view_geometries ORDER BY pair_id"

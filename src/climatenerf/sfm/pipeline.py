@@ -1,4 +1,4 @@
-"""From bare photos or a video to a scene folder: pictures, poses, metres, the user's sidecars."""
+"""The capture pipeline: from photos or a video to a scene folder with poses in metres."""
 
 import os
 import shutil
@@ -46,18 +46,18 @@ from climatenerf.sfm.worker import reconstruct_in_subprocess
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """What a scene is made from.
+    """Inputs and options of a capture.
 
     Attributes:
-        photos: Folder of photos, or a video.
-        out: Scene folder.
-        marks: File of the marks at which known lengths end.
-        features: Maximum number of features per picture.
-        from_colmap: Folder of a COLMAP model of the photos, to take the poses from.
-        sidecars: Folders of labels, masks and depth files by kind.
-        camera_height: Height of the cameras above the ground, m.
-        known_lengths: Names and lengths, m.
-        seed: Random seed of structure from motion.
+        photos: folder of photos, or a video.
+        out: scene folder.
+        marks: file with the marks at the ends of known lengths.
+        features: largest number of features per picture.
+        from_colmap: folder of a COLMAP model with poses of the photos; None: compute the poses.
+        sidecars: folders of labels, masks and depth files by kind.
+        camera_height: height of the cameras above the ground, m; None: unknown.
+        known_lengths: names and lengths, m.
+        seed: random seed of structure from motion.
     """
 
     photos: Path
@@ -72,18 +72,18 @@ class CaptureSettings:
 
     @property
     def excluded(self) -> list[Path]:
-        """Folders whose pictures are no photos to pose."""
+        """Folders whose pictures are not photos."""
         return [self.out, *self.sidecars.values()]
 
 
 @dataclass(frozen=True)
 class Listener:
-    """Callbacks for what a user wants to know meanwhile.
+    """Callbacks for messages and progress.
 
     Attributes:
-        note: Called with a sentence.
-        warn: Called with a sentence about what should be mended.
-        progress: Called with a stage and the fraction of it that is done.
+        note: called with a sentence of information.
+        warn: called with a sentence about a problem.
+        progress: called with (stage, finished fraction of the stage).
     """
 
     note: Callable[[str], None]
@@ -93,14 +93,14 @@ class Listener:
 
 @dataclass(frozen=True)
 class Captured:
-    """A scene that was made.
+    """Result of a capture.
 
     Attributes:
-        scene: The scene, in metres.
-        model: What structure from motion found.
-        unposed: Pictures without pose, with reason and remedy.
-        kept: Files of the user that stay in the scene folder, relative to it.
-        length_error: Why known lengths could not be used, or None.
+        scene: the scene, in metres.
+        model: result of structure from motion.
+        unposed: pictures without pose, with reason and remedy.
+        kept: the user's files that are kept in the scene folder, relative to it.
+        length_error: why known lengths could not be used; None if they could.
     """
 
     scene: Scene
@@ -111,10 +111,11 @@ class Captured:
 
 
 def check_settings(settings: CaptureSettings) -> None:
-    """Refuse settings that cannot lead to a scene, before any work is done.
+    """Check the settings before any work is done.
 
     Raises:
-        UserError: a value out of its range, a folder that is absent, or files in the way.
+        UserError: a value is out of range, a folder is missing, or a file of the user would be
+            lost.
     """
     out = settings.out
     if not 64 <= settings.features <= 32768:
@@ -127,7 +128,9 @@ def check_settings(settings: CaptureSettings) -> None:
         raise UserError(f"{settings.photos} does not exist; give a folder of photos or a video")
     for kind, folder in settings.sidecars.items():
         if not (folder.is_dir() and any(folder.iterdir())):
-            raise UserError(f"--{kind} {folder} is no folder with files; give the folder of them")
+            raise UserError(
+                f"--{kind} {folder} is missing or empty; give the folder with the {kind} files"
+            )
     if out.is_symlink() and not out.exists():
         raise UserError(
             f"{out} is a link to {os.readlink(out)}, which does not exist; make that folder, or"
@@ -135,7 +138,7 @@ def check_settings(settings: CaptureSettings) -> None:
         )
     for path in (settings.photos, settings.from_colmap, *settings.sidecars.values()):
         if path is not None and path.resolve().is_relative_to(out.resolve()):
-            raise UserError(f"{path} lies in {out}; choose another folder with -o")
+            raise UserError(f"{path} is inside {out}; choose another folder with -o")
     check_output(out, list(settings.sidecars))
     if settings.from_colmap is None:
         require_pycolmap()
@@ -147,11 +150,11 @@ def capture(settings: CaptureSettings, listener: Listener) -> Captured:
     """Make a scene folder from photos or a video.
 
     Args:
-        settings: what it is made from; `check_settings` has accepted them.
+        settings: inputs and options; call `check_settings` first.
         listener: callbacks.
 
     Raises:
-        UserError: no scene can be made. An earlier scene in the folder is unharmed.
+        UserError: the capture failed. An earlier scene in the folder is unchanged.
     """
     out, fresh = settings.out, not os.path.lexists(settings.out)
     has_scene = (out / FILE_NAME).is_file()
@@ -168,7 +171,7 @@ def capture(settings: CaptureSettings, listener: Listener) -> Captured:
         except UserError as error:
             if has_scene:
                 raise UserError(f"{error} (the scene in {out} is unchanged)") from error
-            # The poses are worth keeping, and marks are made on the page written below.
+            # Keep the poses: the user needs the page written below to make the marks.
             length_error = error
         warnings = dict.fromkeys((*scene.warnings, *scale_warnings(scene)))
         scene = replace(scene, warnings=tuple(warnings))
@@ -183,15 +186,15 @@ def capture(settings: CaptureSettings, listener: Listener) -> Captured:
 
 
 def with_known_lengths(scene: Scene, known: Sequence[tuple[str, float]], marks: Path) -> Scene:
-    """Return the scene in the metres of known lengths.
+    """Return the scene with the scale of known lengths; unchanged without any.
 
     Args:
-        scene: the capture.
-        known: names of marked lengths, with the length of each, m.
-        marks: file of the marks.
+        scene: the scene.
+        known: name and length (m) of each marked length.
+        marks: file with the marks.
 
     Raises:
-        UserError: marks that are absent or unusable.
+        UserError: the marks are missing or unusable.
     """
     if not known:
         return scene
@@ -205,8 +208,8 @@ def poses_by_motion(
     """Import the pictures and find their poses by structure from motion.
 
     Args:
-        settings: what the scene is made from.
-        new: folder that receives pictures and model.
+        settings: inputs and options.
+        new: folder for the pictures and the model.
         listener: callbacks.
 
     Returns:
@@ -219,12 +222,12 @@ def poses_by_motion(
     for note in imported.notes:
         listener.note(note)
     for name, reason in imported.unusable.items():
-        listener.warn(f"{name} is left out: {reason}")
+        listener.warn(f"{name} is skipped: {reason}")
     features, seed = settings.features, settings.seed
     model = reconstruct_in_subprocess(imported, work, flat, features, seed, report)
     if len(model.groups) > 1:
         listener.warn(
-            f"the pictures fall into {len(model.groups)} groups that do not fit together"
+            f"the pictures form {len(model.groups)} unconnected groups"
             f" ({', '.join(map(str, model.groups))} pictures); the largest is kept"
         )
     try:
@@ -240,7 +243,7 @@ def poses_by_motion(
 def poses_of_colmap(
     settings: CaptureSettings, new: Path, listener: Listener
 ) -> tuple[PhotoImport, Model, list[Unposed]]:
-    """Import photos with the poses of a COLMAP model; arguments as for `poses_by_motion`."""
+    """Import photos with the poses of a COLMAP model; see `poses_by_motion`."""
     assert settings.from_colmap is not None
     root, excluded = settings.from_colmap, settings.excluded
     found = import_posed(settings.photos, root, new, excluded, listener.progress)
@@ -250,9 +253,9 @@ def poses_of_colmap(
 
 
 def in_metres(settings: CaptureSettings, new: Path, imported: PhotoImport) -> Scene:
-    """Read the posed pictures as a scene, level and in metres as far as photos and flags allow."""
+    """Read the posed pictures as a scene; align it with gravity and metres as far as known."""
     exif = {picture.name: picture.exif for picture in imported.pictures}
-    # Only views with poses are in the model. Their pixel sizes are known after reading.
+    # The model contains only views with poses, and their cameras.
     posed = read_colmap(new / "sparse" / "0")
     gravity = {}
     for view in posed.views:
@@ -274,9 +277,10 @@ def in_metres(settings: CaptureSettings, new: Path, imported: PhotoImport) -> Sc
 
 
 def is_upright(settings: CaptureSettings, path: Path, camera: Camera) -> bool:
-    """Return whether a camera describes its photo as viewers show it, and not as it is stored.
+    """Return True if a camera describes its photo as shown, False if as stored.
 
-    Pictures that this program imports are upright. A COLMAP model's are if only that fits.
+    Pictures that this program imports are upright. Cameras of a COLMAP model describe the photo as
+    shown if they fit only after the EXIF rotation.
     """
     return settings.from_colmap is None or read_header(path).rotates_to_fit(camera)
 
@@ -312,7 +316,7 @@ def with_sidecars(
 
 @contextmanager
 def naming_photos(settings: CaptureSettings, new: Path) -> Iterator[None]:
-    """Let errors name the user's photos where a scene's pictures are copies of them."""
+    """Make errors name the user's photos instead of their copies in the scene folder."""
     try:
         yield
     except UserError as error:
