@@ -14,6 +14,7 @@ import pytest
 import torch
 from support.random_field import random_field
 
+from climatenerf.field import compositing as field_compositing
 from climatenerf.field import hash_field as field_module
 from climatenerf.field.activations import plain_radiance
 from climatenerf.field.capabilities import FUSED
@@ -28,7 +29,6 @@ from climatenerf.ops import (
     reference,
     visual_hull,
 )
-from climatenerf.render import volume as view_module
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 os.environ["TRITON_INTERPRET"] = str(int(DEVICE == "cpu"))  # it is read where a kernel is defined
@@ -79,8 +79,8 @@ def gpu_kernels(monkeypatch):
         monkeypatch.setattr(module, "SAMPLES", 16)
     monkeypatch.setattr(gpu_marching, "SLOPE_SAMPLES", 16)
     for module in (gpu_compositing, gpu_marching):
-        monkeypatch.setattr(module, "LIST", 4)
-    monkeypatch.setattr(gpu_visual_hull, "PLACES", 64)
+        monkeypatch.setattr(module, "RAY_LISTS", 4)
+    monkeypatch.setattr(gpu_visual_hull, "POSITIONS", 64)
     monkeypatch.setattr(gpu_optimiser, "ENTRIES", 16)
     monkeypatch.setattr(gpu_network, "PROGRAMS", 2)  # each goes through several tiles
 
@@ -306,7 +306,7 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     o[0] = field.centre + 40 * field.unit  # outside all cells, looking away
     d[0] = torch.nn.functional.normalize(o[0] - field.centre, dim=-1)
     near = torch.full((n,), 0.2)
-    for module in (field_module, view_module):
+    for module in (field_module, field_compositing):
         monkeypatch.setattr(module, "MIN_WEIGHT", least)
     with torch.no_grad():
         field.view_net[1] += 0.3  # some colours are beyond white
@@ -415,4 +415,4 @@ def test_all_kernels_compile_for_cuda(card, tmp_path):
 
 def is_launched(module, name):
     source = inspect.getsource(module)
-    return f"\n    {name}[(" in source or f"over({name}," in source
+    return f"\n    {name}[(" in source or f"launch({name}," in source

@@ -41,10 +41,10 @@ def test_a_step_with_the_gpu_kernels_has_the_gradients_of_the_cpu_kernels(scene,
     for module, name, size in (
         (gpu_marching, "SLOPE_SAMPLES", 4096),
         (gpu_marching, "RAYS", 64),
-        (gpu_marching, "LIST", 64),
-        (gpu_compositing, "LIST", 64),
+        (gpu_marching, "RAY_LISTS", 64),
+        (gpu_compositing, "RAY_LISTS", 64),
         (gpu_optimiser, "ENTRIES", 2**16),
-        (gpu_visual_hull, "PLACES", 4096),
+        (gpu_visual_hull, "POSITIONS", 4096),
         (marching, "MAX_RAY_SAMPLES", 128),
     ):
         monkeypatch.setattr(module, name, size)

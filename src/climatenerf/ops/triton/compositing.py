@@ -1,9 +1,9 @@
-"""GPU kernels in Triton: compositing. A block of rays goes along its samples side by side.
+"""GPU kernels in Triton: compositing. A program goes along the samples of a block of rays.
 
 The slow twins in `ops/reference.py` are the specification.
 """
 
-# Triton's functions have no types that pyright could know.
+# pyright cannot know the types of Triton's functions.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 # pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOptionalSubscript=false
@@ -12,15 +12,15 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from climatenerf.ops.triton.tiles import LIST, over, ray_lists
+from climatenerf.ops.triton.tiles import RAY_LISTS, launch, ray_lists
 
 
 @triton.jit
 def weight_of(before, tau):
-    """Rendering weight of a sample of optical depth tau behind so much of it."""
-    # 1 - exp(-tau) loses all digits of a thin sample's; the series has them.
-    thin = tau * (1.0 - tau * (0.5 - tau * (1.0 / 6.0 - tau / 24.0)))
-    return tl.exp(-before) * tl.where(tau < 0.05, thin, 1.0 - tl.exp(-tau))
+    """Return the rendering weight of a sample of depth tau behind an optical depth of `before`."""
+    # 1 - exp(-tau) loses all digits where tau is small; the series keeps them.
+    series = tau * (1.0 - tau * (0.5 - tau * (1.0 / 6.0 - tau / 24.0)))
+    return tl.exp(-before) * tl.where(tau < 0.05, series, 1.0 - tl.exp(-tau))
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -30,17 +30,17 @@ def _weights_forward(tau, offsets, weights, transmittance, n, BLOCK: tl.constexp
     longest = tl.max(count, 0)
     k = 0
     while k < longest:
-        own = tl.load(tau + first + k, mask=k < count, other=0.0)
-        tl.store(weights + first + k, weight_of(total, own), mask=k < count)
-        total += own
+        depth = tl.load(tau + first + k, mask=k < count, other=0.0)
+        tl.store(weights + first + k, weight_of(total, depth), mask=k < count)
+        total += depth
         k += 1
     tl.store(transmittance + r, tl.exp(-total), mask=r < n)
 
 
 def weights_forward(tau: Tensor, offsets: Tensor, weights: Tensor, transmittance: Tensor) -> None:
-    """Rendering weights of packed samples with optical depths tau; transmittance left per ray."""
+    """Write rendering weights of samples with optical depths tau, and transmittance of rays."""
     n = offsets.shape[0] - 1
-    over(_weights_forward, n, LIST)(tau, offsets, weights, transmittance, n, BLOCK=LIST)
+    launch(_weights_forward, n, RAY_LISTS)(tau, offsets, weights, transmittance, n, BLOCK=RAY_LISTS)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -55,22 +55,24 @@ def _weights_backward(tau, offsets, grad_w, grad_t, grad_tau, n, BLOCK: tl.const
     behind = tl.load(grad_t + r, mask=r < n, other=0.0) * tl.exp(-total)
     j = 0
     while j < longest:
-        i, known = first + count - 1 - j, j < count  # from the last on
-        own = tl.load(tau + i, mask=known, other=0.0)
-        grad = tl.load(grad_w + i, mask=known, other=0.0)
+        i, mask = first + count - 1 - j, j < count  # back to front
+        depth = tl.load(tau + i, mask=mask, other=0.0)
+        grad = tl.load(grad_w + i, mask=mask, other=0.0)
         after = tl.exp(-total)
-        total -= own
-        tl.store(grad_tau + i, grad * after - behind, mask=known)
-        behind += grad * weight_of(total, own)
+        total -= depth
+        tl.store(grad_tau + i, grad * after - behind, mask=mask)
+        behind += grad * weight_of(total, depth)
         j += 1
 
 
 def weights_backward(
     tau: Tensor, offsets: Tensor, grad_w: Tensor, grad_t: Tensor, grad_tau: Tensor
 ) -> None:
-    """Gradient of `weights_forward`."""
+    """Write the gradient of `weights_forward`."""
     n = offsets.shape[0] - 1
-    over(_weights_backward, n, LIST)(tau, offsets, grad_w, grad_t, grad_tau, n, BLOCK=LIST)
+    launch(_weights_backward, n, RAY_LISTS)(
+        tau, offsets, grad_w, grad_t, grad_tau, n, BLOCK=RAY_LISTS
+    )
 
 
 def _channels(values: Tensor) -> dict[str, object]:
@@ -94,20 +96,20 @@ def _accumulate_forward(
     longest = tl.max(count, 0)
     k = 0
     while k < longest:
-        i, own = first + k, k < count
-        weight = tl.load(weights + i, mask=own, other=0.0)
-        known = own[:, None] & (c < CHANNELS)
-        value = tl.load(values + i[:, None] * CHANNELS + c, mask=known, other=0.0)
+        i, inside = first + k, k < count
+        weight = tl.load(weights + i, mask=inside, other=0.0)
+        mask = inside[:, None] & (c < CHANNELS)
+        value = tl.load(values + i[:, None] * CHANNELS + c, mask=mask, other=0.0)
         total += weight[:, None] * value
         k += 1
     tl.store(out + r[:, None] * CHANNELS + c, total, mask=(r < n)[:, None] & (c < CHANNELS))
 
 
 def accumulate_forward(weights: Tensor, values: Tensor, offsets: Tensor, out: Tensor) -> None:
-    """Sum over each ray of weights [s] · values [s,c] → out [rays,c]."""
+    """Write the sum over each ray of weights [s] · values [s,c] → out [rays,c]."""
     n = offsets.shape[0] - 1
-    over(_accumulate_forward, n, LIST)(
-        weights, values, offsets, out, n, **_channels(values), BLOCK=LIST
+    launch(_accumulate_forward, n, RAY_LISTS)(
+        weights, values, offsets, out, n, **_channels(values), BLOCK=RAY_LISTS
     )
 
 
@@ -126,18 +128,18 @@ def _accumulate_backward(
 ):
     r, first, count = ray_lists(offsets, n, BLOCK)
     c = tl.arange(0, WIDTH)[None, :]
-    some = (r < n)[:, None] & (c < CHANNELS)
-    grad = tl.load(grad_out + r[:, None] * CHANNELS + c, mask=some, other=0.0)
+    valid = (r < n)[:, None] & (c < CHANNELS)
+    grad = tl.load(grad_out + r[:, None] * CHANNELS + c, mask=valid, other=0.0)
     longest = tl.max(count, 0)
     k = 0
     while k < longest:
-        i, own = first + k, k < count
-        known = own[:, None] & (c < CHANNELS)
+        i, inside = first + k, k < count
+        mask = inside[:, None] & (c < CHANNELS)
         at = i[:, None] * CHANNELS + c
-        value = tl.load(values + at, mask=known, other=0.0)
-        weight = tl.load(weights + i, mask=own, other=0.0)
-        tl.store(grad_v + at, grad * weight[:, None], mask=known)
-        tl.store(grad_w + i, tl.sum(grad * value, 1), mask=own)
+        value = tl.load(values + at, mask=mask, other=0.0)
+        weight = tl.load(weights + i, mask=inside, other=0.0)
+        tl.store(grad_v + at, grad * weight[:, None], mask=mask)
+        tl.store(grad_w + i, tl.sum(grad * value, 1), mask=inside)
         k += 1
 
 
@@ -149,10 +151,10 @@ def accumulate_backward(
     grad_w: Tensor,
     grad_v: Tensor,
 ) -> None:
-    """Gradient of `accumulate_forward`."""
+    """Write the gradient of `accumulate_forward`."""
     n = offsets.shape[0] - 1
-    over(_accumulate_backward, n, LIST)(
-        weights, values, offsets, grad_out, grad_w, grad_v, n, **_channels(values), BLOCK=LIST
+    launch(_accumulate_backward, n, RAY_LISTS)(
+        weights, values, offsets, grad_out, grad_w, grad_v, n, **_channels(values), BLOCK=RAY_LISTS
     )
 
 
@@ -164,10 +166,10 @@ def _distortion_forward(weights, s, ds, offsets, out, n, BLOCK: tl.constexpr):
     longest = tl.max(count, 0)
     k = 0
     while k < longest:
-        i, own = first + k, k < count
-        w = tl.load(weights + i, mask=own, other=0.0)
-        p = tl.load(s + i, mask=own, other=0.0)
-        width = tl.load(ds + i, mask=own, other=0.0)
+        i, inside = first + k, k < count
+        w = tl.load(weights + i, mask=inside, other=0.0)
+        p = tl.load(s + i, mask=inside, other=0.0)
+        width = tl.load(ds + i, mask=inside, other=0.0)
         total += 2.0 * w * (p * w_sum - ws_sum) + w * w * width * (1.0 / 3.0)
         w_sum += w
         ws_sum += w * p
@@ -178,9 +180,9 @@ def _distortion_forward(weights, s, ds, offsets, out, n, BLOCK: tl.constexpr):
 def distortion_forward(
     weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor, out: Tensor
 ) -> None:
-    """Distortion loss per ray, in linear time (DVGOv2); see `reference.distortion`."""
+    """Write the distortion of each ray in linear time (DVGOv2); see `reference.distortion`."""
     n = offsets.shape[0] - 1
-    over(_distortion_forward, n, LIST)(weights, s, ds, offsets, out, n, BLOCK=LIST)
+    launch(_distortion_forward, n, RAY_LISTS)(weights, s, ds, offsets, out, n, BLOCK=RAY_LISTS)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -198,25 +200,27 @@ def _distortion_backward(weights, s, ds, offsets, grad_out, grad_w, n, BLOCK: tl
     grad = tl.load(grad_out + r, mask=r < n, other=0.0)
     k = 0
     while k < longest:
-        i, own = first + k, k < count
-        w = tl.load(weights + i, mask=own, other=0.0)
-        p = tl.load(s + i, mask=own, other=0.0)
-        width = tl.load(ds + i, mask=own, other=0.0)
+        i, inside = first + k, k < count
+        w = tl.load(weights + i, mask=inside, other=0.0)
+        p = tl.load(s + i, mask=inside, other=0.0)
+        width = tl.load(ds + i, mask=inside, other=0.0)
         before = p * w_sum - ws_sum
         w_sum += w
         ws_sum += w * p
         after = (ws_all - ws_sum) - p * (w_all - w_sum)
-        each = grad * 2.0 * (before + after + w * width * (1.0 / 3.0))
-        tl.store(grad_w + i, each, mask=own)
+        gradient = grad * 2.0 * (before + after + w * width * (1.0 / 3.0))
+        tl.store(grad_w + i, gradient, mask=inside)
         k += 1
 
 
 def distortion_backward(
     weights: Tensor, s: Tensor, ds: Tensor, offsets: Tensor, grad_out: Tensor, grad_w: Tensor
 ) -> None:
-    """Gradient of `distortion_forward` to the weights."""
+    """Write the gradient of `distortion_forward` to the weights."""
     n = offsets.shape[0] - 1
-    over(_distortion_backward, n, LIST)(weights, s, ds, offsets, grad_out, grad_w, n, BLOCK=LIST)
+    launch(_distortion_backward, n, RAY_LISTS)(
+        weights, s, ds, offsets, grad_out, grad_w, n, BLOCK=RAY_LISTS
+    )
 
 
 @triton.jit(do_not_specialize=["n", "shift"])
@@ -241,8 +245,8 @@ def _merge_order(t_a, offsets_a, t_b, offsets_b, offsets, order, n, shift, BLOCK
 def merge_order(
     t_a: Tensor, offsets_a: Tensor, t_b: Tensor, offsets_b: Tensor, offsets: Tensor, order: Tensor
 ) -> None:
-    """Order that merges two packed sample lists by t; indices ≥ len(t_a) mean list b."""
+    """Write the order that merges two packed lists by t; indices ≥ len(t_a) are list b's."""
     n, shift = offsets.shape[0] - 1, t_a.shape[0]
-    over(_merge_order, n, LIST)(
-        t_a, offsets_a, t_b, offsets_b, offsets, order, n, shift, BLOCK=LIST
+    launch(_merge_order, n, RAY_LISTS)(
+        t_a, offsets_a, t_b, offsets_b, offsets, order, n, shift, BLOCK=RAY_LISTS
     )

@@ -1,11 +1,11 @@
 """GPU kernels in Triton: the density, and marching, which evaluates it in occupied cells.
 
-A block of rays looks for occupied cells and computes densities together. `march` keeps the samples;
-`fused_render.composite` shares the search and does not. Rays of a block wait for one another, but
-only for `TRIES` cells at a time.
+A block of rays searches for occupied cells and computes densities together. `march` stores the
+samples; `fused_render.composite` shares the search and does not. Rays of a block wait for each
+other for at most `TRIES` cells at a time.
 """
 
-# Triton's functions have no types that pyright could know.
+# pyright cannot know the types of Triton's functions.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false
 # pyright: reportOperatorIssue=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportOptionalSubscript=false
@@ -18,19 +18,19 @@ from torch import Tensor
 
 from climatenerf.ops.triton.encoding import features_at, slopes_of
 from climatenerf.ops.triton.network import EXACT, first_layer, hidden_of, sizes_of
-from climatenerf.ops.triton.tiles import LIST, over, points, ray_lists
+from climatenerf.ops.triton.tiles import RAY_LISTS, launch, points, ray_lists
 
-SAMPLES = 64  # of a tile of densities
-RAYS = 16  # that march together
-WARPS = 2  # they are marched by
-TRIES = tl.constexpr(4)  # empty cells that a ray crosses while others compute densities
-FOREVER = tl.constexpr(1e30)
-SLOPE_SAMPLES, SLOPE_WARPS = 32, 4  # of a tile of the density's slopes
+SAMPLES = 64  # per tile of densities
+RAYS = 16  # that march together in a program
+WARPS = 2  # per program that marches
+TRIES = tl.constexpr(4)  # empty cells that a ray crosses between two computations of densities
+INFINITE = tl.constexpr(1e30)
+SLOPE_SAMPLES, SLOPE_WARPS = 32, 4  # per tile of the density's slopes
 
 
 @triton.jit
 def unit_cube(qx, qy, qz):
-    """Contraction into the unit cube: its coordinates, and the distance from the centre."""
+    """Contract positions: return unit-cube coordinates and the distance from the centre."""
     m = tl.sqrt(qx * qx + qy * qy + qz * qz)
     s = 0.25 * tl.where(m <= 1.0, 1.0, (2.0 - 1.0 / m) / m)
     ux = tl.minimum(tl.maximum(qx * s + 0.5, 0.0), 0.999999)
@@ -40,10 +40,10 @@ def unit_cube(qx, qy, qz):
 
 
 @triton.jit
-def density_of(qx, qy, qz, some, encoding, layers, SIZES: tl.constexpr):
-    """Density (1/grid unit) at positions in grid units, where `some`."""
+def density_of(qx, qy, qz, valid, encoding, layers, SIZES: tl.constexpr):
+    """Return the density (1/grid unit) at positions in grid units, where `valid`."""
     ux, uy, uz, m = unit_cube(qx, qy, qz)
-    first, second = features_at(ux, uy, uz, some, encoding, SIZES)
+    first, second = features_at(ux, uy, uz, valid, encoding, SIZES)
     layer, w2, b2 = layers
     h = tl.maximum(hidden_of(first, second, layer, EXACT), 0.0)
     raw = tl.sum(h * w2[None, :], 1) + b2
@@ -52,7 +52,7 @@ def density_of(qx, qy, qz, some, encoding, layers, SIZES: tl.constexpr):
 
 @triton.jit
 def density_layers(net, SIZES: tl.constexpr):
-    """The density's network as `density_of` takes it, from (w1, b1, w2, b2) in memory."""
+    """Load the density's network (w1, b1, w2, b2) as `density_of` takes it."""
     w1, b1, w2, b2 = net
     layer = first_layer(w1, b1, SIZES)
     unit = tl.arange(0, SIZES[2])
@@ -61,16 +61,16 @@ def density_layers(net, SIZES: tl.constexpr):
 
 @triton.jit(do_not_specialize=["n"])
 def _density_at(q, encoding, net, out, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
-    i, some, qx, qy, qz = points(q, tl.program_id(0), n, BLOCK)
+    i, valid, qx, qy, qz = points(q, tl.program_id(0), n, BLOCK)
     layers = density_layers(net, SIZES)
-    tl.store(out + i, density_of(qx, qy, qz, some, encoding, layers, SIZES), mask=some)
+    tl.store(out + i, density_of(qx, qy, qz, valid, encoding, layers, SIZES), mask=valid)
 
 
 def density_at(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
-    """Density (1/grid unit) at q [n,3] in grid units → out [n]."""
+    """Write the density (1/grid unit) at q [n,3] in grid units → out [n]."""
     table, resolutions, *layers = net
     n, encoding = q.shape[0], (table, resolutions, table.shape[1])
-    over(_density_at, n, SAMPLES)(
+    launch(_density_at, n, SAMPLES)(
         q, encoding, tuple(layers), out, n, SIZES=sizes_of(table, layers[0]), BLOCK=SAMPLES
     )
 
@@ -78,34 +78,35 @@ def density_at(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
 @triton.jit(do_not_specialize=["n"])
 def _slopes(q, encoding, layers, out, n, SIZES: tl.constexpr, BLOCK: tl.constexpr):
     w1, b1, w2, _ = layers
-    i, some, qx, qy, qz = points(q, tl.program_id(0), n, BLOCK)
+    i, valid, qx, qy, qz = points(q, tl.program_id(0), n, BLOCK)
     ux, uy, uz, m = unit_cube(qx, qy, qz)
     layer = first_layer(w1, b1, SIZES)
     even, odd, _ = layer
-    first, second = features_at(ux, uy, uz, some, encoding, SIZES)
+    first, second = features_at(ux, uy, uz, valid, encoding, SIZES)
     unit = tl.arange(0, SIZES[2])
-    own = tl.load(w2 + unit, mask=unit < SIZES[3], other=0.0)[None, :]
-    back = tl.where(hidden_of(first, second, layer, EXACT) > 0.0, own, 0.0)
+    output_weight = tl.load(w2 + unit, mask=unit < SIZES[3], other=0.0)[None, :]
+    active = hidden_of(first, second, layer, EXACT) > 0.0
+    back = tl.where(active, output_weight, 0.0)
     first = tl.dot(back, tl.trans(even), input_precision=EXACT)
     second = tl.dot(back, tl.trans(odd), input_precision=EXACT)
-    known = some[:, None] & (tl.arange(0, SIZES[1]) < SIZES[0])[None, :]
-    gx, gy, gz = slopes_of(first, second, ux, uy, uz, known, encoding, SIZES)
-    # Back through the contraction, and what thins the density outside the core.
+    mask = valid[:, None] & (tl.arange(0, SIZES[1]) < SIZES[0])[None, :]
+    gx, gy, gz = slopes_of(first, second, ux, uy, uz, mask, encoding, SIZES)
+    # Back through the contraction and the density's fall-off outside the core.
     outside = m > 1.0
     far = tl.where(outside, m, 1.0)
     s = 0.25 * tl.where(outside, (2.0 - 1.0 / far) / far, 1.0)
     along = (qx * gx + qy * gy + qz * gz) * 0.5 * (1.0 / far - 1.0) / (far * far * far)
     along = tl.where(outside, along - 2.0 / (far * far), 0.0)
-    tl.store(out + 3 * i, s * gx + along * qx, mask=some)
-    tl.store(out + 3 * i + 1, s * gy + along * qy, mask=some)
-    tl.store(out + 3 * i + 2, s * gz + along * qz, mask=some)
+    tl.store(out + 3 * i, s * gx + along * qx, mask=valid)
+    tl.store(out + 3 * i + 1, s * gy + along * qy, mask=valid)
+    tl.store(out + 3 * i + 2, s * gz + along * qz, mask=valid)
 
 
 def density_slopes(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
-    """Gradient of the density's logarithm at q [n,3] (grid units) → out [n,3]."""
+    """Write the gradient of the density's logarithm at q [n,3] (grid units) → out [n,3]."""
     table, resolutions, *layers = net
     n = q.shape[0]
-    over(_slopes, n, SLOPE_SAMPLES)(
+    launch(_slopes, n, SLOPE_SAMPLES)(
         q,
         (table, resolutions, table.shape[1]),
         tuple(layers),
@@ -119,49 +120,49 @@ def density_slopes(q: Tensor, net: tuple[Tensor, ...], out: Tensor) -> None:
 
 @triton.jit
 def _clip(o, d, far, start, end):
-    """Cuts a ray to its part within the outermost cube, along one axis."""
+    """Clip rays to the outermost cube along one axis."""
     moves = d != 0.0
     safe = tl.where(moves, d, 1.0)
     a, b = (-far - o) / safe, (far - o) / safe
     start = tl.where(moves, tl.maximum(start, tl.minimum(a, b)), start)
-    gone = (o < -far) | (o > far)
-    end = tl.where(moves, tl.minimum(end, tl.maximum(a, b)), tl.where(gone, -1.0, end))
+    outside = (o < -far) | (o > far)
+    end = tl.where(moves, tl.minimum(end, tl.maximum(a, b)), tl.where(outside, -1.0, end))
     return start, end
 
 
 @triton.jit
 def begin(rays, spans, cascades, steps, n, BLOCK: tl.constexpr):
-    """A block's rays: index, which there are, origins, directions, where their combs begin, end."""
+    """Load a block of rays: return index, mask, origins, directions, first and last length."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    some = r < n
-    ox = tl.load(rays[0] + 3 * r, mask=some, other=0.0)
-    oy = tl.load(rays[0] + 3 * r + 1, mask=some, other=0.0)
-    oz = tl.load(rays[0] + 3 * r + 2, mask=some, other=0.0)
-    dx = tl.load(rays[1] + 3 * r, mask=some, other=1.0)
-    dy = tl.load(rays[1] + 3 * r + 1, mask=some, other=1.0)
-    dz = tl.load(rays[1] + 3 * r + 2, mask=some, other=1.0)
-    t = tl.load(spans + 3 * r, mask=some, other=0.0)
-    end = tl.load(spans + 3 * r + 1, mask=some, other=-1.0)
-    # A count of 1 is a constant to the compiler, which has no types of its own.
+    valid = r < n
+    ox = tl.load(rays[0] + 3 * r, mask=valid, other=0.0)
+    oy = tl.load(rays[0] + 3 * r + 1, mask=valid, other=0.0)
+    oz = tl.load(rays[0] + 3 * r + 2, mask=valid, other=0.0)
+    dx = tl.load(rays[1] + 3 * r, mask=valid, other=1.0)
+    dy = tl.load(rays[1] + 3 * r + 1, mask=valid, other=1.0)
+    dz = tl.load(rays[1] + 3 * r + 2, mask=valid, other=1.0)
+    t = tl.load(spans + 3 * r, mask=valid, other=0.0)
+    end = tl.load(spans + 3 * r + 1, mask=valid, other=-1.0)
+    # The compiler treats an argument of 1 as a constant without a type.
     far = tl.exp2(tl.full((), cascades - 1, tl.int32).to(tl.float32))
     t, end = _clip(ox, dx, far, t, end)
     t, end = _clip(oy, dy, far, t, end)
     t, end = _clip(oz, dz, far, t, end)
-    share = tl.load(spans + 3 * r + 2, mask=some, other=0.0)
-    t += share * tl.maximum(steps[0], steps[1] * t)
-    return r, some, (ox, oy, oz), (dx, dy, dz), t, end
+    jitter = tl.load(spans + 3 * r + 2, mask=valid, other=0.0)
+    t += jitter * tl.maximum(steps[0], steps[1] * t)
+    return r, valid, (ox, oy, oz), (dx, dy, dz), t, end
 
 
 @triton.jit
-def _leave(o, d, index, cell, half):
-    """Ray length at which rays leave their lattice cells of side `cell`, along one axis."""
+def _cell_exit(o, d, index, cell, half):
+    """Return the ray length at which rays leave their cells of side `cell`, along one axis."""
     face = (index + (d > 0.0).to(tl.int32)).to(tl.float32) * cell - half
-    return tl.where(d == 0.0, FOREVER, (face - o) / tl.where(d == 0.0, 1.0, d))
+    return tl.where(d == 0.0, INFINITE, (face - o) / tl.where(d == 0.0, 1.0, d))
 
 
 @triton.jit
 def middle_of(o, d, t, end, steps):
-    """The comb's step that begins at t: its length, ray length of its middle, and place there."""
+    """Return the step that begins at t: its length, and ray length and position of its middle."""
     dt = tl.minimum(tl.maximum(steps[0], steps[1] * t), end - t)
     tm = t + 0.5 * dt
     return dt, tm, o[0] + tm * d[0], o[1] + tm * d[1], o[2] + tm * d[2]
@@ -169,7 +170,7 @@ def middle_of(o, d, t, end, steps):
 
 @triton.jit
 def search(o, d, t, end, live, cells, steps):
-    """Live rays cross `TRIES` cells at most: t, and 1 for those that have found an occupied one."""
+    """Let live rays cross at most `TRIES` cells: return t, and 1 where a cell is occupied."""
     found = tl.zeros_like(t).to(tl.int32)
     for _try in range(TRIES):
         t, found = _walk(o, d, t, end, live & (t < end), found, cells, steps)
@@ -178,17 +179,18 @@ def search(o, d, t, end, live, cells, steps):
 
 @triton.jit
 def _walk(o, d, t, end, live, found, cells, steps):
-    """Rays that are live and have not found an occupied cell look into the one they are in.
+    """Test the cells of live rays that have not found an occupied one.
 
-    Returns t, behind the cell (or its block of cells) where that is empty, and who has found one.
+    Return t, moved behind the cell (or its block of cells) where that is empty, and the updated
+    `found`.
     """
     occupied, blocks, sides = cells
     cascades, side, size = sides
     look = live & (found == 0)
     dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
-    reach = tl.maximum(tl.maximum(tl.abs(qx), tl.abs(qy)), tl.abs(qz))
-    # The least cascade that holds it: exponents are exact where logarithms round.
-    bits = tl.maximum(reach, 1.0).to(tl.int32, bitcast=True)
+    distance = tl.maximum(tl.maximum(tl.abs(qx), tl.abs(qy)), tl.abs(qz))
+    # The finest cascade that holds it: exponents are exact where logarithms round.
+    bits = tl.maximum(distance, 1.0).to(tl.int32, bitcast=True)
     cascade = (bits >> 23) - 127 + ((bits & 0x7FFFFF) != 0).to(tl.int32)
     cascade = tl.minimum(cascade, cascades - 1)
     half = tl.exp2(cascade.to(tl.float32))
@@ -197,19 +199,23 @@ def _walk(o, d, t, end, live, found, cells, steps):
     y = tl.minimum(tl.maximum(((qy + half) / cell).to(tl.int32), 0), side - 1)
     z = tl.minimum(tl.maximum(((qz + half) / cell).to(tl.int32), 0), side - 1)
     bx, by, bz, count = x // size, y // size, z // size, side // size
-    held = tl.load(blocks + ((cascade * count + bx) * count + by) * count + bz, mask=look, other=0)
-    full = held > 0
-    own = tl.load(
+    block = tl.load(blocks + ((cascade * count + bx) * count + by) * count + bz, mask=look, other=0)
+    full = block > 0
+    value = tl.load(
         occupied + ((cascade * side + x) * side + y) * side + z, mask=look & full, other=0
     )
     width = tl.where(full, cell, cell * size)
-    leave = _leave(o[0], d[0], tl.where(full, x, bx), width, half)
-    leave = tl.minimum(leave, _leave(o[1], d[1], tl.where(full, y, by), width, half))
-    leave = tl.minimum(leave, _leave(o[2], d[2], tl.where(full, z, bz), width, half))
-    # Whole steps, so that the sampling comb does not depend on the cells crossed.
-    on = t + dt * tl.maximum(tl.ceil((leave - tm) / dt), 1.0)
-    hit = look & (own > 0)
-    return tl.where(look & (own == 0), on, t), found | hit.to(tl.int32)
+    exit_length = _cell_exit(o[0], d[0], tl.where(full, x, bx), width, half)
+    exit_length = tl.minimum(
+        exit_length, _cell_exit(o[1], d[1], tl.where(full, y, by), width, half)
+    )
+    exit_length = tl.minimum(
+        exit_length, _cell_exit(o[2], d[2], tl.where(full, z, bz), width, half)
+    )
+    # Whole steps, so that sample positions do not depend on the cells crossed.
+    after = t + dt * tl.maximum(tl.ceil((exit_length - tm) / dt), 1.0)
+    hit = look & (value > 0)
+    return tl.where(look & (value == 0), after, t), found | hit.to(tl.int32)
 
 
 @triton.jit(do_not_specialize=["n"])
@@ -218,7 +224,7 @@ def _march(
     spans,
     cells,
     steps,
-    enough,
+    max_depth,
     encoding,
     net,
     rows,
@@ -228,11 +234,11 @@ def _march(
     SIZES: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    r, some, o, d, t, end = begin(rays, spans, cells[2][0], steps, n, BLOCK)
+    r, valid, o, d, t, end = begin(rays, spans, cells[2][0], steps, n, BLOCK)
     layers = density_layers(net, SIZES)
     tau = tl.zeros_like(t)
     k = tl.zeros_like(r)
-    live = some & (t < end)
+    live = valid & (t < end)
     while tl.max(live.to(tl.int32), 0) > 0:
         t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
@@ -240,7 +246,7 @@ def _march(
             dt, tm, qx, qy, qz = middle_of(o, d, t, end, steps)
             sigma = density_of(qx, qy, qz, here, encoding, layers, SIZES)
             thick = here & (sigma * dt > steps[2])
-            # By step, then by ray: neighbouring threads write side by side.
+            # By step, then by ray: neighbouring threads write to adjacent addresses.
             at = rows + k * n + r
             tl.store(at, tm, mask=thick)
             tl.store(at + capacity * n, dt, mask=thick)
@@ -248,8 +254,8 @@ def _march(
             tau += tl.where(thick, sigma * dt, 0.0)
             k += thick.to(tl.int64)
             t = tl.where(here, t + dt, t)
-        live = live & (t < end) & (tau < enough) & (k < capacity)
-    tl.store(counts + r, k, mask=some)
+        live = live & (t < end) & (tau < max_depth) & (k < capacity)
+    tl.store(counts + r, k, mask=valid)
 
 
 def march(
@@ -263,17 +269,21 @@ def march(
     rows: Tensor,
     counts: Tensor,
 ) -> None:
-    """Marches rays front to back through occupied space, evaluating density on the way.
+    """March rays front to back through occupied space and evaluate the density on the way.
 
-    Args: rays [n,3] in grid units; spans [n,3]: first and last length, share of the first step;
-    cells = (occupied [K,G,G,G], the same for blocks); steps = (smallest step, step per length,
-    optical depth below which one counts as empty); stop = transmittance at which a ray ends;
-    net = (table, resolutions, w1, b1, w2, b2).
-    rows [3, capacity, n or more] receive t, dt and sigma, counts [n] how many.
+    Args:
+        rays_o, rays_d: [n,3], grid units; directions have unit length.
+        spans: [n,3], first and last length, fraction of the first step to skip.
+        cells: (occupied [K,G,G,G], the same for blocks of cells).
+        steps: smallest step, step per length, optical depth below which a sample counts as empty.
+        stop: transmittance at which a ray ends.
+        net: (table, resolutions, w1, b1, w2, b2).
+        rows: [3, capacity, n or more], receives t, dt and sigma.
+        counts: [n], receives the number of samples of each ray.
     """
     table, resolutions, *layers = net
     n = spans.shape[0]
-    over(_march, n, RAYS)(
+    launch(_march, n, RAYS)(
         (rays_o, rays_d),
         spans,
         cells_of(cells),
@@ -292,7 +302,7 @@ def march(
 
 
 def cells_of(cells: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
-    """As kernels take them: with cascades, cells along a side, cells along a block's."""
+    """Return cells as kernels take them: with cascades and sides of the cube and of a block."""
     occupied, blocks = cells
     cascades, side = occupied.shape[:2]
     return occupied, blocks, (cascades, side, side // blocks.shape[1])
@@ -304,42 +314,42 @@ def _pack(rows, offsets, out, n, total, capacity, BLOCK: tl.constexpr):
     longest = tl.max(count, 0)
     k = 0
     while k < longest:
-        some = k < count
+        valid = k < count
         for kind in tl.static_range(3):
-            value = tl.load(rows + (kind * capacity + k) * n + r, mask=some)
-            tl.store(out + kind * total + first + k, value, mask=some)
+            value = tl.load(rows + (kind * capacity + k) * n + r, mask=valid)
+            tl.store(out + kind * total + first + k, value, mask=valid)
         k += 1
 
 
 def pack(rows: Tensor, offsets: Tensor, out: Tensor) -> None:
-    """Packs what `march` has left in rows into out [3, samples]."""
+    """Pack the samples that `march` wrote to rows → out [3, samples]."""
     n = offsets.shape[0] - 1
-    over(_pack, n, LIST)(rows, offsets, out, n, out.shape[1], rows.shape[1], BLOCK=LIST)
+    launch(_pack, n, RAY_LISTS)(rows, offsets, out, n, out.shape[1], rows.shape[1], BLOCK=RAY_LISTS)
 
 
 @triton.jit(do_not_specialize=["n"])
 def _grid_positions(rays_o, rays_d, offsets, t, out, n, BLOCK: tl.constexpr):
     r, first, count = ray_lists(offsets, n, BLOCK)
-    some = r < n
-    ox = tl.load(rays_o + 3 * r, mask=some)
-    oy = tl.load(rays_o + 3 * r + 1, mask=some)
-    oz = tl.load(rays_o + 3 * r + 2, mask=some)
-    dx = tl.load(rays_d + 3 * r, mask=some)
-    dy = tl.load(rays_d + 3 * r + 1, mask=some)
-    dz = tl.load(rays_d + 3 * r + 2, mask=some)
+    valid = r < n
+    ox = tl.load(rays_o + 3 * r, mask=valid)
+    oy = tl.load(rays_o + 3 * r + 1, mask=valid)
+    oz = tl.load(rays_o + 3 * r + 2, mask=valid)
+    dx = tl.load(rays_d + 3 * r, mask=valid)
+    dy = tl.load(rays_d + 3 * r + 1, mask=valid)
+    dz = tl.load(rays_d + 3 * r + 2, mask=valid)
     longest = tl.max(count, 0)
     k = 0
     while k < longest:
-        i, own = first + k, k < count
-        far = tl.load(t + i, mask=own, other=0.0)
-        ux, uy, uz, _ = unit_cube(ox + far * dx, oy + far * dy, oz + far * dz)
-        tl.store(out + 3 * i, ux, mask=own)
-        tl.store(out + 3 * i + 1, uy, mask=own)
-        tl.store(out + 3 * i + 2, uz, mask=own)
+        i, mask = first + k, k < count
+        length = tl.load(t + i, mask=mask, other=0.0)
+        ux, uy, uz, _ = unit_cube(ox + length * dx, oy + length * dy, oz + length * dz)
+        tl.store(out + 3 * i, ux, mask=mask)
+        tl.store(out + 3 * i + 1, uy, mask=mask)
+        tl.store(out + 3 * i + 2, uz, mask=mask)
         k += 1
 
 
 def grid_positions(rays_o: Tensor, rays_d: Tensor, offsets: Tensor, t: Tensor, u: Tensor) -> None:
-    """Unit-cube coordinates (after contraction) of packed samples: → u [samples,3]."""
+    """Write the unit-cube coordinates (after contraction) of packed samples → u [samples,3]."""
     n = rays_o.shape[0]
-    over(_grid_positions, n, LIST)(rays_o, rays_d, offsets, t, u, n, BLOCK=LIST)
+    launch(_grid_positions, n, RAY_LISTS)(rays_o, rays_d, offsets, t, u, n, BLOCK=RAY_LISTS)
