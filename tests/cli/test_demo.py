@@ -1,12 +1,12 @@
 """The demo, in small: what it leaves, what it says, and what happens when it is stopped."""
 
-import dataclasses
 import functools
 import json
 
 import numpy as np
 import pytest
 from PIL import Image
+from support.command_line import FEW_ROWS
 
 from climatenerf import cli
 from climatenerf.cli import demo
@@ -16,14 +16,10 @@ from climatenerf.cli import demo
 def small(monkeypatch):
     """Small grids, large photos' pixels left out: a blurred street in seconds."""
     from climatenerf.cli import fit as cli_fit
-    from climatenerf.field.presets import PRESETS
     from climatenerf.training import run as run_module
     from climatenerf.training.settings import FitSettings
 
-    tiny = dataclasses.replace(
-        PRESETS["cpu"], geometry_log2_rows=13, appearance_log2_rows=13, cascades=4
-    )
-    settings = functools.partial(FitSettings, samples_per_step=2**14, size=tiny)
+    settings = functools.partial(FitSettings, samples_per_step=2**14, size=FEW_ROWS)
     monkeypatch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 64)
     monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))

@@ -207,3 +207,17 @@ def test_wrong_options_exit_with_2(verb, capsys):
 def test_status_of_a_verb_is_passed_on(verb):
     verb.run = lambda options: 1
     assert cli.main(["fit", "--scene", "a"]) == 1
+
+
+@pytest.mark.parametrize("verb", ["fit", "render", "demo"])
+def test_help_of_a_verb_does_not_load_torch(verb):
+    code = (
+        "import sys; from climatenerf.cli import main\n"
+        "try:\n    status = main(sys.argv[1:])\n"
+        "except SystemExit as left:\n    status = left.code\n"
+        "print('HEAVY', sorted({'torch', 'numba'} & set(sys.modules)), 'STATUS', status)"
+    )
+    words = [sys.executable, "-c", code, verb, "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert done.stdout.rstrip().endswith("HEAVY [] STATUS 0"), done.stdout + done.stderr
+    assert f"climatenerf {verb}" in done.stdout
