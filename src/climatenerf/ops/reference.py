@@ -1,10 +1,10 @@
-"""The specification of every kernel: slow, obvious PyTorch, in whatever precision it is given.
+"""The specification of every kernel: slow, obvious PyTorch, in the precision of its arguments.
 
 Vocabulary. Grid units: lengths divided so that the scene's core is the ball of radius 1; `q` is a
 position in grid units, `u` the same position after contraction, in the unit cube. Rays are packed:
 the samples of ray r are `offsets[r]:offsets[r + 1]`, front to back. `tau` is a sample's optical
-depth sigma·dt, `weights` its rendering weight. Everything works on the last axis or on packed
-samples; gradients come from autograd. Tests hold the fast kernels against these functions.
+depth sigma·dt, `weights` its rendering weight. Functions work on the last axis or on packed
+samples; autograd gives the gradients. Tests compare the fast kernels with these functions.
 """
 
 import torch
@@ -15,21 +15,24 @@ from climatenerf.core.vectors import unit
 
 
 def contract(q: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-    """Unit-cube coordinates of a position: mip-NeRF 360's contraction (Eq. 10), then (x+2)/4.
+    """Return unit-cube coordinates: mip-NeRF 360's contraction (Eq. 10), then (x+2)/4.
 
-    The ball of radius 1 is kept, the rest of space goes into the shell up to radius 2.
+    The contraction keeps the ball of radius 1 and maps the rest of space to the shell up to 2.
     """
     m = q.norm(dim=-1, keepdim=True).clamp_min(1.0)  # inside the ball the factor is exactly 1
     return (q * (2.0 - 1.0 / m) / m / 4.0 + 0.5).clamp(0.0, 0.999999)
 
 
 def hash_rows(corner: Int[Tensor, "*n 3"], resolution: int, table_size: int) -> Int[Tensor, "*n"]:
-    """Row of a lattice corner: direct where the level fits the table, else Müller et al. 2022."""
+    """Return the row of a lattice corner: its index if the level fits the table, else a hash.
+
+    The hash is that of Müller et al. 2022.
+    """
     x, y, z = corner.unbind(-1)
     side = resolution + 1
     if side**3 <= table_size:
         return x + side * (y + side * z)
-    # 32-bit wrap-around of the products does not touch the low bits that the mask keeps.
+    # Wrap-around of the products at 32 bits does not change the low bits that the mask keeps.
     return (x ^ (y * 2654435761) ^ (z * 805459861)) & (table_size - 1)
 
 
@@ -38,7 +41,7 @@ def hash_encode(
     table: Float[Tensor, "levels rows 2"],
     resolutions: Int[Tensor, "levels"],
 ) -> Float[Tensor, "n features"]:
-    """Multi-resolution hash encoding: trilinear features of each level, side by side."""
+    """Return the multi-resolution hash encoding: trilinear features of each level, concatenated."""
     features = []
     for level, resolution in enumerate(resolutions.tolist()):
         p = u * resolution
@@ -60,10 +63,10 @@ def mlp(
     shared: Float[Tensor, "m h"] | None = None,
     row: Int[Tensor, "n"] | None = None,
 ) -> Float[Tensor, "n o"]:
-    """Fully connected layers (weight [in, out], bias [out]) with ReLU between them.
+    """Return the output of layers (weight [in, out], bias [out]) with a ReLU between them.
 
-    `shared[row]`, if given, is added to the first layer before its ReLU: what the samples of a ray
-    have in common (direction, appearance) passes through that layer once per ray.
+    `shared[row]`, if given, is added to the first layer before its ReLU: inputs that the samples of
+    a ray share (direction, appearance) pass through that layer once per ray.
     """
     for index, (weight, bias) in enumerate(layers):
         x = x @ weight + bias
@@ -77,10 +80,10 @@ def mlp(
 def density(
     q: Float[Tensor, "n 3"], table: Tensor, resolutions: Tensor, layers: list[tuple[Tensor, Tensor]]
 ) -> Float[Tensor, "n"]:
-    """Density (1/grid unit): exp of the geometry network, per contracted length.
+    """Return the density (1/grid unit): exp of the geometry network, per contracted length.
 
-    The contraction shortens radial lengths by |q|^2; dividing by it gives the haze that a field
-    starts from a finite optical depth to infinity. exp(15) = 3e6 is opaque at any step.
+    The contraction shortens radial lengths by |q|^2. Dividing by it gives the initial haze of a
+    field a finite optical depth to infinity. exp(15) = 3e6 is opaque at any step.
     """
     raw = mlp(hash_encode(contract(q), table, resolutions), layers)[:, 0]
     return raw.clamp_max(15.0).exp() / q.square().sum(-1).clamp_min(1.0)
@@ -92,7 +95,7 @@ def density_slopes(
     resolutions: Tensor,
     layers: list[tuple[Tensor, Tensor]],
 ) -> Float[Tensor, "n 3"]:
-    """Gradient of the density's logarithm: the density's own direction, and no overflow."""
+    """Return the gradient of the density's logarithm, which cannot overflow."""
     with torch.enable_grad():
         q = q.detach().requires_grad_()
         raw = mlp(hash_encode(contract(q), table, resolutions), layers)[:, 0]
@@ -103,20 +106,20 @@ def density_slopes(
 def render_weights(
     tau: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]
 ) -> tuple[Float[Tensor, "s"], Float[Tensor, "rays"]]:
-    """w_i = T_i (1 - exp(-tau_i)), T_i = exp(-sum of tau before i); and what is left behind all."""
-    weights, left = [], []
+    """Return w_i = T_i (1 - exp(-tau_i)), T_i = exp(-sum of tau before i), and T behind all."""
+    weights, transmittance = [], []
     for start, stop in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
         ray = tau[start:stop]
         before = torch.cat([ray.new_zeros(1), ray.cumsum(0)])
         weights.append((-before[:-1]).exp() * -torch.expm1(-ray))
-        left.append((-before[-1]).exp())
-    return torch.cat(weights), torch.stack(left)
+        transmittance.append((-before[-1]).exp())
+    return torch.cat(weights), torch.stack(transmittance)
 
 
 def accumulate(
     weights: Float[Tensor, "s"], values: Float[Tensor, "s c"], offsets: Int[Tensor, "rays+1"]
 ) -> Float[Tensor, "rays c"]:
-    """Sum of weights·values over each ray."""
+    """Return the sum of weights·values over each ray."""
     return torch.stack(
         [
             (weights[a:b, None] * values[a:b]).sum(0)
@@ -131,17 +134,17 @@ def surface(
     target: Float[Tensor, "s 3"] | None,
     offsets: Int[Tensor, "rays+1"],
 ) -> tuple[Float[Tensor, "rays c"], Float[Tensor, "rays"]]:
-    """What rays see of the surface head's output, normals (of any length) before class logits.
+    """Accumulate the surface head's output, normals (of any length) before class logits.
 
-    Logits are accumulated; normals compared: the sum of weights·|n - target|², n the unit vector
-    (Verbin et al. 2022), or 0 without a target.
+    Return the accumulated logits, and the error of normals: the sum of weights·|n - target|², n the
+    unit vector (Verbin et al. 2022), or 0 without a target.
     """
     logits = accumulate(weights, raw[:, 3:], offsets)
     if target is None:
         return logits, torch.zeros_like(logits[:, 0])
-    # 1e-6: a network that gives 0 has no direction, and its gradient would be NaN.
-    off = (unit(raw[:, :3], 1e-6) - target).square().sum(-1, keepdim=True)
-    return logits, accumulate(weights, off, offsets)[:, 0]
+    # 1e-6: an output of 0 has no direction, and its gradient would be NaN.
+    error = (unit(raw[:, :3], 1e-6) - target).square().sum(-1, keepdim=True)
+    return logits, accumulate(weights, error, offsets)[:, 0]
 
 
 def distortion(
@@ -150,7 +153,7 @@ def distortion(
     ds: Float[Tensor, "s"],
     offsets: Int[Tensor, "rays+1"],
 ) -> Float[Tensor, "rays"]:
-    """Distortion loss of mip-NeRF 360 (Eq. 15) per ray, by the double sum."""
+    """Return the distortion loss of mip-NeRF 360 (Eq. 15) per ray, by the double sum."""
     losses = []
     for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
         w, p = weights[a:b], s[a:b]
@@ -169,13 +172,13 @@ def march(
     density_at,
     skips: tuple[int, ...] = (1,),
 ) -> list[tuple[float, float, float]]:
-    """One ray through occupied space: its samples (t, dt, sigma), front to back.
+    """Return the samples (t, dt, sigma) of one ray in occupied space, front to back.
 
-    span = (t_min, t_max, jitter of the first step in [0,1)). A step is max(steps[0], steps[1]·t)
-    long; of an optical depth below steps[2] it counts as empty. In an empty cell whole steps are
-    skipped until the ray has left it, or has left the block of skip³ cells about it if all of these
-    are empty, for the first such of `skips`. Ends where the transmittance falls below `stop`.
-    Cascade k covers the cube of half side 2^k.
+    span = (t_min, t_max, fraction of the first step to skip, in [0,1)). A step is
+    max(steps[0], steps[1]·t) long; with an optical depth below steps[2] it counts as empty. In an
+    empty cell whole steps are skipped until the ray has left it, or has left the block of skip³
+    cells around it if all of these are empty, for the first such block of `skips`. The ray ends
+    where the transmittance falls below `stop`. Cascade k covers the cube of half side 2^k.
     """
     cascades, side = occupied.shape[:2]
     far = 2.0 ** (cascades - 1)
@@ -212,8 +215,8 @@ def march(
                     cell, index = cell * skip, index // skip
                     break
             edge = (index + (ray_d > 0)) * cell - half
-            leave = torch.where(ray_d != 0, (edge - ray_o) / ray_d, torch.inf).min().item()
-            t += dt * max(-((middle - leave) // dt), 1.0)
+            exit_length = torch.where(ray_d != 0, (edge - ray_o) / ray_d, torch.inf).min().item()
+            t += dt * max(-((middle - exit_length) // dt), 1.0)
     return samples
 
 
@@ -223,7 +226,7 @@ def merge_order(
     t_b: Float[Tensor, "b"],
     offsets_b: Int[Tensor, "rays+1"],
 ) -> tuple[Int[Tensor, "a+b"], Int[Tensor, "rays+1"]]:
-    """Order that merges two packed lists of samples by t, and the merged offsets."""
+    """Return the order that merges two packed lists of samples by t, and the merged offsets."""
     order = []
     for r in range(offsets_a.shape[0] - 1):
         a = torch.arange(int(offsets_a[r]), int(offsets_a[r + 1]))
@@ -236,37 +239,39 @@ def merge_order(
 def label_votes(
     x: Float[Tensor, "n 3"],
     radius: Float[Tensor, "n"],
-    reach: list[Tensor],
+    masks: list[Tensor],
     pinholes: Float[Tensor, "v 4"],
     c2w: Float[Tensor, "v 4 4"],
-    least: tuple[int, float, float],
+    thresholds: tuple[int, float, float],
 ) -> Bool[Tensor, "n"]:
-    """Which places enough views see before nothing but what they look for (sky, or ground).
+    """Return for which balls enough views agree that only a mask (sky, or ground) lies behind.
 
     Args:
-        x: places, world m.
-        radius: of the ball around each that has to lie before it as a whole, m.
-        reach: for each view how many pixels within it a pixel lies, 1 at its edge.
-        pinholes: fx, fy, cx, cy of those maps.
-        c2w: of the views.
-        least: voices needed; share of the views that have a place in their picture; distance (m)
-            between the first of them and another.
+        x: centres of the balls, world m.
+        radius: of the balls, m.
+        masks: depth inside each view's mask: pixels to its edge, 1 at the edge, 0 outside.
+        pinholes: fx, fy, cx, cy of the masks.
+        c2w: poses of the views.
+        thresholds: minimum number of votes; minimum fraction of the views whose picture contains
+            the centre; minimum baseline (m) between the first voting view and another one.
     """
-    said, watching = [], []
-    for sky, (fx, fy, cx, cy), pose in zip(reach, pinholes, c2w, strict=True):
-        height, width = sky.shape
+    voted, observed = [], []
+    for mask, (fx, fy, cx, cy), pose in zip(masks, pinholes, c2w, strict=True):
+        height, width = mask.shape
         local = (x - pose[:3, 3]) @ pose[:3, :3]
         z = local[:, 2]
-        z = torch.where(z > radius, z, torch.nan)  # behind the eye or around it: not asked
+        z = torch.where(z > radius, z, torch.nan)  # the ball must lie in front of the camera
         column = (fx * local[:, 0] / z + cx).floor()
         row = (fy * local[:, 1] / z + cy).floor()
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        place = torch.stack([row, column]).where(inside, 0.0).long()
-        depth = sky[place[0], place[1]]
-        watching.append(inside)
-        said.append(inside & (depth >= 1) & (depth - 1 >= radius * torch.maximum(fx, fy) / z))
-    says, eyes = torch.stack(said), c2w[:, :3, 3]
-    first = eyes[says.float().argmax(0)]  # of the first voice, or any where there is none
-    spread = (says & ((eyes[:, None] - first).norm(dim=-1) > least[2])).any(0)
-    voices = says.sum(0)
-    return spread & (voices >= least[0]) & (voices >= least[1] * torch.stack(watching).sum(0))
+        pixel = torch.stack([row, column]).where(inside, 0.0).long()
+        depth = mask[pixel[0], pixel[1]]
+        observed.append(inside)
+        voted.append(inside & (depth >= 1) & (depth - 1 >= radius * torch.maximum(fx, fy) / z))
+    votes, centres = torch.stack(voted), c2w[:, :3, 3]
+    first = centres[votes.float().argmax(0)]  # of the first vote, or any view where there is none
+    far_apart = (centres[:, None] - first).norm(dim=-1) > thresholds[2]
+    wide = (votes & far_apart).any(0)
+    count = votes.sum(0)
+    enough = count >= thresholds[1] * torch.stack(observed).sum(0)
+    return wide & (count >= thresholds[0]) & enough

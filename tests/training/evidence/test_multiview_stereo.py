@@ -149,7 +149,7 @@ def test_correlation_matches_the_reference():
         tile = kernels._tile(pictures, i, x, y)
         assert tile == 3 * int(3 * y / height) + int(3 * x / width)
         assert tile == multiview_stereo._tiles(np.array([[x / width, y / height]]))[0]
-        ours = kernels._alike(pictures, i, tile, np.float32(x), np.float32(y), s, window)
+        ours = kernels._correlation(pictures, i, tile, np.float32(x), np.float32(y), s, window)
         js = [j for j in pictures.others[i, tile] if j >= 0]
         each = [correlation_in_world_space(cameras, c2w, images, i, j, x, y, s) for j in js]
         best = sorted(value for value in each if np.isfinite(value))[-2:]

@@ -1,8 +1,8 @@
-"""Search along pixels' rays for the distance at which neighbouring pictures look alike: Numba, CPU.
+"""Plane sweep along pixels' rays for the depth at which neighbouring pictures match. CPU, in Numba.
 
-Pictures are grey and of pinhole cameras, pixel centres at .5. Inverse z-depth s in 1/m: a pixel's
-direction d (z = 1) at s is seen by another camera in the direction A d + s b, A and b the turn and
-the shift between the two cameras' frames.
+Pictures are grey and of pinhole cameras; pixel centres are at .5. Depth is the inverse z-depth s,
+1/m: a neighbour sees a pixel of direction d (z = 1) at s in the direction A d + s b, where A and b
+are rotation and translation between the two camera frames.
 """
 
 from typing import NamedTuple
@@ -11,54 +11,55 @@ import numpy as np
 from jaxtyping import Float32, Int, UInt8
 from numba import njit, prange
 
-SIDE = 2  # pixels from a window's middle to its border
-STEP = 1.0  # pixels that the projection moves between two distances that are tried, or more:
-MAX_STEPS = 256  # what comes near moves over all of a large picture
-FINE = 8  # smaller steps to either side of the best one
-APART = 3  # steps from the best one that count as another place
+SIDE = 2  # pixels from the middle of a window to its border
+STEP = 1.0  # pixels by which the projection moves between two depths
+MAX_STEPS = 256  # depths; near surfaces move across all of a large picture
+FINE = 8  # fractions of a step that are tried on either side of the best one
+SEPARATION = 3  # steps from the best depth from which a depth counts as different
 MIN_CONTRAST = 4.0  # standard deviation of a window, 8-bit levels
-UNSEEN = 0  # the level of a pixel that a picture does not show
-TILES = 3  # along each side of a picture: each has neighbours of its own
-STEEP = 20.0  # times a window's reach in depth that it must be away: 1/z is taken from a series
-NONE = -2.0  # a likeness that is not known
-HOPELESS = 0.5  # a likeness at whole steps that no smaller step makes a good one
-# NaN keeps its meaning: it stands for what a picture does not show.
+UNSEEN = 0  # level of an invalid pixel
+TILES = 3  # along each side of a picture; each tile has a list of neighbours
+MIN_DISTANCE = 20.0  # minimum z in half extents in z of a window, for the series of 1/z
+NONE = -2.0  # an invalid correlation
+MIN_CORRELATION = 0.5  # at whole steps; below it no finer step gives a good match
+# Without nnan: NaN marks invalid pixels.
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
 class Pictures(NamedTuple):
-    """Grey pictures in one row, and how they see each other (Numba takes named tuples as is)."""
+    """Grey pictures in one flat array, and their neighbours (Numba accepts named tuples)."""
 
     grey: UInt8[np.ndarray, "total"]
     """Levels from 1 to 255, or `UNSEEN`."""
     start: Int[np.ndarray, "v"]
-    """Where each picture begins."""
+    """Offset of each picture in `grey`."""
     size: Int[np.ndarray, "v 2"]
     """Width and height, px."""
     intrinsics: Float32[np.ndarray, "v 4"]
     """fx, fy, cx, cy, px."""
     others: Int[np.ndarray, "v tiles k"]
-    """The neighbours with which what lies in a tile is compared, -1: none. There are TILES² of
-    them, row by row."""
+    """Neighbours with which a tile is compared; -1: none. There are TILES² tiles, row by row."""
     turn: Float32[np.ndarray, "v tiles k 3 3"]
-    """A: from the picture's camera frame to a neighbour's."""
+    """A: rotation from the picture's camera frame to a neighbour's."""
     shift: Float32[np.ndarray, "v tiles k 3"]
-    """b: the picture's eye in a neighbour's frame, m."""
+    """b: the picture's camera centre in a neighbour's frame, m."""
     most: Float32[np.ndarray, "v tiles"]
-    """The largest inverse z-depth that is tried, 1/m; the least is 0."""
+    """Largest inverse z-depth that is tried, 1/m; the smallest is 0."""
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST)
 def match(
     pictures: Pictures, view: Int[np.ndarray, "n"], pixel: Float32[np.ndarray, "n 2"]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Inverse z-depth of pixels (x, y) of views, by Goesele et al. 2006, "Multi-View Stereo
-    Revisited": windows are compared by normalized cross-correlation.
+    """Return inverse z-depths of pixels (x, y) of views.
+
+    Windows are compared by normalised cross-correlation (Goesele et al. 2006, "Multi-View Stereo
+    Revisited").
 
     Returns:
-        [n 3]: inverse z-depth (1/m); likeness there, the mean of the two neighbours that are most
-        alike; and the most at any other distance. Likeness is in [-1,1], or `NONE`, also where it
-        is poor.
+        [n 3]: inverse z-depth (1/m); correlation there, the mean of the two best neighbours; and
+        the best correlation at any other depth. Correlations are in [-1,1], or `NONE`, also where
+        they are poor.
     """
     n = view.shape[0]
     found = np.empty((n, 3), np.float32)
@@ -71,55 +72,55 @@ def match(
         tile = _tile(pictures, i, x, y)
         steps = _steps(pictures, i, tile, x, y)
         per_step = pictures.most[i, tile] / (steps - 1)
-        likeness = np.empty(steps, np.float32)
+        correlations = np.empty(steps, np.float32)
         best = 0
         for h in range(steps):
-            likeness[h] = _alike(pictures, i, tile, x, y, h * per_step, window)
-            if likeness[h] > likeness[best]:
+            correlations[h] = _correlation(pictures, i, tile, x, y, h * per_step, window)
+            if correlations[h] > correlations[best]:
                 best = h
-        if likeness[best] < HOPELESS:
+        if correlations[best] < MIN_CORRELATION:
             continue
         second = -1
         for h in range(steps):
-            apart = abs(h - best) >= APART and likeness[h] > NONE
-            if apart and (second < 0 or likeness[h] > likeness[second]):
+            separate = abs(h - best) >= SEPARATION and correlations[h] > NONE
+            if separate and (second < 0 or correlations[h] > correlations[second]):
                 second = h
         found[p, 0], found[p, 1] = _refined(pictures, i, tile, x, y, best, per_step, window)
-        if second >= 0:  # as finely, or it would look less alike than it is
+        if second >= 0:  # refined as well, for a fair comparison
             _, found[p, 2] = _refined(pictures, i, tile, x, y, second, per_step, window)
     return found
 
 
 @njit(cache=True, fastmath=_FAST)
 def _refined(pictures, i, tile, x, y, h, per_step, window):
-    """Inverse z-depth of the best place within a step of step h, and the likeness there."""
+    """Return the best inverse z-depth within a step of step h, and the correlation there."""
     fine = np.empty(2 * FINE + 1, np.float32)
     top = FINE
     for f in range(2 * FINE + 1):
         s = max(0.0, (h + (f - FINE) / FINE) * per_step)
-        fine[f] = _alike(pictures, i, tile, x, y, s, window)
+        fine[f] = _correlation(pictures, i, tile, x, y, s, window)
         if fine[f] > fine[top]:
             top = f
     shift = 0.0
     if 0 < top < 2 * FINE and fine[top - 1] > NONE and fine[top + 1] > NONE:
-        bend = fine[top - 1] - 2 * fine[top] + fine[top + 1]
-        if bend < -1e-6:  # flat: 0/0
-            shift = 0.5 * (fine[top - 1] - fine[top + 1]) / bend
+        curvature = fine[top - 1] - 2 * fine[top] + fine[top + 1]
+        if curvature < -1e-6:  # constant: 0/0
+            shift = 0.5 * (fine[top - 1] - fine[top + 1]) / curvature
     return np.float32(max(0.0, (h + (top - FINE + shift) / FINE) * per_step)), fine[top]
 
 
 @njit(cache=True, fastmath=_FAST)
-def _look(pictures, i, x, y):
-    """Grey level of picture i, between its pixels; NaN where it shows nothing."""
-    return _between(pictures, i, x, y) if _shows(pictures, i, x, y) else np.float32(np.nan)
+def _grey_at(pictures, i, x, y):
+    """Return the interpolated grey level of picture i; NaN outside it."""
+    return _interpolated(pictures, i, x, y) if _contains(pictures, i, x, y) else np.float32(np.nan)
 
 
 @njit(cache=True, fastmath=_FAST)
-def _between(pictures, i, x, y):
-    """Grey level at a place that lies between middles of pixels; NaN where one is not shown."""
+def _interpolated(pictures, i, x, y):
+    """Return the grey level between four pixel centres; NaN where one of them is invalid."""
     width, height = pictures.size[i, 0], pictures.size[i, 1]
     x, y = np.float32(x - 0.5), np.float32(y - 0.5)
-    # Rounding, and the series of 1/z, may bring a place past the first or the last.
+    # Rounding, and the series of 1/z, may give a position beyond the first or last pixel.
     column = max(0, min(int(x), width - 2))
     row = max(0, min(int(y), height - 2))
     u, v = x - np.float32(column), y - np.float32(row)
@@ -135,7 +136,7 @@ def _between(pictures, i, x, y):
 
 @njit(cache=True, fastmath=_FAST)
 def _tile(pictures, i, x, y):
-    """Number of the tile of picture i, row by row, in which a pixel lies."""
+    """Return the tile of picture i, numbered row by row, that contains a pixel."""
     column = min(max(int(TILES * x / pictures.size[i, 0]), 0), TILES - 1)
     row = min(max(int(TILES * y / pictures.size[i, 1]), 0), TILES - 1)
     return TILES * row + column
@@ -143,11 +144,11 @@ def _tile(pictures, i, x, y):
 
 @njit(cache=True, fastmath=_FAST)
 def _take_window(pictures, i, x, y, window):
-    """Fills `window` with what is about a pixel, less its mean and of length 1; False if flat."""
+    """Write the window around a pixel, minus its mean and of length 1; return False if flat."""
     total, at = 0.0, 0
     for row in range(-SIDE, SIDE + 1):
         for column in range(-SIDE, SIDE + 1):
-            window[at] = _look(pictures, i, x + column, y + row)
+            window[at] = _grey_at(pictures, i, x + column, y + row)
             total += window[at]
             at += 1
     mean, squared = total / at, 0.0
@@ -163,7 +164,7 @@ def _take_window(pictures, i, x, y, window):
 
 @njit(cache=True, fastmath=_FAST)
 def _direction(pictures, i, tile, k, x, y, s):
-    """A d + s b of a pixel of picture i, in the frame of its neighbour k."""
+    """Return A d + s b of a pixel of picture i, in the frame of its neighbour k."""
     fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
     dx, dy = (x - pictures.intrinsics[i, 2]) / fx, (y - pictures.intrinsics[i, 3]) / fy
     a, b = pictures.turn[i, tile, k], pictures.shift[i, tile, k]
@@ -176,7 +177,7 @@ def _direction(pictures, i, tile, k, x, y, s):
 
 @njit(cache=True, fastmath=_FAST)
 def _steps(pictures, i, tile, x, y):
-    """How many distances are tried, by how far the projection moves from the last to the first."""
+    """Return the number of depths to try, from the length of the projection of the ray."""
     length = 0.0
     for k in range(pictures.others.shape[2]):
         j = pictures.others[i, tile, k]
@@ -184,18 +185,18 @@ def _steps(pictures, i, tile, x, y):
             continue
         far = _direction(pictures, i, tile, k, x, y, 0.0)
         near = _direction(pictures, i, tile, k, x, y, pictures.most[i, tile])
-        if far[2] <= 1e-3 or near[2] <= 1e-3:  # passes the camera: over all of the picture
+        if far[2] <= 1e-3 or near[2] <= 1e-3:  # the ray passes the camera
             return MAX_STEPS
         fx, fy = pictures.intrinsics[j, 0], pictures.intrinsics[j, 1]
         across = fx * (near[0] / near[2] - far[0] / far[2])
         down = fy * (near[1] / near[2] - far[1] / far[2])
         length = max(length, np.sqrt(across * across + down * down))
-    return min(MAX_STEPS, int(length / STEP) + 2 * APART)
+    return min(MAX_STEPS, int(length / STEP) + 2 * SEPARATION)
 
 
 @njit(cache=True, fastmath=_FAST)
-def _shows(pictures, i, x, y):
-    """Whether a place lies between middles of picture i's pixels."""
+def _contains(pictures, i, x, y):
+    """Return whether a position lies between pixel centres of picture i."""
     width, height = pictures.size[i, 0], pictures.size[i, 1]
     inside = x >= 0.5 and y >= 0.5 and x <= width - 0.5 and y <= height - 0.5
     return inside and min(width, height) > 1
@@ -203,10 +204,10 @@ def _shows(pictures, i, x, y):
 
 @njit(cache=True, fastmath=_FAST)
 def _projected(xs, ys, zs, column, row):
-    """Where a window's pixel comes to lie from the neighbour's centre: x/z and y/z.
+    """Return x/z and y/z of a window's pixel, relative to the neighbour's principal point.
 
-    Each is a value at the window's middle and its changes along rows and columns; of z 1/z, and
-    relative changes, which are so small that a series of 1/z does.
+    xs and ys hold the value at the window's middle and its changes along rows and columns. zs holds
+    1/z and the relative changes of z, which are so small that a series of 1/z suffices.
     """
     u, v = np.float32(column), np.float32(row)
     change = zs[1] * u + zs[2] * v
@@ -215,8 +216,8 @@ def _projected(xs, ys, zs, column, row):
 
 
 @njit(cache=True, fastmath=_FAST)
-def _alike(pictures, i, tile, x, y, s, window):
-    """Mean likeness to the two neighbours that are most alike at inverse z-depth s."""
+def _correlation(pictures, i, tile, x, y, s, window):
+    """Return the mean correlation with the two best neighbours at inverse z-depth s."""
     first, second = np.float32(NONE), np.float32(NONE)
     fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
     for k in range(pictures.others.shape[2]):
@@ -224,38 +225,38 @@ def _alike(pictures, i, tile, x, y, s, window):
         if j < 0:
             continue
         middle = _direction(pictures, i, tile, k, x, y, np.float32(s))
-        a, own = pictures.turn[i, tile, k], pictures.intrinsics[j]
+        a, lens = pictures.turn[i, tile, k], pictures.intrinsics[j]
         turn_u, turn_v = a[2, 0] / fx, a[2, 1] / fy  # along the window's rows and columns
-        reach = SIDE * (abs(turn_u) + abs(turn_v))
-        # Beside or behind the camera, or turned far.
-        if middle[2] <= max(np.float32(1e-3), STEEP * reach):
+        extent = SIDE * (abs(turn_u) + abs(turn_v))
+        # Beside or behind the camera, or tilted too far.
+        if middle[2] <= max(np.float32(1e-3), MIN_DISTANCE * extent):
             continue
-        xs = own[0] * middle[0], own[0] * a[0, 0] / fx, own[0] * a[0, 1] / fy
-        ys = own[1] * middle[1], own[1] * a[1, 0] / fx, own[1] * a[1, 1] / fy
+        xs = lens[0] * middle[0], lens[0] * a[0, 0] / fx, lens[0] * a[0, 1] / fy
+        ys = lens[1] * middle[1], lens[1] * a[1, 0] / fx, lens[1] * a[1, 1] / fy
         per_z = np.float32(1.0) / middle[2]
         zs = per_z, turn_u * per_z, turn_v * per_z
-        inside = True  # with its corners, the whole window
+        inside = True  # the corners decide for the whole window
         for row in (-SIDE, SIDE):
             for column in (-SIDE, SIDE):
                 to_x, to_y = _projected(xs, ys, zs, column, row)
-                inside &= _shows(pictures, j, to_x + own[2], to_y + own[3])
+                inside &= _contains(pictures, j, to_x + lens[2], to_y + lens[3])
         if not inside:
             continue
         total, squared, both, at = np.float32(0), np.float32(0), np.float32(0), 0
         for row in range(-SIDE, SIDE + 1):
             for column in range(-SIDE, SIDE + 1):
                 to_x, to_y = _projected(xs, ys, zs, column, row)
-                grey = _between(pictures, j, to_x + own[2], to_y + own[3])
+                grey = _interpolated(pictures, j, to_x + lens[2], to_y + lens[3])
                 total += grey
                 squared += grey * grey
                 both += grey * window[at]
                 at += 1
         variance = squared - total * total / at
-        if not variance > at * MIN_CONTRAST**2:  # NaN where not shown
+        if not variance > at * MIN_CONTRAST**2:  # NaN where a pixel is invalid
             continue
-        own_likeness = np.float32(both / np.sqrt(variance))
-        if own_likeness > first:
-            first, second = own_likeness, first
-        elif own_likeness > second:
-            second = own_likeness
+        correlation = np.float32(both / np.sqrt(variance))
+        if correlation > first:
+            first, second = correlation, first
+        elif correlation > second:
+            second = correlation
     return np.float32(NONE) if second == NONE else np.float32(0.5) * (first + second)
