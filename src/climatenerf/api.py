@@ -234,7 +234,7 @@ def render_movie(
         part: (i, n) renders the frames whose index is i - 1 modulo n, and joins nothing.
         join_only: render nothing; join the finished frames.
         preview: show the frame at work in `preview.png`.
-        progress: called with "light", "snowfall", "frames" and "movie".
+        progress: called with the effect that is prepared, then with "frames" and "movie".
         note: called with sentences about what was assumed or left out.
         effects: the effects that the weather has sections for; None takes the installed ones.
 

@@ -219,19 +219,7 @@ def _interpolate(frames: Keyframes, time: float) -> Any:
 
 
 def to_toml(table: Mapping[str, Any]) -> str:
-    """Text of a weather file for the tables of `weather_to_table`."""
-    lines = [f"seed = {table['seed']}"]
-    for section, entries in table.items():
-        if isinstance(entries, Mapping):
-            lines += ["", f"[{section}]", *(f"{k} = {_toml(v)}" for k, v in entries.items())]
-    return "\n".join(lines) + "\n"
+    """Return the text of a weather file for the tables of `weather_to_table`."""
+    import tomli_w
 
-
-def _toml(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f'"{k}" = {_toml(v)}' for k, v in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(_toml(x) for x in value) + "]"
-    if isinstance(value, str):
-        return f'"{value}"'
-    return repr(value)
+    return tomli_w.dumps(table)
