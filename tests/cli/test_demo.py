@@ -14,7 +14,7 @@ from climatenerf.cli import demo
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Small grids, large photos' pixels left out: a blurred street in seconds."""
+    """Small grids and reduced photos give a blurred street in seconds."""
     from climatenerf.cli import fit as cli_fit
     from climatenerf.training import run as run_module
     from climatenerf.training.settings import FitSettings

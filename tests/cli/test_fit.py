@@ -131,18 +131,18 @@ def test_invalid_known_lengths_are_refused(tmp_path, capsys, text, expected):
 
 
 def test_a_known_length_sets_the_scale(tmp_path):
-    """The street's own metres say how long something is; told it is twice that, all doubles."""
+    """A length given as twice the true one doubles the scale."""
     from climatenerf.cli.fit import with_known_lengths
     from climatenerf.scene import read_scene
 
     scene = read_scene(STREET)
     ends = {"from": np.array([2.0, 6.0, 0.5]), "to": np.array([2.0, 6.0, 2.5])}
     lines = []
-    for end, place in ends.items():
+    for end, point in ends.items():
         lines.append(f"[POST.{end}]")
         for view in scene.views:
             c2w, camera = scene.c2w_world(view), scene.cameras[view.camera]
-            local = (place - c2w[:3, 3]) @ c2w[:3, :3]
+            local = (point - c2w[:3, 3]) @ c2w[:3, :3]
             x, y = camera.project(local)
             if local[2] > 0.5 and 0 < x < camera.width and 0 < y < camera.height:
                 lines.append(f'"{view.name}" = [{x:.3f}, {y:.3f}]')
@@ -153,12 +153,12 @@ def test_a_known_length_sets_the_scale(tmp_path):
     assert out.scale_source == "known-length" and out.scale_error < 0.03
 
 
-@pytest.mark.parametrize("left", ["optimiser.safetensors", "metrics.json"])
-def test_a_run_with_deleted_files_is_not_overwritten(run_folder, tmp_path, capsys, left):
+@pytest.mark.parametrize("remaining", ["optimiser.safetensors", "metrics.json"])
+def test_a_run_with_deleted_files_is_not_overwritten(run_folder, tmp_path, capsys, remaining):
     (tmp_path / "run").mkdir()
-    shutil.copy(run_folder / left, tmp_path / "run" / left)
+    shutil.copy(run_folder / remaining, tmp_path / "run" / remaining)
     complaint(capsys, "fit", STREET, "-o", tmp_path / "run", "--steps", "1")
-    assert [p.name for p in (tmp_path / "run").iterdir()] == [left]
+    assert [p.name for p in (tmp_path / "run").iterdir()] == [remaining]
 
 
 def test_a_capture_is_never_written_into(tmp_path, capsys):

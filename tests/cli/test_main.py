@@ -144,30 +144,30 @@ def stopped_in_a_terminal(how):
         stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm"},
     )  # fmt: skip
     os.close(theirs)
-    shown = b""
+    output = b""
     while True:
         try:
             more = os.read(ours, 4096)
         except OSError:  # on Linux: the other side is closed
             break
-        if b"READY" in more and b"READY" not in shown:
+        if b"READY" in more and b"READY" not in output:
             process.send_signal(how)
-        shown += more
+        output += more
         if not more:
             break
     os.close(ours)
-    return shown.decode(), process.wait(timeout=60)
+    return output.decode(), process.wait(timeout=60)
 
 
 @pytest.mark.parametrize(
     ("how", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 )
 def test_a_signal_restores_the_terminal(how, status):
-    shown, left = stopped_in_a_terminal(how)
-    assert left == status and "Traceback" not in shown
-    assert "climatenerf: interrupted" in shown
-    assert "\x1b[?25l" in shown, "the bar hides the cursor"
-    assert shown.rfind("\x1b[?25h") > shown.rfind("\x1b[?25l"), "and it comes back"
+    output, exit_status = stopped_in_a_terminal(how)
+    assert exit_status == status and "Traceback" not in output
+    assert "climatenerf: interrupted" in output
+    assert "\x1b[?25l" in output, "the bar hides the cursor"
+    assert output.rfind("\x1b[?25h") > output.rfind("\x1b[?25l"), "and it comes back"
 
 
 def test_signal_handlers_are_restored_and_ignored_signals_stay_ignored(verb):
@@ -214,7 +214,7 @@ def test_help_of_a_verb_does_not_load_torch(verb):
     code = (
         "import sys; from climatenerf.cli import main\n"
         "try:\n    status = main(sys.argv[1:])\n"
-        "except SystemExit as left:\n    status = left.code\n"
+        "except SystemExit as exit_status:\n    status = exit_status.code\n"
         "print('HEAVY', sorted({'torch', 'numba'} & set(sys.modules)), 'STATUS', status)"
     )
     words = [sys.executable, "-c", code, verb, "--help"]

@@ -164,13 +164,15 @@ def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypa
     assert sidecar["weather"]["snow"]["depth"] == "0.15 m"
     assert sidecar["units"]["length"] == "m" and "scale" in sidecar and "versions" in sidecar
     assert len(sidecar["frames"]) == 2 and sidecar["appearance_of_training_view"] is None
-    known = set(layer_table()) - {"label"}  # the embedded street's labels know the sky alone
+    expected_layers = set(layer_table()) - {
+        "label"
+    }  # the embedded street's labels know the sky alone
     for frame in sidecar["frames"]:
         assert (frame["camera"]["width"], frame["camera"]["height"]) == (96, 54)
         assert np.array(frame["c2w_world"]).shape == (4, 4)
-        assert set(frame["layers"]) == known
+        assert set(frame["layers"]) == expected_layers
         layers = {}
-        for name in known:
+        for name in expected_layers:
             layers[name] = np.load(tmp_path / frame["layers"][name][0])[name]
             assert not np.isnan(layers[name]).any(), name
             assert layers[name].shape[:2] == (54, 96)

@@ -1,4 +1,4 @@
-"""Render jobs: what a finished frame is known by, parts, restarts, and two processes at once."""
+"""Render jobs: keys of finished frames, parts, restarts, and two processes at once."""
 
 import contextlib
 import dataclasses

@@ -53,8 +53,8 @@ def test_png_is_within_half_a_step_and_marked(tmp_path):
             assert (levels[0, :3] == 128).all()
         else:
             back, step = levels * float(layer.png_step), float(layer.png_step)
-        known = np.isfinite(values)
-        assert np.abs(back - values)[known].max() <= 0.5 * step + 1e-6
+        finite = np.isfinite(values)
+        assert np.abs(back - values)[finite].max() <= 0.5 * step + 1e-6
     depth = np.asarray(Image.open(tmp_path / "depth" / "0000.png"))
     assert (depth[0, :3] == 0).all() and (depth[1:] > 0).all()
 

@@ -29,12 +29,12 @@ def test_movie_shows_the_frames_in_their_colours(tmp_path, size):
     with MovieWriter(path, size, 12) as movie:
         for frame in frames(10, *size):
             movie.add(frame)
-    info, shown = decoded(path)
+    info, decoded_frames = decoded(path)
     assert info["fps"] == 12 and info["codec"] == "h264" and "yuv420p" in info["pix_fmt"]
     assert "bt709" in info["pix_fmt"]
-    assert len(shown) == 10 and shown[0].shape == (48, 64, 3)
+    assert len(decoded_frames) == 10 and decoded_frames[0].shape == (48, 64, 3)
     assert (movie.note is None) == (size == (64, 48))
-    for frame, expected in zip(shown, frames(10, *size), strict=True):
+    for frame, expected in zip(decoded_frames, frames(10, *size), strict=True):
         gap = frame[: size[1], : size[0]].astype(float) - expected
         assert np.abs(gap).mean() < 3 and abs(gap.mean()) < 1.5, "a wrong matrix shifts by more"
     assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]

@@ -34,7 +34,7 @@ def drive(count, side=False):
     return looking_at(position, target)
 
 
-def roll(c2w, degrees):
+def rolled(c2w, degrees):
     a = np.radians(degrees)
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
@@ -55,7 +55,7 @@ def distance_to(path, c2w):
 
 def test_training_path_has_no_roll_even_spacing_and_stays_near_the_photographs():
     rng = np.random.default_rng(1)
-    poses = np.stack([roll(m, a) for m, a in zip(drive(40), rng.normal(0, 4, 40), strict=True)])
+    poses = np.stack([rolled(m, a) for m, a in zip(drive(40), rng.normal(0, 4, 40), strict=True)])
     path = training_path(scene_of(poses), 25, (480, 270))
     check_valid(path, 25)
     step = np.linalg.norm(np.diff(path.c2w[:, :3, 3], axis=0), axis=1)
@@ -163,7 +163,7 @@ def test_orbit_without_a_centre_is_a_small_ellipse(side):
 
 
 def test_still_has_the_pose_of_the_photograph():
-    poses = np.stack([roll(m, 7) for m in drive(5)])
+    poses = np.stack([rolled(m, 7) for m in drive(5)])
     scene = scene_of(poses, Camera(640, 360, 500, 500, 310, 190, k1=-0.1))
     for name in ("0003.jpg", "0003", 3, "3"):
         path = still(scene, name, 4)
@@ -187,7 +187,7 @@ def test_fitted_camera_keeps_the_field_of_view():
     assert 480 / wide.fx > 640 / 500 and 180 / wide.fx < 360 / 500, "wider and lower"
     assert 480 / wide.fx <= 1.5 * 640 / 500 + 1e-9
     # A phone on its side: its long side stands upright in a level movie.
-    on_side = scene_of(np.stack([roll(m, 90) for m in drive(3)]))
+    on_side = scene_of(np.stack([rolled(m, 90) for m in drive(3)]))
     upright = fitted_camera(on_side, (180, 320))
     assert upright.fx == pytest.approx(250)
     fish = Camera(640, 640, 200, 200, 320, 320, fisheye=True)
@@ -214,10 +214,10 @@ def test_nerfstudio_poses_are_transformed_back_through_every_frame(tmp_path):
     world_from_input[:3, :3], world_from_input[:3, 3] = 2.5 * q, [1, 2, 3]
     input_from_world = np.linalg.inv(world_from_input)
     applied = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-    own = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    own *= np.sign(np.linalg.det(own))
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
     centred = np.eye(4)
-    centred[:3, :3], centred[:3, 3] = own, [0.3, -0.2, 0.1]
+    centred[:3, :3], centred[:3, 3] = rotation, [0.3, -0.2, 0.1]
 
     def in_model(c2w):
         pose = centred @ input_from_world @ c2w

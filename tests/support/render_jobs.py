@@ -1,5 +1,6 @@
 """Render jobs with a frame source that costs nothing, and processes that render or join them."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -55,10 +56,7 @@ def join_parts(out: Path, frames: int) -> None:
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    """All files of a render by relative path, but for the lock and what a killed process left."""
+    """All files of a render by relative path, except the lock and what a killed process left."""
     found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
-    return {
-        name: path.read_bytes()
-        for name, path in found.items()
-        if name != ".frames/lock" and not name.startswith(".frames/unfinished-")
-    }
+    temporary = re.compile(r"(.*/)?\.[0-9a-f]{12}\.tmp\.\w+|\.frames/(lock|unfinished-.*)")
+    return {name: p.read_bytes() for name, p in found.items() if not temporary.fullmatch(name)}

@@ -4,8 +4,8 @@
     render_frames(job, out, lambda: frame_source(job, field, scene), frames_of_part(job, (3, 16)))
     movie = join(job, scene, out)
 
-A finished frame is known by a hash of everything that it depends on, so a stopped job resumes with
-the same call, and parts that several processes or machines render fit together.
+A finished frame is recognised by a hash of everything that it depends on. So a stopped job resumes
+with the same call, and parts that several processes or machines render fit together.
 """
 
 import contextlib
@@ -524,8 +524,8 @@ def _write_partial_sidecar(job: RenderJob, scene: Scene, out: Path) -> None:
     """Describe the frames that a stopped render leaves: without a sidecar they are no data."""
     with contextlib.suppress(UserError):
         folder = render_folder.working_folder(out, job.key)
-        held = render_folder.held_render(folder)
-        if held is not None and held["render"] == job.key:
+        current = render_folder.current_render(folder)
+        if current is not None and current["render"] == job.key:
             found = _sidecar(job, scene, out)
             if found["frames"]:
                 write_json(folder / SIDECAR, found)

@@ -41,25 +41,25 @@ def frame_files(index: int, layers: Sequence[str], formats: Sequence[str]) -> li
     return [f"frames/{stem}.png", *found]
 
 
-def held_render(folder: Path) -> dict[str, Any] | None:
+def current_render(folder: Path) -> dict[str, Any] | None:
     """Return the description of the render that a folder holds, or None if there is no sound one.
 
     The keys are `render` (its hash), `frames` (how many), `layers`, `formats` and `replaces`: files
     of an earlier render, relative to the folder, that are removed when this one is complete.
     """
     try:
-        held = read_json(folder / STATE / "render.json")
+        current = read_json(folder / STATE / "render.json")
         wanted = {"render": str, "frames": int, "layers": list, "formats": list, "replaces": list}
-        sound = all(isinstance(held.get(name), kind) for name, kind in wanted.items())
+        sound = all(isinstance(current.get(name), kind) for name, kind in wanted.items())
     except (UserError, OSError):
         return None
-    return held if sound else None
+    return current if sound else None
 
 
 def describe(
     key: str, frames: int, layers: Sequence[str], formats: Sequence[str], replaces: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the content of `render.json`; `held_render` reads it back."""
+    """Return the content of `render.json`; `current_render` reads it back."""
     return {
         "schema_version": SCHEMA_VERSION,
         "render": key,
@@ -80,11 +80,11 @@ def files_of_render(out: Path) -> set[Path]:
         frames = read_json(out / SIDECAR)["frames"]
         for frame in frames:
             names += [frame["file"], *sum(frame["layers"].values(), [])]
-    held = held_render(out)
-    if held is not None:
-        for index in range(held["frames"]):
-            names += frame_files(index, held["layers"], held["formats"])
-        names += held["replaces"]
+    current = current_render(out)
+    if current is not None:
+        for index in range(current["frames"]):
+            names += frame_files(index, current["layers"], current["formats"])
+        names += current["replaces"]
     if names:
         names += [MOVIE, SIDECAR]
     paths = {(out / name).resolve() for name in names}
@@ -136,10 +136,10 @@ def working_folder(out: Path, key: str) -> Path:
     Raises:
         UserError: the folder holds an unfinished render with other settings.
     """
-    held, waiting = held_render(out), held_render(out / NEXT)
-    if held is not None and held["render"] == key:
+    current, waiting = current_render(out), current_render(out / NEXT)
+    if current is not None and current["render"] == key:
         return out
-    if (held is not None and not is_complete(out, held)) or (
+    if (current is not None and not is_complete(out, current)) or (
         waiting is not None and waiting["render"] != key
     ):
         raise UserError(
@@ -149,11 +149,13 @@ def working_folder(out: Path, key: str) -> Path:
     return out / NEXT if files_of_render(out) else out
 
 
-def is_complete(out: Path, held: Mapping[str, Any]) -> bool:
+def is_complete(out: Path, current: Mapping[str, Any]) -> bool:
     """Return whether the frames of a folder's render have all been joined."""
     try:
         sidecar = read_json(out / SIDECAR)
-        return sidecar["render"] == held["render"] and len(sidecar["frames"]) == held["frames"]
+        return (
+            sidecar["render"] == current["render"] and len(sidecar["frames"]) == current["frames"]
+        )
     except (UserError, OSError, KeyError, TypeError):
         return False
 
@@ -165,7 +167,7 @@ def claim(out: Path, described: Mapping[str, Any]) -> None:
         UserError: the folder holds an unfinished render with other settings.
     """
     folder = working_folder(out, described["render"])
-    if held_render(folder) is None:
+    if current_render(folder) is None:
         if folder != out:  # files that a process left after the render was complete
             shutil.rmtree(folder, ignore_errors=True)
         write_json(folder / STATE / "render.json", described)
@@ -223,8 +225,8 @@ def commit_frame(
         if frame_record(out, index, keys[1]) is not None:
             return
         folder = working_folder(out, keys[0])
-        held = held_render(folder)
-        if held is None or held["render"] != keys[0]:
+        current = current_render(folder)
+        if current is None or current["render"] != keys[0]:
             raise UserError(
                 f"another render has replaced this one in {out} meanwhile; choose another folder"
                 " with -o"
@@ -242,10 +244,10 @@ def promote(out: Path, key: str) -> None:
     already, and `next` the rest of its files.
     """
     source = out / NEXT
-    waiting = held_render(source)
+    waiting = current_render(source)
     if waiting is not None and waiting["render"] == key:
-        held = held_render(out)
-        if held is None or held["render"] != key:
+        current = current_render(out)
+        if current is None or current["render"] != key:
             root = out.resolve()
             old = sorted(path.relative_to(root).as_posix() for path in files_of_render(out))
             write_json(out / STATE / "render.json", {**waiting, "replaces": old})
@@ -255,26 +257,26 @@ def promote(out: Path, key: str) -> None:
             if path.is_file() and path != source / STATE / "render.json":
                 move(path, out / path.relative_to(source))
         shutil.rmtree(source, ignore_errors=True)
-    held = held_render(out)
-    if held is None or held["render"] != key or not held["replaces"]:
+    current = current_render(out)
+    if current is None or current["render"] != key or not current["replaces"]:
         return
     wanted = {MOVIE, SIDECAR}
-    for index in range(held["frames"]):
-        wanted.update(frame_files(index, held["layers"], held["formats"]))
-    for name in set(held["replaces"]) - wanted:
+    for index in range(current["frames"]):
+        wanted.update(frame_files(index, current["layers"], current["formats"]))
+    for name in set(current["replaces"]) - wanted:
         (out / name).unlink(missing_ok=True)
     for path in (out / STATE).glob("*.json"):
-        if path.stem.isdecimal() and int(path.stem) >= held["frames"]:
+        if path.stem.isdecimal() and int(path.stem) >= current["frames"]:
             path.unlink(missing_ok=True)
-    write_json(out / STATE / "render.json", {**held, "replaces": []})
+    write_json(out / STATE / "render.json", {**current, "replaces": []})
 
 
 def continue_promotion(out: Path, key: str) -> None:
     """Finish moving a complete render into `out`, if a process was killed while it did so."""
 
     def begun() -> bool:
-        found = [held_render(folder) for folder in (out, out / NEXT)]
-        return all(held is not None and held["render"] == key for held in found)
+        found = [current_render(folder) for folder in (out, out / NEXT)]
+        return all(current is not None and current["render"] == key for current in found)
 
     if begun():
         with locked(out):
