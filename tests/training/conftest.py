@@ -1,4 +1,4 @@
-"""The toy scene, for all tests of fits that do not make their own."""
+"""The toy scene, for all tests of fits that do not build their own."""
 
 import pytest
 from support.toy_scene import make_scene

@@ -1,4 +1,4 @@
-"""Pixels of all photos in one row: in memory or, beyond a bound, in a file."""
+"""Pixels of all photos in one array: in memory or, beyond a limit, in a file."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ CAMERAS = [Camera(20, 14, 20.0, 20.0, 10.0, 7.0), Camera(14, 20, 20.0, 20.0, 7.0
 
 
 def made() -> TrainingPixels:
-    """Four pictures of two cameras; some lack label, mask and depth."""
+    """Four pictures of two cameras; labels, masks and depths of some are missing."""
     rng = np.random.default_rng(0)
     camera_of = [0, 1, 0, 1]
     shapes = [(CAMERAS[i].height, CAMERAS[i].width) for i in camera_of]
@@ -27,9 +27,9 @@ def made() -> TrainingPixels:
     return TrainingPixels(CAMERAS, camera_of, poses, images, labels, masks, relative)
 
 
-def test_pixels_beyond_the_bound_are_drawn_from_a_file_just_the_same(monkeypatch):
+def test_pixels_are_drawn_alike_from_memory_and_from_a_file(monkeypatch):
     inside = made()
-    monkeypatch.setattr(module, "IN_MEMORY", 100)
+    monkeypatch.setattr(module, "MAX_IN_MEMORY", 100)
     outside = made()
     row, parts = in_one_row([(2, 3), (30, 40)], [None, np.ones((30, 40), np.uint8)], np.uint8, 7)
     assert isinstance(row, np.memmap) and (row[:6] == 7).all() and (row[6:] == 1).all()
@@ -41,7 +41,7 @@ def test_pixels_beyond_the_bound_are_drawn_from_a_file_just_the_same(monkeypatch
     assert torch.equal(a.relative.nan_to_num(-1), b.relative.nan_to_num(-1))
 
 
-def test_what_a_picture_lacks_is_unknown_there_alone():
+def test_missing_labels_masks_and_depths_are_unknown_in_their_image_only():
     pixels = made()
     assert pixels.label is not None and pixels.relative is not None and pixels.usable is not None
     n = 20 * 14
@@ -51,28 +51,28 @@ def test_what_a_picture_lacks_is_unknown_there_alone():
     assert pixels.usable[n:].all() and pixels.usable_fraction == pytest.approx(1 - 94 / (4 * n))
 
 
-def test_the_kinds_of_labels_are_counted_piece_by_piece(monkeypatch):
+def test_classes_are_counted_in_pieces(monkeypatch):
     pixels = made()
     assert pixels.label is not None
     pixels.label[5], pixels.label[700] = 3, 4
-    monkeypatch.setattr(module, "AT_MOST", 100)
-    assert torch.equal(pixels.kinds(), pixels.label.unique()) and pixels.kinds().numel() == 4
+    monkeypatch.setattr(module, "MAX_DRAWN", 100)
+    assert torch.equal(pixels.classes(), pixels.label.unique()) and pixels.classes().numel() == 4
     pixels.label = None
-    assert pixels.kinds().numel() == 0
+    assert pixels.classes().numel() == 0
 
 
-def test_a_full_disk_is_a_sentence(monkeypatch):
+def test_a_full_temporary_folder_is_a_user_error(monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(module, "IN_MEMORY", 100)
+    monkeypatch.setattr(module, "MAX_IN_MEMORY", 100)
     monkeypatch.setattr(module.tempfile, "TemporaryFile", full)
     with pytest.raises(UserError, match=r"No space left.*TMPDIR"):
         made()
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_pictures_and_cameras_are_as_many(count):
+def test_the_number_of_pictures_must_equal_that_of_cameras(count):
     images = [np.zeros((14, 20, 3), np.uint8)] * count
     with pytest.raises(ValueError, match=f"{count} pictures for 2 cameras"):
         TrainingPixels(CAMERAS, [0, 0], np.stack([np.eye(4)] * 2), images)
@@ -83,8 +83,8 @@ def test_a_picture_of_another_size_is_refused():
         TrainingPixels(CAMERAS, [0], np.eye(4)[None], [np.zeros((20, 14, 3), np.uint8)])
 
 
-def test_what_a_mask_hides_says_nothing_of_what_is_empty():
-    """A thumb or a mirror that a network takes for the sky: masked, it carves no more."""
+def test_masked_pixels_are_no_evidence_of_empty_space():
+    """A thumb or a mirror labelled as sky forces no cell empty once it is masked."""
     poses = np.stack([np.eye(4)] * 6)
     poses[:, 0, 3] = np.arange(6)  # m, side by side, looking the same way
     images = [np.zeros((14, 20, 3), np.uint8)] * 6
@@ -93,24 +93,24 @@ def test_what_a_mask_hides_says_nothing_of_what_is_empty():
     for mask in masks:
         mask[:, :12] = False
     x, radius = torch.tensor([[2.5, -1.0, 40.0]]), torch.tensor([0.01])
-    for given, carved in ((None, True), (masks, False)):
+    for given, forced in ((None, True), (masks, False)):
         pixels = TrainingPixels(CAMERAS, [0] * 6, poses, images, labels, given)
         assert pixels.sky_hull is not None and pixels.label is not None
-        assert bool(pixels.sky_hull.consensus(x, radius)) == carved
-        assert (pixels.label == UNKNOWN).any() == (not carved)
+        assert bool(pixels.sky_hull.consensus(x, radius)) == forced
+        assert (pixels.label == UNKNOWN).any() == (not forced)
 
 
-def test_colours_nearby_are_the_least_and_largest_of_a_window():
-    """Against filters of whole pictures; at borders the window ends, and the next photo is none."""
+def test_colours_nearby_are_the_minimum_and_maximum_of_a_window():
+    """Compare with filters of whole pictures; windows end at the border of a photo."""
     pixels = made()
     start = pixels.pixel_start.tolist()
     batch = pixels.draw(3000, torch.Generator().manual_seed(0))
     low, high = pixels.colours_nearby(batch.image, batch.xy)
     for i, camera in enumerate(pixels.cameras):
         rgb = pixels.rgb[start[i] : start[i + 1]].numpy().reshape(camera.height, camera.width, 3)
-        some = batch.image == i
-        x, y = (batch.xy[some].numpy() * (camera.width, camera.height)).astype(int).T
+        rows = batch.image == i
+        x, y = (batch.xy[rows].numpy() * (camera.width, camera.height)).astype(int).T
         side = 2 * module.NEARBY + 1
         for found, filtered in ((low, minimum_filter), (high, maximum_filter)):
             expected = filtered(rgb, (side, side, 1), mode="nearest")[y, x] / 255
-            assert np.allclose(found[some].numpy(), expected, atol=1e-6)
+            assert np.allclose(found[rows].numpy(), expected, atol=1e-6)

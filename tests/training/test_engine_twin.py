@@ -1,4 +1,4 @@
-"""The step that `benchmarks/engine.py` measures, and its twin in plain PyTorch: they are one."""
+"""The step that `benchmarks/engine.py` measures, against the same in plain PyTorch."""
 
 import os
 import sys
@@ -28,18 +28,18 @@ def learned(field, at, plain):
     return float(loss.detach()), {name: each.clone() for name, each in named.items()}
 
 
-def test_the_measured_step_and_its_twin_have_one_loss_and_the_same_gradients(scene):
+def test_the_benchmarked_step_and_plain_pytorch_have_the_same_loss_and_gradients(scene):
     trainer = begin(scene, steps=10)
     field = trainer.field
     generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():  # as after some steps: structure in the grids, matter in sight
+    with torch.no_grad():  # as after a few steps: varied grids and visible matter
         for name, parameter in field.named_parameters():
             if name.endswith("_grid"):
                 parameter.copy_(0.1 * torch.randn(parameter.shape, generator=generator))
         field.geometry_net[-1].add_(2.0)
     for table in trainer.grid_adam.tables:
-        del table.grad_buffer  # gradients are to be seen
-    at = engine.drawn(trainer, 30_000)
+        del table.grad_buffer  # so that gradients go to .grad
+    at = engine.draw_batch(trainer, 30_000)
     ours, gradients = learned(field, at, False)
     twin, wanted = learned(field, at, True)
     assert abs(ours - twin) < 1e-5 * abs(twin)

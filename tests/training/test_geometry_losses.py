@@ -1,4 +1,4 @@
-"""Flatness, classes and normals as losses: known values, invariances, gradients."""
+"""Losses on planarity, classes and normals: known values, invariances, gradients."""
 
 import math
 
@@ -22,7 +22,7 @@ def plane_depth(normal, offset):
 
 
 @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.0, -0.95, 0.3), (0.3, 0.1, 0.9)])
-def test_planes_do_not_bend_however_tilted(normal):
+def test_second_difference_of_a_plane_is_zero_at_any_tilt(normal):
     """Over pixels in any line, at any distance."""
     z = torch.tensor(plane_depth(normal, 3.0))
     for down, right in ((0, 1), (5, 0), (8, 8), (3, -3)):
@@ -31,7 +31,7 @@ def test_planes_do_not_bend_however_tilted(normal):
         assert abs(losses.second_difference(torch.stack([middle, left, right_])[None])) < 1e-6
 
 
-def test_ground_loss_is_the_mean_distance_from_the_ground_up_to_a_bound():
+def test_ground_height_loss_is_the_mean_bounded_distance():
     weights = torch.tensor([0.5, 0.5, 0.2], requires_grad=True)
     t, goal = torch.tensor([0.5, 0.9, 1.0]), torch.tensor([0.53, 0.89, 4.0])
     loss = losses.ground_height_loss(weights, t, goal, 4)
@@ -44,7 +44,7 @@ def test_ground_loss_is_the_mean_distance_from_the_ground_up_to_a_bound():
     assert losses.ground_height_loss(nothing, nothing, nothing, 4) == 0
 
 
-def test_a_bump_bends_and_an_edge_costs_no_more_than_one():
+def test_planarity_loss_is_at_most_one_at_an_edge():
     bump, edge = torch.tensor([[0.97, 1.0, 1.0]]), torch.tensor([[1.0, 1.0, 9.0]])
     assert losses.second_difference(bump) == pytest.approx(2 * (0.97 - 1.0), rel=1e-4)
     counts = torch.ones(1)
@@ -52,7 +52,7 @@ def test_a_bump_bends_and_an_edge_costs_no_more_than_one():
     assert losses.planarity_loss(edge, torch.zeros(1)) == 0
 
 
-def test_an_edge_feels_next_to_no_pull_and_a_bump_much():
+def test_planarity_gradient_is_small_at_an_edge_and_large_at_a_bump():
     pulls = []
     for row in ([0.98, 1.0, 1.0], [1.0, 1.0, 9.0]):
         z = torch.tensor([row], requires_grad=True)
@@ -62,7 +62,7 @@ def test_an_edge_feels_next_to_no_pull_and_a_bump_much():
     assert pulls[1] < 0.01 * pulls[0]
 
 
-def test_class_loss_is_cross_entropy_where_known_and_none_elsewhere():
+def test_class_loss_is_the_cross_entropy_where_the_class_is_known():
     logits = torch.tensor([[2.0, 0.0], [0.0, 3.0], [1.0, 1.0]])
     target = torch.tensor([0, 255, 1])
     known = torch.tensor([True, False, True])
@@ -72,7 +72,7 @@ def test_class_loss_is_cross_entropy_where_known_and_none_elsewhere():
     assert nothing == 0 and torch.isfinite(nothing)
 
 
-def test_normal_loss_of_known_directions():
+def test_normal_loss_has_known_values():
     weights = torch.tensor([0.5, 0.25])
     up, side = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
     same = losses.normal_loss(weights, torch.stack([up, up]), torch.stack([up, up]), 2)
@@ -80,7 +80,7 @@ def test_normal_loss_of_known_directions():
     assert same == 0 and across == pytest.approx((0.5 * 2 + 0.25 * 4) / 2)
 
 
-def test_the_papers_sky_loss_wants_matter_far_away():
+def test_far_sky_loss_falls_with_distance():
     is_sky = torch.tensor([1.0, 1.0, 0.0])
     near = losses.far_sky_loss(torch.tensor([0.0, 1.0, 0.0]), is_sky)
     far = losses.far_sky_loss(torch.tensor([8.0, 8.0, 0.0]), is_sky)
@@ -102,18 +102,18 @@ def test_triples_lie_in_a_line_at_equal_distances_in_one_image():
     )
     assert 0.2 < batch.in_line.float().mean() < 1
     assert torch.allclose((left + right) / 2, middle, atol=1e-4)
-    apart = (left - middle).abs().amax(-1).round()
-    assert set(apart.tolist()) == {1.0, 2.0, 4.0}  # 8 does not fit 14 rows here
-    for some in (slice(n - 2 * m, n - m), slice(n - m, n)):
-        assert torch.equal(batch.image[some], batch.image[:m])
+    spacing = (left - middle).abs().amax(-1).round()
+    assert set(spacing.tolist()) == {1.0, 2.0, 4.0}  # 8 does not fit 14 rows here
+    for side in (slice(n - 2 * m, n - m), slice(n - m, n)):
+        assert torch.equal(batch.image[side], batch.image[:m])
     outside = ~batch.in_line
     assert torch.equal(batch.xy[n - m :][outside], batch.xy[:m][outside])
     # Colours belong to the pixels: each image is of one colour.
     assert torch.allclose(batch.rgb[:, 0] * 255, batch.image.float(), atol=1e-3)
 
 
-def test_a_tilted_plane_does_not_bend_along_triples():
-    """By z-depth, which is the ray's length times the cosine of the batch: lengths do bend."""
+def test_second_difference_of_a_plane_is_zero_along_drawn_triples():
+    """The z-depth is the ray length times the batch's cosine; ray lengths are not affine."""
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
     image = np.zeros((14, 20, 3), np.uint8)
     pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image])
@@ -126,21 +126,21 @@ def test_a_tilted_plane_does_not_bend_along_triples():
     assert losses.second_difference(t[rows][:, batch.in_line].T).abs().max() > 1e-2
 
 
-def test_sky_below_the_horizon_is_none():
-    """A level camera whose whole picture is labelled sky: what sinks by 3 degrees is unknown."""
+def test_sky_labels_below_the_horizon_are_dropped():
+    """A level camera labelled sky entirely: pixels more than 3 degrees below it are unknown."""
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
     level = np.eye(4)
     level[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks along y, z up
     label = np.full((14, 20), 10, np.uint8)
     pixels = TrainingPixels([camera], [0], level[None], [np.zeros((14, 20, 3), np.uint8)], [label])
     assert pixels.label is not None
-    kept = (pixels.label.view(14, 20) == SKY).numpy()
+    sky = (pixels.label.view(14, 20) == SKY).numpy()
     down = (np.arange(14) + 0.5 - 7) / 20
-    assert kept[down < 0].all() and not kept[down > 0.1].any()
-    assert (label == 10).all()  # the caller's own array stays
+    assert sky[down < 0].all() and not sky[down > 0.1].any()
+    assert (label == 10).all()  # the caller's array is unchanged
 
 
-def test_no_side_of_a_triple_is_a_masked_pixel():
+def test_triples_have_no_masked_pixel():
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
     mask = np.ones((14, 20), bool)
     mask[:, 10:] = False
@@ -151,14 +151,14 @@ def test_no_side_of_a_triple_is_a_masked_pixel():
     assert 0.1 < batch.in_line.float().mean() < 0.9
 
 
-def test_labels_that_know_nothing_are_none():
+def test_labels_without_any_class_count_as_none():
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
     image, label = np.zeros((14, 20, 3), np.uint8), np.full((14, 20), 255, np.uint8)
     pixels = TrainingPixels([camera], [0], np.eye(4)[None], [image], [label])
     assert pixels.label is None and pixels.sky_hull is None and not pixels.knows_sky
 
 
-def test_without_sky_what_was_labelled_so_is_unknown():
+def test_without_sky_makes_sky_labels_unknown():
     camera = Camera(20, 14, 20.0, 20.0, 10.0, 7.0)
     up = np.diag([1.0, -1.0, -1.0, 1.0])
     up[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]

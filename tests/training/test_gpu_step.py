@@ -1,4 +1,4 @@
-"""A whole step of a fit by the GPU's kernels, in Triton's interpreter, against the CPU's."""
+"""A whole step of a fit with the GPU kernels, in Triton's interpreter, against the CPU's."""
 
 import os
 
@@ -35,7 +35,7 @@ def use_backend(backend, monkeypatch):
 
 
 def test_a_step_with_the_gpu_kernels_has_the_gradients_of_the_cpu_kernels(scene, monkeypatch):
-    """In large tiles: the interpreter takes milliseconds for an operation, however long."""
+    """Tiles are large: the interpreter takes milliseconds for an operation of any length."""
     for module in (gpu_encoding, gpu_network, gpu_marching):
         monkeypatch.setattr(module, "SAMPLES", 4096)
     for module, name, size in (

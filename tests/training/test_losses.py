@@ -29,7 +29,7 @@ def test_distance_measure_is_the_identity_near_and_bounded_far():
     assert torch.allclose(measure, torch.tensor([0.0, 0.5, 1.0, 1.5, 2.0]))
 
 
-def test_distortion_of_known_weights():
+def test_distortion_loss_has_known_values():
     offsets = torch.tensor([0, 1, 3])
     t = torch.tensor([0.5, 0.2, 0.6])
     dt = torch.tensor([0.1, 0.1, 0.1])
@@ -144,7 +144,7 @@ def test_monocular_depth_counts_by_its_weight_where_it_is_known(scene):
     assert found[0] > 0 and found[1] == pytest.approx(2 * found[0], rel=1e-5) and found[2] == 0
 
 
-def test_scaling_a_gradient_leaves_the_value():
+def test_scale_gradient_leaves_the_value_unchanged():
     x = torch.tensor([2.0, -3.0], requires_grad=True)
     y = scale_gradient(x, torch.tensor([0.25, 1.0]))
     assert torch.equal(y.detach(), x.detach())

@@ -6,7 +6,7 @@ from climatenerf.training.optimiser import GridAdam
 def after_steps(
     decay: float, touched: torch.Tensor, steps: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A table as it began, after steps in which `touched` had gradients, and torch's AdamW's."""
+    """A table before and after steps with gradients in `touched`, and after AdamW's steps."""
     generator = torch.Generator().manual_seed(0)
     start = torch.randn(2, 16, 2, generator=generator)
     table, twin = (torch.nn.Parameter(start.clone()) for _ in range(2))
@@ -22,7 +22,7 @@ def after_steps(
     return start, table.data, twin.data
 
 
-def test_rows_with_gradients_follow_adam_and_others_stay():
+def test_rows_with_gradients_follow_adam_and_others_are_unchanged():
     touched = torch.zeros(2, 16, 2, dtype=torch.bool)
     touched[0, :5] = True
     start, ours, theirs = after_steps(0.0, touched, 5)
@@ -30,8 +30,8 @@ def test_rows_with_gradients_follow_adam_and_others_stay():
     assert torch.equal(ours[~touched], start[~touched])
 
 
-def test_values_fall_by_their_share_of_the_rate_whether_they_have_a_gradient_or_not():
-    """As AdamW's, but for when within eight steps."""
+def test_weight_decay_applies_with_and_without_gradients():
+    """As in AdamW, except that it is applied every eight steps."""
     touched = (torch.arange(16) < 5)[None, :, None].expand(2, 16, 2)
     start, ours, theirs = after_steps(0.5, touched, 16)
     assert torch.allclose(ours, theirs, atol=6e-3)

@@ -1,4 +1,4 @@
-"""Directions from the lattice against the camera's own."""
+"""Directions interpolated on the lattice, against the camera's."""
 
 import numpy as np
 import pytest
@@ -25,14 +25,14 @@ FOLD = Camera(80, 60, 50.0, 50.0, 40.0, 30.0, k1=-0.232)
     ("index", "camera", "pixels"),
     [(0, PLAIN, 1e-4), (1, BENT, 0.02), (2, FISH, 0.1), (3, FOLD, 1e-4)],
 )
-def test_directions_are_the_cameras(index, camera, pixels):
-    """Off by less than so many pixels, whatever cameras are kept beside."""
+def test_interpolated_directions_match_the_camera(index, camera, pixels):
+    """The error is below a number of pixels, with other cameras in the same lattice."""
     found = all_of(Directions([PLAIN, BENT, FISH, FOLD]), index, camera).numpy()
     real = camera.directions().reshape(-1, 3)
     assert np.allclose(np.linalg.norm(found, axis=-1), 1, atol=1e-6)
     assert np.linalg.norm(found - real, axis=-1).max() < pixels / camera.fx
 
 
-def test_a_large_photo_costs_less_than_its_pixels():
+def test_the_lattice_is_smaller_than_the_photo():
     camera = Camera(1000, 750, 800.0, 800.0, 500.0, 375.0)
     assert Directions([camera]).lattice.nbytes < 1000 * 750

@@ -13,8 +13,8 @@ from climatenerf.training.trainer import make_trainer
 
 
 @pytest.mark.slow
-def test_perturbed_poses_come_back(tmp_path):
-    """Cameras turned by some four degrees: a quarter is found again soon, and only if asked."""
+def test_perturbed_poses_are_recovered_in_part(tmp_path):
+    """Of rotations by about four degrees a quarter is recovered soon, with `refine_poses` only."""
     scene = make_scene(tmp_path)
     views = scene.of_split("train")
     true = torch.from_numpy(np.stack([scene.c2w_world(v) for v in views])).float()
@@ -31,18 +31,18 @@ def test_perturbed_poses_come_back(tmp_path):
     trainer = make_trainer(pixels, extent, settings)
     trainer.run(lambda _: None)
     found = trainer.poses.corrected(given, trainer.field.unit).detach()
-    left = [
+    errors = [
         (poses[:, :3, :3] @ true[:, :3, :3].transpose(1, 2)).diagonal(dim1=1, dim2=2).sum(-1)
         for poses in (given, found)
     ]
-    before, after = (torch.rad2deg(torch.acos(((t - 1) / 2).clamp(-1, 1))).median() for t in left)
+    before, after = (torch.rad2deg(torch.acos(((t - 1) / 2).clamp(-1, 1))).median() for t in errors)
     assert after < 0.75 * before, (before, after)
     still = make_trainer(pixels, extent, replace(settings, refine_poses=False, steps=100))
     still.run(lambda _: None)
     assert torch.equal(still.poses.turn, torch.zeros_like(still.poses.turn))
 
 
-def test_rotations_are_rotations_and_known_ones():
+def test_rotations_are_orthonormal_and_have_known_values():
     turn = torch.randn(20, 3)
     r = rotations(turn)
     assert torch.allclose(r @ r.transpose(1, 2), torch.eye(3).expand(20, 3, 3), atol=1e-5)
@@ -52,8 +52,8 @@ def test_rotations_are_rotations_and_known_ones():
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-4, 0.0316, 0.0317, 0.3, 3.0])
-def test_rotations_are_the_exponential_with_its_gradients(size):
-    """Also on both sides of where the series end."""
+def test_rotations_equal_the_matrix_exponential_with_gradients(size):
+    """Also on both sides of the angle below which series are used."""
     generator = torch.Generator().manual_seed(0)
     turn = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1) * size
     weights = torch.randn(20, 3, 3, generator=generator)
@@ -75,7 +75,7 @@ def test_rotations_are_the_exponential_with_its_gradients(size):
     assert torch.allclose(found[0][1], found[1][1], atol=3e-5)
 
 
-def test_no_correction_leaves_rays_and_poses_as_they_are_and_has_finite_gradients():
+def test_zero_corrections_change_nothing_and_have_finite_gradients():
     poses = PoseCorrections(3)
     image = torch.tensor([0, 2, 1])
     o, d = torch.randn(3, 3), torch.nn.functional.normalize(torch.randn(3, 3), dim=-1)
@@ -88,7 +88,7 @@ def test_no_correction_leaves_rays_and_poses_as_they_are_and_has_finite_gradient
     assert torch.allclose(poses.corrected(c2w, 5.0), c2w)
 
 
-def test_corrected_poses_throw_the_corrected_rays():
+def test_corrected_poses_give_the_corrected_rays():
     poses = PoseCorrections(2)
     with torch.no_grad():
         poses.turn.copy_(0.1 * torch.randn(2, 3))

@@ -45,13 +45,13 @@ def toy(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(toy):
-    """With one picture held out, since measuring takes the most time here."""
+    """The toy scene with one picture held out, since measuring takes most of the time."""
     return with_split(toy, {"00.png"})
 
 
 @pytest.fixture(autouse=True)
 def tiny(monkeypatch):
-    """Small sizes; a field of a few steps is thick haze, in which full pictures take seconds."""
+    """Small pictures and few rays: a field of a few steps is haze, which is slow to render."""
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
     mark_seen = Sampler.mark_seen
     monkeypatch.setattr(Sampler, "mark_seen", lambda self, o, d: mark_seen(self, o[:50], d[:50]))
@@ -72,7 +72,7 @@ def contents(folder):
 
 
 def full_disk_for(name, monkeypatch):
-    """Renaming onto a file of this name fails as on a full disk."""
+    """Let renaming onto a file of this name fail as on a full disk."""
     real = os.replace
 
     def replace(source, target):
@@ -83,7 +83,7 @@ def full_disk_for(name, monkeypatch):
     monkeypatch.setattr(os, "replace", replace)
 
 
-def test_a_run_folder_has_everything(toy, tmp_path):
+def test_a_run_folder_holds_metrics_config_scene_preview_and_field(toy, tmp_path):
     scene = toy
     done = []
     metrics = fitted(scene, tmp_path / "run", evaluated=lambda *count: done.append(count))
@@ -93,7 +93,7 @@ def test_a_run_folder_has_everything(toy, tmp_path):
     assert {"psnr", "ssim", "psnr_cc", "seconds", "steps", "samples"} <= set(on_disk)
     assert on_disk["steps"] == 6 and on_disk["samples"] > 0 and on_disk["seconds"] > 0
     assert on_disk["interrupted"] is False and on_disk["train_views"] == 20
-    assert on_disk["masked_fraction"] == 0, "masks begin with believing everything"
+    assert on_disk["masked_fraction"] == 0, "at first nothing is masked"
     assert sorted(on_disk["views"]) == [f"{i:02d}.png" for i in (0, 6, 12, 18)]
     for key in ("psnr", "ssim", "psnr_cc"):
         rows = [row[key] for row in on_disk["views"].values()]
@@ -115,7 +115,7 @@ def test_a_run_folder_has_everything(toy, tmp_path):
     assert found == pytest.approx(on_disk["views"][view.name]["psnr"], abs=1e-3)
 
 
-def test_what_a_mask_hides_does_not_count_in_the_score(toy, tmp_path):
+def test_masked_pixels_do_not_count_in_the_score(toy, tmp_path):
     scene = toy
     metrics = fitted(scene, tmp_path / "run", steps=2)
     field, (view, other, *_) = load_field(tmp_path / "run"), scene.of_split("heldout")
@@ -137,8 +137,8 @@ def test_what_a_mask_hides_does_not_count_in_the_score(toy, tmp_path):
     assert other.name not in found and len(found) == 3
 
 
-def test_a_held_out_photo_is_shown_as_photos_from_about_there(toy, tmp_path, monkeypatch):
-    """The further north a photo looks, the higher the numbers of its appearance."""
+def test_held_out_views_are_rendered_in_the_appearance_of_nearby_photos(toy, tmp_path, monkeypatch):
+    """Appearance vectors are set to the northward component of each photo's direction."""
     scene = toy
     fitted(scene, tmp_path / "run", steps=2)
     field = load_field(tmp_path / "run")
@@ -162,14 +162,14 @@ def test_a_held_out_photo_is_shown_as_photos_from_about_there(toy, tmp_path, mon
     assert np.ptp(seen) == 0
 
 
-def test_nothing_held_out_means_no_quality(scene, tmp_path):
+def test_quality_is_none_without_held_out_photos(scene, tmp_path):
     metrics = fitted(with_split(scene, set()), tmp_path / "run", steps=2)
     assert metrics["psnr"] is None and metrics["ssim"] is None and metrics["psnr_cc"] is None
     assert metrics["train_views"] == 24 and metrics["steps"] == 2
 
 
-def test_heads_on_the_appearance_grid_learn_and_come_back(scene, tmp_path, monkeypatch):
-    """As in the paper's preset: no grid of their own, the paper's weights, an opaque sky."""
+def test_surface_heads_on_the_appearance_grid_learn_and_load(scene, tmp_path, monkeypatch):
+    """As in the paper's preset: no surface grid, the paper's weights, an opaque sky."""
     view = scene.of_split("train")[0]
     settings = dataclasses.replace(
         PAPER,
@@ -193,7 +193,7 @@ def test_heads_on_the_appearance_grid_learn_and_come_back(scene, tmp_path, monke
     assert np.isfinite(render_view(field, scene.cameras[0], scene.c2w_world(view))).all()
 
 
-def test_without_masks_no_share_of_them_is_told(scene, tmp_path):
+def test_masked_fraction_is_none_without_masks(scene, tmp_path):
     metrics = fitted(scene, tmp_path / "run", steps=2, losses=Losses(transient=0.0))
     assert metrics["masked_fraction"] is None
 
@@ -210,7 +210,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(scene, tmp_path):
 
 
 def state_of(trainer):
-    """All that a step reads or changes."""
+    """All state that a step reads or changes."""
     state = {f"field.{k}": v for k, v in trainer.field.state_dict().items()}
     state |= {f"grid.{k}": v for k, v in trainer.grid_adam.state().items()}
     for index, moments in trainer.net_adam.state_dict()["state"].items():
@@ -250,14 +250,14 @@ def stop_at(step):
 
 
 def stop_half_way(trainer, run):
-    """Leaves what a fit of 40 steps that is stopped after 20 leaves."""
+    """Stop a fit of 40 steps after 20, and write its checkpoint."""
     with pytest.raises(KeyboardInterrupt):
         trainer.run(stop_at(20))
     write_json(run / "config.json", run_module._config(trainer.settings, 1, trainer.field))
     checkpoint(trainer, run)
 
 
-def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path):
+def test_a_restored_fit_continues_bit_for_bit(scene, tmp_path):
     trainer = begin(scene, steps=40)
     trainer.field.pruning_threshold = 0.004
     stop_half_way(trainer, tmp_path)
@@ -273,7 +273,7 @@ def test_a_restored_fit_goes_on_bit_for_bit_as_if_never_stopped(scene, tmp_path)
 
 
 def labelled(trainer):
-    """A fit of the same pixels, bright ones sky, dark ones grown, the rest built."""
+    """A fit of the same pixels, labelled by brightness: sky, building, vegetation."""
     pixels = trainer.pixels
     grey = pixels.rgb.float().mean(-1)
     others = torch.where(grey > 100, BUILDING, VEGETATION)
@@ -284,8 +284,8 @@ def labelled(trainer):
     return make_trainer(pixels, trainer.extent, trainer.settings)
 
 
-def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
-    """Masks, relative depth's sums and the cells that the sky bars are in the checkpoint."""
+def test_a_restored_fit_with_labels_continues_bit_for_bit(scene, tmp_path):
+    """The checkpoint holds masks, sums of relative depth, and cells that the sky forces empty."""
     trainer = labelled(begin(scene, steps=40))
     assert trainer.field.occupancy.forced_empty.any()
     stop_half_way(trainer, tmp_path)
@@ -301,7 +301,7 @@ def test_with_labels_too_a_restored_fit_goes_on_bit_for_bit(scene, tmp_path):
     assert all(map(torch.equal, trainer.masks.parameters(), again.masks.parameters()))
 
 
-def test_labels_that_come_with_a_resumed_run_are_not_believed_at_once(scene, tmp_path):
+def test_new_labels_of_a_resumed_run_are_trusted_later(scene, tmp_path):
     trainer = begin(scene, steps=40)
     stop_half_way(trainer, tmp_path)
     again = labelled(begin(scene, steps=40))
@@ -311,7 +311,7 @@ def test_labels_that_come_with_a_resumed_run_are_not_believed_at_once(scene, tmp
     assert again.objective.classes_trusted_at == pytest.approx(wanted)
 
 
-def test_refined_poses_are_kept_and_not_left_behind(scene, tmp_path):
+def test_refined_poses_are_saved_and_need_the_flag_to_resume(scene, tmp_path):
     fitted(scene, tmp_path / "run", steps=20, refine_poses=True)
     moved = load_scene(tmp_path / "run")
     pairs = [(a.c2w, b.c2w) for a, b in zip(scene.views, moved.views, strict=True)]
@@ -346,7 +346,7 @@ def test_a_run_with_the_earlier_names_of_settings_is_read_and_resumed(scene, tmp
     assert fitted(scene, tmp_path / "run", steps=6, resume=True)["steps"] == 6
 
 
-def test_resuming_counts_on(scene, tmp_path):
+def test_resuming_continues_the_counters(scene, tmp_path):
     first = fitted(scene, tmp_path / "run", steps=8)
     second = fitted(scene, tmp_path / "run", steps=16, resume=True)
     assert second["steps"] == 16
@@ -355,8 +355,8 @@ def test_resuming_counts_on(scene, tmp_path):
     assert third["steps"] == 16 and third["samples"] == second["samples"], "it was finished"
 
 
-def test_a_run_that_is_resumed_for_longer_stays_as_far_as_it_was(scene, tmp_path):
-    """Nothing that a later stage has found is believed less again: near matter, masks, steps."""
+def test_progress_does_not_fall_when_a_run_is_resumed_for_longer(scene, tmp_path):
+    """What depends on progress, such as the near distance, does not go back."""
     fitted(scene, tmp_path / "run", steps=8)
     again = begin(scene, steps=800)
     assert again.progress == 0 and again.near > again.field.near
@@ -364,7 +364,7 @@ def test_a_run_that_is_resumed_for_longer_stays_as_far_as_it_was(scene, tmp_path
     assert again.elapsed < 0.02 and again.progress == 1 and again.near == again.field.near
     arrays, head = read_safetensors(tmp_path / "run" / "optimiser.safetensors", "state")
     state = {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
-    state["floats"] = state["floats"][:3]  # as earlier versions left it
+    state["floats"] = state["floats"][:3]  # as earlier versions wrote it
     write_safetensors(tmp_path / "run" / "optimiser.safetensors", state, {})
     before = begin(scene, steps=800)
     restore(before, tmp_path / "run")
@@ -382,20 +382,20 @@ def test_photos_from_one_spot_are_refused(scene, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_photos_from_one_spot_are_refused_in_metres_that_are_guessed_from_them(scene, tmp_path):
-    """Turned on a tripod, apart by rounding alone: metres are then of how far they are apart."""
+def test_photos_from_one_spot_are_refused_whatever_the_scale(scene, tmp_path):
+    """A tripod: rounding separates the cameras, and the scale was derived from their distances."""
     random, views = np.random.default_rng(0), []
     for view in scene.views:
         pose = view.c2w.copy()
         pose[:3, 3] = scene.views[0].c2w[:3, 3] + 1e-9 * random.standard_normal(3)
         views.append(dataclasses.replace(view, c2w=pose))
-    apart = np.diag([1e9, 1e9, 1e9, 1.0])
-    scene = dataclasses.replace(scene, views=tuple(views), world_from_input=apart)
+    stretch = np.diag([1e9, 1e9, 1e9, 1.0])
+    scene = dataclasses.replace(scene, views=tuple(views), world_from_input=stretch)
     with pytest.raises(UserError, match="from one spot.*walk"):
         fitted(scene, tmp_path / "run")
 
 
-def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
+def test_a_run_resumed_after_refinement_protects_the_cells_of_points(scene, tmp_path):
     points = np.array([[0.0, -0.6, 0.6], [0.6, 0.0, 0.8]])
     views = [dataclasses.replace(view, seen=np.arange(2)) for view in scene.views]
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
@@ -412,10 +412,10 @@ def test_a_run_that_is_resumed_late_knows_the_points_by_cell(scene, tmp_path):
     assert torch.equal(again.field.occupancy.forced_empty, trainer.field.occupancy.forced_empty)
 
 
-def test_a_resumed_fit_draws_the_ground_in_the_units_of_the_run(scene, tmp_path, monkeypatch):
-    """Whatever extent is found anew: the field's is the run's."""
-    place = np.random.default_rng(0).uniform(-2, 2, (200, 2))
-    points = np.concatenate([place, np.zeros((200, 1))], axis=1)
+def test_a_resumed_fit_has_the_ground_height_in_the_units_of_the_run(scene, tmp_path, monkeypatch):
+    """Although a new extent is estimated, the field keeps the run's."""
+    xy = np.random.default_rng(0).uniform(-2, 2, (200, 2))
+    points = np.concatenate([xy, np.zeros((200, 1))], axis=1)
     views = [dataclasses.replace(view, seen=np.arange(200)) for view in scene.views]
     scene = dataclasses.replace(scene, views=tuple(views), points=points)
     every = torch.ones(1, dtype=torch.bool)
@@ -447,15 +447,15 @@ def test_ctrl_c_leaves_a_run_that_renders_and_resumes(scene, tmp_path):
     assert again["steps"] == 9 and again["interrupted"] is False
 
 
-def test_a_checkpoint_in_the_middle_knows_what_photos_see(scene, tmp_path):
-    """A run left by a crash must carry snow and light like a finished one."""
+def test_a_checkpoint_during_a_fit_marks_observed_cells(scene, tmp_path):
+    """Snow and light must work on a run left by a crash, too."""
     trainer = begin(scene, steps=40)
     with pytest.raises(KeyboardInterrupt):
         trainer.run(stop_at(20))
     checkpoint(trainer, tmp_path)
     early = load_field(tmp_path)
     assert early.observed_only().occupancy.occupied.any(), (
-        "all is haze: nothing is seen, all is trusted"
+        "all is haze: no cell is observed, so all are kept"
     )
     with torch.no_grad():
         trainer.field.geometry_net[-1].add_(8.0)  # surfaces, as a longer fit would find
@@ -465,7 +465,7 @@ def test_a_checkpoint_in_the_middle_knows_what_photos_see(scene, tmp_path):
     assert 0 < field.observed_only().occupancy.occupied.sum() < field.occupancy.occupied.sum()
 
 
-def test_a_resumed_run_stays_in_its_own_metres(scene, tmp_path):
+def test_a_resumed_run_keeps_its_metric_frame(scene, tmp_path):
     fitted(scene, tmp_path / "run", steps=2)
     before = load_scene(tmp_path / "run")
     bigger = np.diag([2.0, 2.0, 2.0, 1.0]) @ scene.world_from_input
@@ -476,7 +476,7 @@ def test_a_resumed_run_stays_in_its_own_metres(scene, tmp_path):
     assert after.ground_z == before.ground_z
 
 
-def test_a_damaged_held_out_picture_is_found_before_fitting(tmp_path):
+def test_a_damaged_held_out_picture_is_reported_before_the_fit(tmp_path):
     scene = with_split(make_scene(tmp_path / "toy"), {"00.png"})
     path = scene.of_split("heldout")[0].path
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -485,7 +485,7 @@ def test_a_damaged_held_out_picture_is_found_before_fitting(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_damaged_mask_of_a_held_out_picture_is_found_before_fitting(scene, tmp_path):
+def test_a_damaged_held_out_mask_is_reported_before_the_fit(scene, tmp_path):
     view = scene.of_split("heldout")[0]
     (tmp_path / "mask.png").write_bytes(b"no picture")
     views = [
@@ -497,14 +497,14 @@ def test_a_damaged_mask_of_a_held_out_picture_is_found_before_fitting(scene, tmp
     assert not (tmp_path / "run").exists()
 
 
-def test_resuming_where_there_is_nothing(scene, tmp_path):
+def test_resuming_an_empty_folder_is_refused(scene, tmp_path):
     with pytest.raises(UserError, match="no run to resume"):
         fitted(scene, tmp_path / "run", resume=True)
 
 
 @pytest.mark.parametrize("heldout", [{"01.png", "02.png"}, {"01.png"}])
 def test_resuming_with_other_photos_is_refused(scene, tmp_path, heldout):
-    """Also with as many: what was held out must not become training, nor the reverse."""
+    """Also with the same number: held-out photos must not become training photos."""
     fitted(scene, tmp_path / "run", steps=2)
     with pytest.raises(UserError, match="other photos"):
         fitted(with_split(scene, heldout), tmp_path / "run", steps=4, resume=True)
@@ -520,7 +520,7 @@ def test_resuming_with_another_size_is_refused(scene, tmp_path, monkeypatch):
         fitted(scene, tmp_path / "run", steps=4, resume=True, preset="gpu", size=other)
 
 
-def test_a_run_from_a_newer_program_is_left_alone(scene, tmp_path):
+def test_a_run_of_a_newer_version_is_not_touched(scene, tmp_path):
     fitted(scene, tmp_path / "run", steps=2)
     config = read_json(tmp_path / "run" / "config.json")
     write_json(tmp_path / "run" / "config.json", {**config, "schema_version": 99})
@@ -532,7 +532,7 @@ def test_a_run_from_a_newer_program_is_left_alone(scene, tmp_path):
 
 @pytest.mark.parametrize("name", ["optimiser.safetensors", "config.json"])
 @pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: b"{}"])
-def test_a_damaged_run_is_one_clear_sentence(scene, tmp_path, name, damage):
+def test_a_damaged_run_is_a_user_error(scene, tmp_path, name, damage):
     fitted(scene, tmp_path / "run", steps=2)
     path = tmp_path / "run" / name
     path.write_bytes(damage(path.read_bytes()))
@@ -540,7 +540,7 @@ def test_a_damaged_run_is_one_clear_sentence(scene, tmp_path, name, damage):
         fitted(scene, tmp_path / "run", steps=4, resume=True)
 
 
-def test_a_run_without_its_optimisers_state_or_with_half_of_it(scene, tmp_path):
+def test_a_missing_or_incomplete_optimiser_state_is_a_user_error(scene, tmp_path):
     fitted(scene, tmp_path / "run", steps=2)
     path = tmp_path / "run" / "optimiser.safetensors"
     arrays, about = read_safetensors(path)
@@ -558,7 +558,7 @@ def test_a_run_without_its_optimisers_state_or_with_half_of_it(scene, tmp_path):
 @pytest.mark.parametrize(
     "name", ["field.safetensors", "optimiser.safetensors", "metrics.json", "scene.json"]
 )
-def test_a_full_disk_harms_nothing_and_the_run_goes_on_later(scene, tmp_path, monkeypatch, name):
+def test_a_full_disk_damages_nothing_and_the_run_resumes(scene, tmp_path, monkeypatch, name):
     fitted(scene, tmp_path / "run", steps=3)
     before = contents(tmp_path / "run")
     with monkeypatch.context() as patch:
@@ -574,7 +574,7 @@ def test_a_full_disk_harms_nothing_and_the_run_goes_on_later(scene, tmp_path, mo
 
 
 @pytest.mark.parametrize("name", ["config.json", "field.safetensors", "optimiser.safetensors"])
-def test_a_run_that_never_got_saved_can_be_begun_again(scene, tmp_path, monkeypatch, name):
+def test_a_run_that_was_never_saved_can_begin_again(scene, tmp_path, monkeypatch, name):
     with monkeypatch.context() as patch:
         full_disk_for(name, patch)
         with pytest.raises(UserError, match="disk is full"):
@@ -582,8 +582,8 @@ def test_a_run_that_never_got_saved_can_be_begun_again(scene, tmp_path, monkeypa
     assert fitted(scene, tmp_path / "run", steps=3)["steps"] == 3
 
 
-def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
-    """Matched points reach the fit; without the loss, or by the settings, none are looked for."""
+def test_multiview_stereo_runs_only_for_the_sparse_depth_loss(tmp_path, monkeypatch):
+    """Matches reach the fit; without the loss or the setting photos are not matched."""
     scene, asked = make_scene(tmp_path / "toy"), []
 
     def plane_sweep_depth(pixels, points, typical, seed):
@@ -611,7 +611,7 @@ def test_photos_are_matched_for_the_points_loss_alone(tmp_path, monkeypatch):
     assert asked == [5] and measured == [1, 0, 0]
 
 
-def test_the_appearance_grid_alone_decays(toy, tmp_path, monkeypatch):
+def test_only_the_appearance_grid_has_weight_decay(toy, tmp_path, monkeypatch):
     seen = []
 
     def watched(tables, decays):
@@ -622,6 +622,6 @@ def test_the_appearance_grid_alone_decays(toy, tmp_path, monkeypatch):
     fitted(toy, tmp_path / "run", steps=1)
     field = load_field(tmp_path / "run")
     grids = (field.geometry_grid, field.appearance_grid, field.sky_grid, field.surface_grid)
-    shares = (0.0, FitSettings().decay, 0.0, 0.0)
-    assert seen[0] == [(grid.shape, share) for grid, share in zip(grids, shares, strict=True)]
+    decays_of = (0.0, FitSettings().decay, 0.0, 0.0)
+    assert seen[0] == [(grid.shape, decay) for grid, decay in zip(grids, decays_of, strict=True)]
     assert read_json(tmp_path / "run" / "metrics.json")["heldout_appearance"] == "nearby"

@@ -30,7 +30,7 @@ BY_INDEX = {
 
 
 class Watch(TorchDispatchMode):
-    """Records operations that would wait for a GPU, except those of our own kernels."""
+    """Record operations that would synchronise with a GPU, except those of our own kernels."""
 
     def __init__(self):
         super().__init__()

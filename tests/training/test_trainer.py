@@ -37,20 +37,20 @@ def heldout_psnr(scene, render):
 
 
 def depth_of(field, c2w):
-    """Mean ray length of what each pixel shows, m."""
+    """Mean ray length of each pixel, m; infinite where it is translucent."""
     o, d = camera_rays(CAMERA, c2w)
     n = o.shape[0]
     samples = field.march(o, d, torch.full((n,), 0.5), torch.full((n,), 100.0))
-    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     total = torch.zeros(n).index_add(0, samples.ray_index(), weights * samples.t)
-    return torch.where(left < 0.5, total / (1 - left).clamp_min(1e-3), torch.inf)
+    return torch.where(transmittance < 0.5, total / (1 - transmittance).clamp_min(1e-3), torch.inf)
 
 
-def test_a_fit_shows_views_it_has_not_seen(scene):
+def test_a_fit_predicts_held_out_views(scene):
     """Against the best single colour: at least 8 dB better after 400 small steps.
 
-    Without points or labels a start can go wrong (seeds 0, 1, 2 end at 18.1, 22.9 and 23.4 dB);
-    this is about one that does not.
+    Without points or labels a fit can diverge at the start (seeds 0, 1, 2 end at 18.1, 22.9 and
+    23.4 dB); this one does not.
     """
     trainer = begin(scene, steps=400, seed=2)
     reports = []
@@ -70,7 +70,7 @@ def test_a_fit_shows_views_it_has_not_seen(scene):
     assert field.occupancy.occupied.float().mean() < 0.5
 
 
-def test_reports_count_and_rise_to_the_end(scene):
+def test_reports_count_steps_and_progress_to_the_end(scene):
     reports = []
     trainer = begin(scene, steps=25, samples_per_step=2**16)
     trainer.run(reports.append)
@@ -80,12 +80,12 @@ def test_reports_count_and_rise_to_the_end(scene):
     assert (np.diff(samples) > 0).all() and samples[-1] == trainer.samples
     for r in reports:
         assert math.isfinite(r.psnr) and r.rays_per_second > 0 and r.samples_per_ray > 0
-    # The budget of samples is kept, whatever the rays meet (the first step goes in blind).
+    # Each step keeps the budget of samples; the first one has no estimate yet.
     assert np.diff(samples).max() < 2.5 * trainer.settings.samples_per_step
 
 
 class Clock:
-    """Half a second passes between two looks at it."""
+    """A clock that advances by half a second at each call."""
 
     def __init__(self):
         self.now = 0.0
@@ -95,7 +95,7 @@ class Clock:
         return self.now
 
 
-def test_the_time_bound_ends_the_fit_with_the_first_step_beyond_it(scene, monkeypatch):
+def test_the_time_limit_ends_the_fit_with_the_first_step_beyond_it(scene, monkeypatch):
     monkeypatch.setattr(module, "time", Clock())
     reports = []
     trainer = begin(scene, minutes=0.1)
@@ -115,14 +115,14 @@ def parameters_after(scene, seed, steps=40):
     return trainer.field.state_dict()
 
 
-def test_the_same_seed_gives_the_same_field_and_another_seed_another(scene):
+def test_the_seed_determines_the_field(scene):
     a, b, c = (parameters_after(scene, seed) for seed in (1, 1, 2))
     for name in a:
         assert torch.equal(a[name], b[name]), name
     assert not torch.equal(a["geometry_grid"], c["geometry_grid"])
 
 
-def test_all_parameters_learn_and_stay_finite(scene):
+def test_all_parameters_change_and_stay_finite(scene):
     labelled = begin(scene, steps=20)
     bright = labelled.pixels.rgb.float().mean(-1) > 128
     labelled.pixels.label = torch.where(bright, SKY, ROAD).to(torch.uint8)
@@ -134,7 +134,7 @@ def test_all_parameters_learn_and_stay_finite(scene):
         assert not torch.equal(parameter, before[name]), name
 
 
-def test_space_outside_every_picture_stays_empty(scene):
+def test_space_outside_all_frusta_stays_empty(scene):
     trainer = begin(scene, steps=40)
     occupancy = trainer.field.occupancy
     ring = torch.tensor([[0.0, 0.0, 8.0], [0.0, 0.0, 0.5]])  # above all cameras; on the box
@@ -148,7 +148,7 @@ def test_space_outside_every_picture_stays_empty(scene):
             trainer.evidence.free_space.force_empty(everywhere=False)
 
 
-def test_a_fit_that_stops_early_does_not_claim_normals(scene):
+def test_normals_count_as_learned_only_late_in_a_fit(scene):
     trainer = begin(scene, steps=100)
 
     def report(state):
@@ -162,7 +162,7 @@ def test_a_fit_that_stops_early_does_not_claim_normals(scene):
     assert trainer.field.knows_normals
 
 
-def test_colours_are_alike_from_all_sides_until_surfaces_are_found(scene):
+def test_colours_are_view_independent_until_surfaces_are_found(scene):
     trainer = begin(scene, steps=40)
     seen = []
 
@@ -183,8 +183,8 @@ def test_colours_are_alike_from_all_sides_until_surfaces_are_found(scene):
     assert seen[-1][1] > 0
 
 
-def test_colours_come_back_from_black(scene):
-    """In haze before a bright sky they darken for a while, and without slope they stayed so."""
+def test_colours_recover_from_black(scene):
+    """Haze in front of a bright sky darkens at first; it must keep a gradient to recover."""
     trainer = begin(scene, steps=150)
     with torch.no_grad():
         trainer.field.colour_net[-1].fill_(-4.0)
@@ -192,7 +192,7 @@ def test_colours_come_back_from_black(scene):
     assert heldout_psnr(scene, lambda c2w: render_view(trainer.field, CAMERA, c2w)) > 14
 
 
-def test_near_matter_is_believed_later(scene):
+def test_marching_begins_nearer_to_the_camera_later(scene):
     trainer = begin(scene, steps=100)
     assert trainer.near == pytest.approx(Schedule().first_near * trainer.field.unit)
     trainer.steps = 50
@@ -201,8 +201,8 @@ def test_near_matter_is_believed_later(scene):
 
 
 @pytest.mark.parametrize("steps", [100, 5000])
-def test_thin_matter_counts_as_empty_once_light_ends_on_dense(scene, steps):
-    """However many steps the bound takes: each march has left out what was below it."""
+def test_the_pruning_threshold_rises_once_light_ends_on_dense_samples(scene, steps):
+    """For any number of steps; each march leaves out samples below the threshold."""
     generator = torch.Generator().manual_seed(0)
     ends = {}
     for kind, dense in (("surfaces", 0.97), ("haze", 0.0)):
@@ -222,8 +222,8 @@ def test_thin_matter_counts_as_empty_once_light_ends_on_dense(scene, steps):
     assert ends["haze"] < 0.5 * trainer.settings.pruning_threshold
 
 
-def test_colours_may_depend_on_the_view_from_the_first_step(scene):
-    """As in a plain NGP, which the ablation compares with and the paper starts from."""
+def test_warm_up_delays_view_dependence(scene):
+    """Without it colours depend on the view from the first step, as in a plain NGP."""
     for warm_up in (True, False):
         trainer = begin(scene, steps=100, warm_up=warm_up)
         before = trainer.field.view_net[0].detach().clone()
@@ -232,9 +232,9 @@ def test_colours_may_depend_on_the_view_from_the_first_step(scene):
 
 
 @pytest.mark.slow
-def test_rays_below_the_horizon_end_on_matter(scene):
-    """They do even where nothing else asks for it: with no colour to explain."""
-    left = {}
+def test_below_horizon_opacity_makes_low_rays_opaque(scene):
+    """Compared with a fit to colours alone."""
+    transmittance = {}
     for weight in (0.0, 1.0):
         trainer = begin(scene, steps=100, losses=Losses(below_horizon_opacity=weight))
         trainer.run(lambda _: None)
@@ -244,13 +244,13 @@ def test_rays_below_the_horizon_end_on_matter(scene):
         near, far = torch.full((len(o),), trainer.field.near), torch.full((len(o),), 1e9)
         samples = trainer.field.march(o, d, near, far)
         tau = samples.sigma * samples.dt
-        left[weight] = float(compositing.render_weights(tau, samples.offsets)[1].mean())
-    assert left[1.0] < 0.5 * left[0.0], left
+        transmittance[weight] = float(compositing.render_weights(tau, samples.offsets)[1].mean())
+    assert transmittance[1.0] < 0.5 * transmittance[0.0], transmittance
 
 
 @pytest.mark.slow
-def test_points_put_matter_where_they_are(scene):
-    """A hundred points on the box's sides, each shown by the views that look at that side."""
+def test_sparse_depth_moves_matter_to_the_points(scene):
+    """A hundred points on the box's sides, each seen by the views that face that side."""
     rng = np.random.default_rng(0)
     along, height = rng.uniform(-0.55, 0.55, 100), rng.uniform(0.5, 1.1, 100)
     sides = [np.stack([np.full(100, 0.6), along, height], -1)]
@@ -275,10 +275,10 @@ def test_points_put_matter_where_they_are(scene):
         near = torch.full_like(rays.depth, trainer.field.near)
         samples = trainer.field.march(rays.rays_o, rays.rays_d, near, 2 * rays.depth)
         tau = samples.sigma * samples.dt
-        weights, left = compositing.render_weights(tau, samples.offsets)
+        weights, transmittance = compositing.render_weights(tau, samples.offsets)
         unit = trainer.field.unit
         off[name] = losses.sparse_depth_loss(
-            weights, left, samples.t / unit, rays.depth / unit, samples.ray_index()
+            weights, transmittance, samples.t / unit, rays.depth / unit, samples.ray_index()
         )
     assert off["with"] < 0.6 * off["without"], off
 
@@ -293,20 +293,20 @@ def test_cells_that_rays_hit_are_occupied_from_the_first_step_on(scene):
 
 
 def lost_before_surfaces(field, scene):
-    """Mean share of light lost before the true surfaces, in the held-out views."""
+    """Mean fraction of light absorbed in front of the true surfaces, in the held-out views."""
     lost = []
     for view in scene.of_split("heldout"):
         pose = scene.c2w_world(view)
         o, d = camera_rays(CAMERA, pose)
         end = 0.9 * depth_of(FIELD, pose).clamp_max(6.0)
         samples = field.march(o, d, torch.full_like(end, 0.3), end)
-        _, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
-        lost.append(1 - left)
+        _, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+        lost.append(1 - transmittance)
     return float(torch.cat(lost).mean())
 
 
 def exposures_learned(field, scene):
-    """By how much each training view is brighter in its photo's appearance than in the mean."""
+    """Ratio of each training view's brightness in its own appearance to that in the mean."""
     ratios = []
     for index, view in enumerate(scene.of_split("train")):
         pose, light = scene.c2w_world(view), []
@@ -318,11 +318,11 @@ def exposures_learned(field, scene):
 
 
 @pytest.mark.slow
-def test_exposures_do_not_become_floaters(tmp_path):
-    """Every photo is exposed anew, by a factor of 1.5 up or down.
+def test_exposure_changes_do_not_become_floaters(tmp_path):
+    """The exposure of every photo is changed by a factor of up to 1.5.
 
-    With labels and points, as photos that went through `capture` have them: without, a start can go
-    wrong whatever the exposures (see above).
+    With labels and points, as from `capture`: without them a fit can diverge at the start whatever
+    the exposures (see above).
     """
     scene, labels = labelled(make_scene(tmp_path))
 
@@ -338,8 +338,8 @@ def test_exposures_do_not_become_floaters(tmp_path):
     for view, gain in zip(scene.of_split("train"), gains, strict=True):
         with Image.open(view.path) as photo:
             linear = decode_srgb(torch.from_numpy(np.array(photo)) / 255)
-        shown = encode_srgb(linear * float(gain)).clamp(0, 1)
-        Image.fromarray((shown.numpy() * 255 + 0.5).astype(np.uint8)).save(view.path)
+        exposed_photo = encode_srgb(linear * float(gain)).clamp(0, 1)
+        Image.fromarray((exposed_photo.numpy() * 255 + 0.5).astype(np.uint8)).save(view.path)
     exposed = start()
     for trainer in (plain, exposed):
         trainer.run(lambda _: None)
@@ -350,11 +350,11 @@ def test_exposures_do_not_become_floaters(tmp_path):
 
 
 @pytest.mark.slow
-def test_someone_in_one_photo_leaves_the_scene(tmp_path):
-    """A magenta figure stands before the box in one photo: its mask finds it, and nothing else.
+def test_an_object_in_one_photo_is_masked_and_absent_from_the_field(tmp_path):
+    """A magenta figure stands in front of the box in one photo; its mask covers nothing else.
 
-    With labels and points, as `capture` gives them; no label names it. Without any, a field may be
-    quicker than the mask, and build the figure of haze.
+    With labels and points, as from `capture`; no label names the figure. Without them a field may
+    learn the figure as haze before the mask turns on.
     """
     scene, labels = labelled(make_scene(tmp_path))
     view = scene.of_split("train")[3]
@@ -369,23 +369,23 @@ def test_someone_in_one_photo_leaves_the_scene(tmp_path):
     trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene))
     trainer.run(lambda _: None)
     x, y = (np.arange(48) + 0.5) / 48, (np.arange(36) + 0.5) / 36
-    place = torch.tensor(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).float()
+    xy = torch.tensor(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).float()
     with torch.no_grad():
-        own = trainer.masks(torch.full((len(place),), 3), place).view(36, 48)
-        others = [trainer.masks(torch.full((len(place),), i), place) for i in (1, 5, 9)]
-    assert own[14:26, 22:26].mean() > 0.8, own[14:26, 22:26].mean()
+        mask = trainer.masks(torch.full((len(xy),), 3), xy).view(36, 48)
+        others = [trainer.masks(torch.full((len(xy),), i), xy) for i in (1, 5, 9)]
+    assert mask[14:26, 22:26].mean() > 0.8, mask[14:26, 22:26].mean()
     assert torch.cat(others).gt(0.5).float().mean() < 0.02
-    assert own[:, :14].gt(0.5).float().mean() < 0.05
-    # And hardly any magenta (1, 0, 1) is left in the scene where the figure stood.
-    place = np.s_[12:28, 21:27]
-    shown = render_view(trainer.field, CAMERA, scene.c2w_world(view))[place]
-    truth = picture(scene.c2w_world(view))[place] / 255
+    assert mask[:, :14].gt(0.5).float().mean() < 0.05
+    # Hardly any magenta (1, 0, 1) remains in the field at the figure's pixels.
+    window = np.s_[12:28, 21:27]
+    rendered = render_view(trainer.field, CAMERA, scene.c2w_world(view))[window]
+    truth = picture(scene.c2w_world(view))[window] / 255
     tint = np.array([1.0, -2.0, 1.0])
-    assert ((shown - truth) @ tint).mean() < 0.35 * (2 - truth @ tint).mean()
+    assert ((rendered - truth) @ tint).mean() < 0.35 * (2 - truth @ tint).mean()
 
 
-def test_a_step_has_every_loss_and_all_gradients_are_finite(scene):
-    """Late in a fit, with labels, relative depth, moving cameras and normals that move matter."""
+def test_gradients_are_finite_with_every_loss(scene):
+    """Late in a fit, with labels, relative depth, pose corrections and normal consistency."""
     pixels = load_pixels(scene, 1)
     grey = pixels.rgb.float().mean(-1)
     others = torch.where(grey > 100, VEHICLE, ROAD)  # one class alone would not be learned
@@ -408,8 +408,8 @@ def test_a_step_has_every_loss_and_all_gradients_are_finite(scene):
     assert trainer.field.knows_classes and trainer.field.knows_normals
 
 
-def test_switched_off_losses_have_no_part(scene):
-    """Without any of them the fit is the plain one: masks, classes and normals stay untouched."""
+def test_losses_of_weight_zero_change_nothing(scene):
+    """A fit to colours alone changes no masks, classes or normals."""
     nothing = Losses(**{each.name: 0.0 for each in dataclasses.fields(Losses)})
     trainer = begin(
         scene,

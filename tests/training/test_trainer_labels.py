@@ -1,4 +1,4 @@
-"""What labels of sky, ground and classes do to a fit."""
+"""Effects of labels, of sky, ground and classes, on a fit."""
 
 import dataclasses
 
@@ -33,8 +33,8 @@ def opacity(trainer):
         torch.full((1000,), trainer.field.near),
         torch.full((1000,), 1e9),
     )
-    left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)[1]
-    return float((1 - left).mean())
+    transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)[1]
+    return float((1 - transmittance).mean())
 
 
 def colour_loss(trainer, radiance, error, batch):
@@ -44,7 +44,7 @@ def colour_loss(trainer, radiance, error, batch):
 
 
 @pytest.mark.slow
-def test_pixels_labelled_sky_lose_their_matter(scene):
+def test_sky_labels_remove_matter(scene):
     trainer = begin(scene, steps=100, losses=Losses(sky=10.0))
     trainer.pixels.label = torch.full((trainer.pixels.rgb.shape[0],), SKY, dtype=torch.uint8)
     trainer = make_trainer(trainer.pixels, trainer.extent, trainer.settings)
@@ -54,7 +54,7 @@ def test_pixels_labelled_sky_lose_their_matter(scene):
     assert opacity(trainer) < 0.2 * opacity(plain), (opacity(trainer), opacity(plain))
 
 
-def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
+def test_the_labelled_sky_learns_from_sky_pixels_only(scene):
     trainer = begin(scene, steps=1, losses=Losses(sky_prior=0.0))
     trainer.pixels.label = torch.full((trainer.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
     trainer.pixels.label[0] = SKY  # labels that know of sky
@@ -71,7 +71,7 @@ def test_with_labels_the_sky_learns_from_its_own_pixels_alone(scene):
     assert all((p.grad == 0).all() for p in trainer.field.colour_net)
 
 
-def test_what_nobody_has_labelled_may_be_sky_too(scene):
+def test_the_sky_learns_from_unlabelled_pixels_too(scene):
     trainer = begin(scene, steps=1, losses=Losses(sky_prior=0.0))
     trainer.pixels.label = torch.full((trainer.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
     trainer.pixels.label[0] = SKY
@@ -82,8 +82,8 @@ def test_what_nobody_has_labelled_may_be_sky_too(scene):
     assert any((p.grad != 0).any() for p in trainer.field.sky_net)
 
 
-def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
-    """Of a half-opaque pole before the open sky only what others see the sky at is sky."""
+def test_sky_samples_exclude_matter_in_other_photos_and_cells_of_points(scene):
+    """A translucent pole in front of the sky: samples that other photos see as matter are kept."""
     trainer = begin(scene, steps=1)
     batch = trainer.pixels.draw(2, trainer.generator)
     batch.label[:] = torch.tensor([SKY, ROAD], dtype=torch.uint8)
@@ -91,11 +91,11 @@ def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
     samples = Samples(torch.tensor([0, 4, 5]), t, torch.full((5,), 0.1), torch.ones(5))
     weights = torch.tensor([0.3, 0.2, 0.2, 0.0, 0.9])
 
-    def asked():
+    def sky_samples():
         which, empty = trainer.objective.sky_samples(batch, samples, weights)
         return which[empty].tolist()
 
-    assert asked() == [0, 1, 2]
+    assert sky_samples() == [0, 1, 2]
 
     class VisualHull:
         def consensus(self, x, radius):
@@ -103,14 +103,14 @@ def test_a_sky_label_spares_what_other_photos_and_points_see(scene):
             return far > 1.5  # the nearest is seen as matter elsewhere
 
     trainer.pixels.sky_hull = VisualHull()
-    assert asked() == [1, 2]
+    assert sky_samples() == [1, 2]
     x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
     cell, _ = trainer.field.occupancy.cell_index(trainer.field.to_grid(x[None]))
     trainer.evidence.free_space.protected.view(-1)[cell] = True  # a sparse point lies by the last
-    assert asked() == [1]
+    assert sky_samples() == [1]
 
 
-def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypatch):
+def test_masked_pixels_lose_their_label_and_relative_depth(scene, monkeypatch):
     trainer = begin(scene, steps=10)
     trainer.steps = 9  # masks are in use
     batch = trainer.pixels.draw(4, trainer.generator)
@@ -123,7 +123,7 @@ def test_what_is_masked_has_no_part_in_labels_and_relative_depth(scene, monkeypa
     assert (batch.label == VEHICLE).all()
 
 
-def test_a_triple_that_is_masked_in_part_is_none(scene, monkeypatch):
+def test_a_partly_masked_triple_does_not_count(scene, monkeypatch):
     trainer = begin(scene, steps=10)
     trainer.steps = 9
     batch = trainer.pixels.draw(12, trainer.generator, 3)
@@ -136,8 +136,8 @@ def test_a_triple_that_is_masked_in_part_is_none(scene, monkeypatch):
     assert unmasked.in_line.tolist() == [True, False, False]
 
 
-def test_an_opaque_sky_has_its_photos_colour(scene):
-    """The paper's sky is matter: rays labelled sky have to teach it their colour."""
+def test_sky_pixels_teach_an_opaque_sky_their_colour(scene):
+    """The paper's sky is matter, so rays labelled sky give gradients to its colour."""
     pixels = load_pixels(scene, 1)
     pixels.label = torch.full((len(pixels.rgb),), SKY, dtype=torch.uint8)
     settings = dataclasses.replace(PAPER, size=TINY, minutes=None, steps=9)
@@ -150,16 +150,16 @@ def test_an_opaque_sky_has_its_photos_colour(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("spared", "steps"), [(False, 40), (True, 80)])
-def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spared, steps):
-    """Without points as depth, which would do the same: by the map of the ground alone.
+@pytest.mark.parametrize(("obstacles", "steps"), [(False, 40), (True, 80)])
+def test_ground_height_moves_matter_to_the_ground(scene, monkeypatch, obstacles, steps):
+    """The sparse depth, which would do the same, is switched off.
 
-    Once where nothing is spared, and once where all is, but for what the field's own classes say
-    (`test_carving.py` is about what is spared).
+    Once without obstacles, and once with obstacles everywhere, so that only samples that the field
+    classifies as ground are moved (`test_free_space.py` tests obstacles).
     """
 
     def everywhere(carving):
-        return torch.full_like(carving.field.occupancy.occupied, spared, dtype=torch.bool)
+        return torch.full_like(carving.field.occupancy.occupied, obstacles, dtype=torch.bool)
 
     monkeypatch.setattr(FreeSpace, "find_obstacles", everywhere)
     known, labels = labelled(scene)
@@ -188,7 +188,7 @@ def test_matter_on_rays_to_the_ground_comes_to_lie_on_it(scene, monkeypatch, spa
     assert above[100.0] < 0.5 * above[0.0], above
 
 
-def test_what_is_matched_on_the_ground_is_left_to_its_map(scene):
+def test_multiview_matches_on_the_ground_are_dropped(scene):
     known, labels = labelled(scene)
     pixels = labelled_pixels(known, labels)
     views = known.of_split("train")
@@ -207,8 +207,8 @@ def test_what_is_matched_on_the_ground_is_left_to_its_map(scene):
     assert alone.evidence.free_space.ground is None and alone.evidence.depths == (matched,)
 
 
-def test_classes_and_normals_move_no_matter(scene, monkeypatch):
-    """Colours' errors are taken away, so that nothing else is left to learn from."""
+def test_classes_and_normals_do_not_change_the_density(scene, monkeypatch):
+    """The colour loss is zeroed, so that only classes and normals give gradients."""
     monkeypatch.setattr(losses, "colour_error", lambda linear, _: 0.0 * linear.sum(-1))
     nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
     for bend, moves in ((0.0, False), (1.0, True)):
@@ -223,19 +223,21 @@ def test_classes_and_normals_move_no_matter(scene, monkeypatch):
         assert any(name.startswith("geometry") for name in moved) == moves, moved
 
 
-@pytest.mark.parametrize(("kept", "told"), [((9,), False), ((2,), False), ((2, 9), True)])
-def test_a_single_class_is_not_learned(scene, kept, told):
-    """As the fall-back's labels are, sky and terrain: all else would be called terrain too."""
-    trainer = with_labels(scene, lambda ids: np.where(np.isin(ids, (*kept, 10)), ids, 255))
-    assert trainer.field.knows_classes == told
+@pytest.mark.parametrize(
+    ("labelled_ids", "learned"), [((9,), False), ((2,), False), ((2, 9), True)]
+)
+def test_a_single_class_is_not_learned(scene, labelled_ids, learned):
+    """Heuristic labels hold sky and terrain alone: everything would be classified as terrain."""
+    trainer = with_labels(scene, lambda ids: np.where(np.isin(ids, (*labelled_ids, 10)), ids, 255))
+    assert trainer.field.knows_classes == learned
     before = trainer.field.surface_net[-2].detach().clone()
     trainer.step(trainer.pixels.draw(1024, trainer.generator))
     moved = trainer.field.surface_net[-2].detach() != before
-    assert bool(moved[:, 3:].any()) == told and bool(moved[:, :3].any()), "normals are learned"
+    assert bool(moved[:, 3:].any()) == learned and bool(moved[:, :3].any()), "normals are learned"
 
 
-def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypatch):
-    """A network calls the ground a person, but points lie on it."""
+def test_points_on_a_movable_class_keep_the_full_mask_price(scene, monkeypatch):
+    """A network labels the ground as a person, but points lie on it."""
     prices = []
 
     def recorded(error, unexplained, mask, price):
@@ -253,23 +255,23 @@ def test_what_several_photos_show_in_one_place_is_not_suspected(scene, monkeypat
     suspected = torch.isclose(prices[0][person], torch.tensor(MOVABLE_PRICE * full))
     assert (still | suspected).all() and still.float().mean() > 0.05 and suspected.any()
     images = trainer.evidence.static_cells.shape[0]
-    told = find_static_cells(trainer.pixels, trainer.evidence.depths, images)
-    assert told.any() and torch.equal(told, trainer.evidence.static_cells)
+    static = find_static_cells(trainer.pixels, trainer.evidence.depths, images)
+    assert static.any() and torch.equal(static, trainer.evidence.static_cells)
     assert not find_static_cells(trainer.pixels, [], images).any()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("label", [True, False])
 def test_the_sky_prior_continues_the_sky_where_no_photo_shows_it(scene, label):
-    """It begins as noise, or black, which upwards only the fill can take away."""
+    """The sky begins as noise or black, which only the prior can correct overhead."""
     schedule = Schedule(unlabelled_sky=(1.0, 1.0))  # the default is slow
     up = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     up[:, 2] = 2 * up[:, 2].abs() + 1.0
     up = torch.nn.functional.normalize(up, dim=-1)
     off = {}
     for weight in (Losses.sky_prior, 0.0):
-        kept = np.asarray if label else lambda ids: np.full_like(ids, 255)
-        trainer = with_labels(scene, kept, losses=Losses(sky_prior=weight), schedule=schedule)
+        relabel = np.asarray if label else lambda ids: np.full_like(ids, 255)
+        trainer = with_labels(scene, relabel, losses=Losses(sky_prior=weight), schedule=schedule)
         field = trainer.field
         with torch.no_grad():
             if label:
@@ -282,15 +284,15 @@ def test_the_sky_prior_continues_the_sky_where_no_photo_shows_it(scene, label):
             trainer.steps += 1
         batch = trainer.pixels.draw(2000, trainer.generator)
         above = batch.label == SKY if label else batch.rays_d[:, 2] > 0
-        seen = decode_srgb(batch.rgb[above]).mean()
+        photographed = decode_srgb(batch.rgb[above]).mean()
         with torch.no_grad():
-            shown = field.sky_colour(up, field.mean_embedding.expand(500, -1))
-        ratio = shown.mean(-1) / seen
+            sky = field.sky_colour(up, field.mean_embedding.expand(500, -1))
+        ratio = sky.mean(-1) / photographed
         off[weight] = float(((ratio < 0.5) | (ratio > 2.0)).float().mean())
     assert off[Losses.sky_prior] < 0.5 * off[0.0], off
 
 
-def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
+def test_settings_of_the_ablation_switch_parts_off(scene, monkeypatch):
     full = with_labels(scene, np.asarray)
     assert full.field.occupancy.forced_empty.any() and full.evidence.knows_sky
     assert not with_labels(scene, np.asarray, free_space=False).field.occupancy.forced_empty.any()
@@ -307,8 +309,8 @@ def test_what_an_ablation_leaves_out_is_left_out(scene, monkeypatch):
         assert (factors[0].min() < 1) == (scaling > 0)
 
 
-def test_what_a_neighbouring_pixel_shows_is_not_unexplained(scene, monkeypatch):
-    """Leaves before the sky are never met pixel by pixel, and no passers-by for that."""
+def test_a_neighbouring_pixels_colour_is_explained(scene, monkeypatch):
+    """Leaves in front of the sky never match pixel by pixel, but are not transient."""
     found = []
 
     def recorded(error, unexplained, mask, price):
@@ -323,8 +325,8 @@ def test_what_a_neighbouring_pixel_shows_is_not_unexplained(scene, monkeypatch):
     x = (batch.xy[:, 0] * pixels.width[batch.image]).long()
     y = (batch.xy[:, 1] * pixels.height[batch.image]).long()
     beside = (x + 1).minimum(pixels.width[batch.image] - 1)
-    shown = pixels.rgb[pixels.pixel_start[batch.image] + y * pixels.width[batch.image] + beside]
-    linear = decode_srgb(shown.float() / 255)
+    neighbour = pixels.rgb[pixels.pixel_start[batch.image] + y * pixels.width[batch.image] + beside]
+    linear = decode_srgb(neighbour.float() / 255)
     colour_loss(trainer, linear, torch.ones(4000), batch)
     colour_loss(trainer, linear + 8.0, torch.ones(4000), batch)
     assert found[0].max() < 1e-9 and found[1].min() > 1.0

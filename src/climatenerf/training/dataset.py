@@ -1,4 +1,4 @@
-"""All training pixels as one long list of rays with their colours."""
+"""All training pixels as one list of rays with colours and labels."""
 
 import copy
 import os
@@ -19,22 +19,22 @@ from climatenerf.training.evidence.frusta import frustum_planes
 from climatenerf.training.evidence.visual_hull import VisualHull
 from climatenerf.training.pixel_directions import Directions
 
-SPACINGS = (1, 2, 4, 8)  # pixels between the neighbours of a triple
-HORIZON = -0.05  # rays that sink more than this end on matter: levelling is good to a degree or two
-SKY_SHARE = 0.1  # of the views that have a place before them: so many must show sky there,
-GROUND_SHARE = 0.5  # or ground
-STANDING_SHARE = 0.5  # or things that stand on it
-AT_MOST = 2**22  # pixels drawn at once where masks hide nearly all
-IN_MEMORY = 2_000_000_000  # bytes that the colours of all photos may take there, or their labels
-NEARBY = 1  # pixels to all sides whose colours a pixel may have, too, before it counts as wrong
-EDGE = 2  # pixels to both sides that are such an edge
+SPACINGS = (1, 2, 4, 8)  # pixels between the middle and the sides of a triple
+HORIZON = -0.05  # sine of the elevation; lower rays end on matter (gravity alignment: 1 to 2 deg)
+SKY_CONSENSUS = 0.1  # fraction of the views of a position that must show sky there,
+GROUND_CONSENSUS = 0.5  # or ground,
+OBSTACLE_CONSENSUS = 0.5  # or obstacles
+MAX_DRAWN = 2**22  # pixels drawn at once where masks hide nearly all
+MAX_IN_MEMORY = 2_000_000_000  # bytes of all colours, or of all labels; more go to a file
+NEARBY = 1  # pixels on each side whose colours explain a pixel's error
+EDGE = 2  # pixels on both sides of a border that belong to the sky's edge
 
 
 @dataclass
 class Batch:
     """n rays drawn from the training images.
 
-    The last 2m of them, m = len(in_line), are the two sides of the first m: pixels in one line at
+    With m = len(in_line), the last 2m rays are the two sides of the first m: pixels in a line at
     equal distances.
     """
 
@@ -47,24 +47,24 @@ class Batch:
     rgb: Float[Tensor, "n 3"]
     """Display sRGB in [0,1]."""
     label: UInt8[Tensor, "n"]
-    """Merged class of the image's label, 255 unknown."""
+    """Merged class of the image's label; 255: unknown."""
     xy: Float[Tensor, "n 2"]
     """Position in the image, (x, y) in (0,1)."""
     cosine: Float[Tensor, "n"]
-    """Of the angle between the ray and the optical axis."""
+    """Cosine of the angle between the ray and the optical axis."""
     in_line: Bool[Tensor, "m"]
-    """Which of the triples lie in their image, and outside its mask, as a whole."""
+    """Which triples lie entirely in their image and outside its mask."""
     relative: Float[Tensor, "n"] | None
-    """Relative inverse z-depth (see `monocular.py`), NaN where unknown; None if there is none."""
+    """Relative inverse z-depth (see `monocular_depth.py`), NaN where unknown; None without any."""
 
     @property
     def is_sky(self) -> Float[Tensor, "n"]:
-        """1 where the image's label says sky, else 0."""
+        """1 where the image's label is sky, else 0."""
         return (self.label == SKY).float()
 
 
 class TrainingPixels:
-    """Draws random pixels from a list of images; keeps 8-bit pixels only."""
+    """The pixels of all training images, as 8-bit values, from which steps draw."""
 
     def __init__(
         self,
@@ -76,10 +76,18 @@ class TrainingPixels:
         masks: Iterable[Shaped[np.ndarray, "h w"] | None] | None = None,
         relative: Iterable[Float[np.ndarray, "h w"] | None] | None = None,
     ):
-        """Takes images in the size of their (already downscaled) cameras; c2w in world metres.
+        """Read all images.
 
         Images, labels, masks and depths are taken one at a time, so a generator saves memory.
-        Masks: pixels where a mask is 0 are never drawn, and their labels count as unknown.
+
+        Args:
+            cameras: in the size of the (already downscaled) images.
+            camera_of: index of each image's camera.
+            c2w: pose of each image, world m.
+            images: display sRGB.
+            labels: class ids of each image; None: unlabelled.
+            masks: 0 where pixels are never drawn and count as unlabelled; None: all are usable.
+            relative: relative inverse z-depth of each image, NaN where unknown; None: unknown.
         """
         self.c2w = to_device(np.asarray(c2w, np.float32))
         self.cameras = [cameras[i] for i in camera_of]
@@ -97,43 +105,43 @@ class TrainingPixels:
         self.spacings = torch.tensor(SPACINGS)
         self.axes = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
         usable = (None if mask is None else mask > 0 for mask in masks or ())
-        flat, shown = in_one_row(shapes, usable, np.bool_, True)
+        flat, unmasked = in_one_row(shapes, usable, np.bool_, True)
         if flat.size:
             self.usable, self.drawable = to_device(flat), torch.from_numpy(flat)
             self.usable_fraction = int(flat.sum()) / flat.size
         self.label = None
         self.sky_hull = None
         self.edge = torch.zeros(0, dtype=torch.long)
-        known = (None if label is None else MERGED[label] for label in labels or ())
-        flat, merged = in_one_row(shapes, known, np.uint8, UNKNOWN)
-        for image, own in enumerate(merged):
-            if shown:  # what a mask hides says nothing of what is empty, either
-                own[~shown[image]] = UNKNOWN
-            # Networks take puddles and wet walls for the sky that they mirror.
-            row, column = np.nonzero(own == SKY)
-            place = to_device(column), to_device(row)
-            d = self.directions.of(self.camera[image].expand(len(row)), *place)
+        classes = (None if label is None else MERGED[label] for label in labels or ())
+        flat, merged = in_one_row(shapes, classes, np.uint8, UNKNOWN)
+        for image, label in enumerate(merged):
+            if unmasked:  # masked pixels are no evidence of empty space, either
+                label[~unmasked[image]] = UNKNOWN
+            # Networks label puddles and wet walls as the sky that they mirror.
+            row, column = np.nonzero(label == SKY)
+            camera = self.camera[image].expand(len(row))
+            d = self.directions.of(camera, to_device(column), to_device(row))
             low = to_numpy(d @ self.c2w[image, 2, :3] < HORIZON)
-            own[row[low], column[low]] = UNKNOWN
-        if (flat != UNKNOWN).any():  # labels that know nothing are none
+            label[row[low], column[low]] = UNKNOWN
+        if (flat != UNKNOWN).any():
             self.label = to_device(flat)
         if self.label is not None and bool((self.label == SKY).any()):
             at = [np.flatnonzero(sky_edge(each)) for each in merged]
             starts = to_numpy(self.pixel_start)[:-1]
             self.edge = to_device(np.concatenate([e + s for e, s in zip(at, starts, strict=True)]))
-            self.sky_hull = VisualHull(self.cameras, c2w, merged, [SKY], SKY_SHARE)
+            self.sky_hull = VisualHull(self.cameras, c2w, merged, [SKY], SKY_CONSENSUS)
         self.ground_hull = self.obstacle_hull = None
         if self.label is not None and bool(
             torch.isin(self.label, torch.tensor(GROUND, dtype=torch.uint8)).any()
         ):
-            self.ground_hull = VisualHull(self.cameras, c2w, merged, GROUND, GROUND_SHARE)
-            self.obstacle_hull = VisualHull(self.cameras, c2w, merged, STANDING, STANDING_SHARE)
+            self.ground_hull = VisualHull(self.cameras, c2w, merged, GROUND, GROUND_CONSENSUS)
+            self.obstacle_hull = VisualHull(self.cameras, c2w, merged, STANDING, OBSTACLE_CONSENSUS)
         scaled = (None if depth is None else in_units(depth) for depth in relative or ())
         flat, _ = in_one_row(shapes, scaled, np.float16, np.nan)
         self.relative = to_device(flat) if flat.size else None
 
     def without_sky(self) -> "TrainingPixels":
-        """The same pixels, with what is labelled sky unknown."""
+        """Return the same pixels, with those labelled sky unlabelled."""
         other = copy.copy(self)
         other.sky_hull, other.edge = None, self.edge[:0]
         if self.label is not None:
@@ -143,35 +151,35 @@ class TrainingPixels:
     def xy_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 2"]:
-        """Where in its picture, (x, y) in (0,1), an image shows a direction; NaN outside it."""
+        """Return the position (x, y), in (0,1), of a direction in each image; NaN outside it."""
         out = torch.full((image.shape[0], 2), torch.nan)
         for i in to_numpy(image.unique()).tolist():
-            some = (image == i).nonzero()[:, 0]
+            rows = (image == i).nonzero()[:, 0]
             camera = self.cameras[i]
-            pixel = camera.project(to_numpy(rays_d[some] @ self.c2w[i, :3, :3]))
-            place = pixel / (camera.width, camera.height)
+            pixel = camera.project(to_numpy(rays_d[rows] @ self.c2w[i, :3, :3]))
+            xy = pixel / (camera.width, camera.height)
             with np.errstate(invalid="ignore"):  # behind the camera: NaN
-                inside = np.all((place >= 0) & (place < 1), axis=-1)
-            out[some[to_device(inside)]] = to_device(place[inside].astype(np.float32))
+                inside = np.all((xy >= 0) & (xy < 1), axis=-1)
+            out[rows[to_device(inside)]] = to_device(xy[inside].astype(np.float32))
         return out
 
     def pixel_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> tuple[Bool[Tensor, "n"], Int[Tensor, "k"]]:
-        """Whether images show directions at all, and the pixels of those that they show."""
-        place = self.xy_towards(image, rays_d)
-        inside = ~place[:, 0].isnan()
-        image, place = image[inside], place[inside]
+        """Return which directions lie in their image, and the pixels of those."""
+        xy = self.xy_towards(image, rays_d)
+        inside = ~xy[:, 0].isnan()
+        image, xy = image[inside], xy[inside]
         width, height = self.width[image], self.height[image]
-        # Rounding may bring the last pixel's border to 1.
-        x = (place[:, 0] * width).long().minimum(width - 1)
-        y = (place[:, 1] * height).long().minimum(height - 1)
+        # Rounding may turn the last pixel's border into 1.
+        x = (xy[:, 0] * width).long().minimum(width - 1)
+        y = (xy[:, 1] * height).long().minimum(height - 1)
         return inside, self.pixel_start[image] + y * width + x
 
     def label_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> UInt8[Tensor, "n"]:
-        """Merged class that an image's label has in a direction; unknown outside the picture."""
+        """Return the merged class of an image in each direction; unknown outside the image."""
         out = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
         if self.label is not None:
             inside, pixel = self.pixel_towards(image, rays_d)
@@ -181,7 +189,7 @@ class TrainingPixels:
     def usable_towards(
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> Bool[Tensor, "n"]:
-        """Whether no mask hides what an image shows in a direction."""
+        """Return whether an image's mask leaves the pixel in each direction."""
         out = torch.ones_like(image, dtype=torch.bool)
         if self.usable is not None:
             inside, pixel = self.pixel_towards(image, rays_d)
@@ -189,11 +197,11 @@ class TrainingPixels:
         return out
 
     def colours_nearby(
-        self, image: Int[Tensor, "n"], place: Float[Tensor, "n 2"]
+        self, image: Int[Tensor, "n"], xy: Float[Tensor, "n 2"]
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-        """Least and largest display sRGB, by channel, of the pixels up to `NEARBY` away."""
+        """Return minimum and maximum display sRGB, by channel, of pixels up to `NEARBY` away."""
         width, height = self.width[image], self.height[image]
-        x, y = (place[:, 0] * width).long(), (place[:, 1] * height).long()
+        x, y = (xy[:, 0] * width).long(), (xy[:, 1] * height).long()
         pixels = [
             self.pixel_start[image]
             + (y + down).clamp_min(0).minimum(height - 1) * width
@@ -209,32 +217,34 @@ class TrainingPixels:
         """Whether any pixel is labelled sky."""
         return self.label is not None and bool((self.label == SKY).any())
 
-    def kinds(self) -> UInt8[Tensor, "k"]:
-        """Merged classes that any pixel is labelled as, with unknown if some are; none without."""
+    def classes(self) -> UInt8[Tensor, "k"]:
+        """Return the merged classes that occur, unknown included; empty without labels."""
         if self.label is None:
             return torch.zeros(0, dtype=torch.uint8)
-        # Piece by piece: to sort all labels would take twenty times their room.
-        pieces = [torch.bincount(each.long(), minlength=256) for each in self.label.split(AT_MOST)]
+        # In pieces: to sort all labels would take twenty times their memory.
+        pieces = [
+            torch.bincount(each.long(), minlength=256) for each in self.label.split(MAX_DRAWN)
+        ]
         return torch.stack(pieces).sum(0).nonzero()[:, 0].to(torch.uint8)
 
     def draw(
         self, n: int, generator: torch.Generator, triples: int = 0, edges: float = 0.0
     ) -> Batch:
-        """n random pixels.
+        """Draw random pixels.
 
         Args:
-            n: how many.
-            generator: of randomness.
-            triples: as many of them are the middle of three in a line at equal distances.
-            edges: share of the rest that is drawn from the sky's edges: few pixels show where
-                matter ends and the sky begins, and much hangs on them.
+            n: number of pixels.
+            generator: source of random numbers, on the CPU.
+            triples: number of pixels that are the middle of three in a line at equal distances.
+            edges: fraction of the others drawn from the sky's edges: few pixels show where matter
+                ends and the sky begins, and the shape of the skyline depends on them.
         """
         free = n - 2 * triples
         pixel = self.anywhere(free, generator)
         if self.edge.numel():
             count = int(edges * (free - triples))
-            chosen = integers(generator, 0, self.edge.shape[0], count)
-            pixel[free - count :] = self.edge[chosen]
+            row = integers(generator, 0, self.edge.shape[0], count)
+            pixel[free - count :] = self.edge[row]
         image = torch.searchsorted(self.pixel_start, pixel, right=True) - 1
         within = pixel - self.pixel_start[image]
         in_line = torch.zeros(0, dtype=torch.bool)
@@ -262,16 +272,17 @@ class TrainingPixels:
         )
 
     def anywhere(self, n: int, generator: torch.Generator) -> Int[Tensor, "n"]:
-        """n random pixels of all that no mask hides, all alike.
+        """Draw n random pixels uniformly from all unmasked ones.
 
-        Hidden ones are drawn and left out: a list of the others would take more than the photos.
+        Masked ones are drawn and rejected: a list of the others would take more memory than the
+        photos.
         """
         total = self.rgb.shape[0]
         if self.drawable is None:
             return integers(generator, 0, total, n)
         found = torch.zeros(0, dtype=torch.long, device="cpu")
         while found.shape[0] < n:
-            more = min(int((n - found.shape[0]) / self.usable_fraction) + 1, AT_MOST)
+            more = min(int((n - found.shape[0]) / self.usable_fraction) + 1, MAX_DRAWN)
             pixel = torch.randint(0, total, (more,), generator=generator, device="cpu")
             found = torch.cat([found, pixel[self.drawable[pixel]]])
         return upload(found[:n])
@@ -279,9 +290,9 @@ class TrainingPixels:
     def sides(
         self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator
     ) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Bool[Tensor, "m"]]:
-        """Two pixels on opposite sides of each pixel, and whether both may be drawn.
+        """Return two pixels on opposite sides of each pixel, and whether both may be used.
 
-        Where one lies outside the image or its mask, the pixel itself stands for both.
+        Where one lies outside the image or its mask, both are the pixel itself.
         """
         m = image.shape[0]
         spacing = self.spacings[integers(generator, 0, len(SPACINGS), m)]
@@ -304,16 +315,20 @@ def in_one_row(
     empty: float,
     channels: int | None = None,
 ) -> tuple[Shaped[np.ndarray, "p *c"], list[Shaped[np.ndarray, "h w *c"]]]:
-    """All pixels of pictures (h, w) in one row, and each picture's part of it; nothing if all lack.
+    """Return all pixels of pictures in one array, and each picture's view of it.
 
-    Above `IN_MEMORY` bytes it is a temporary file, of which the system keeps in memory what it can.
+    Beyond `MAX_IN_MEMORY` bytes the array is a temporary file, which the system caches in memory.
 
     Args:
         shapes: height and width of each picture.
-        pictures: taken one at a time; None: `empty` throughout.
-        kind: of the numbers.
-        empty: what stands where a picture lacks.
+        pictures: taken one at a time; None: missing. If all are missing the array is empty.
+        kind: type of the numbers.
+        empty: value of missing pictures.
         channels: of each pixel; None: pixels are single numbers.
+
+    Raises:
+        ValueError: the number or a size of the pictures differs from `shapes`.
+        UserError: the temporary folder is full.
     """
     row, parts = np.empty(0, kind), []
     per_pixel = () if channels is None else (channels,)
@@ -324,7 +339,7 @@ def in_one_row(
             continue
         if not parts:
             whole = (int(starts[-1]), *per_pixel)
-            row = _room(whole, np.dtype(kind))
+            row = _allocate(whole, np.dtype(kind))
             row.fill(empty)
             spans = zip(starts[:-1], starts[1:], shapes, strict=True)
             parts = [row[a:b].reshape(*shape, *per_pixel) for a, b, shape in spans]
@@ -336,13 +351,13 @@ def in_one_row(
     return row, parts
 
 
-def _room(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
+def _allocate(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
     size = kind.itemsize * int(np.prod(shape))
-    if size <= IN_MEMORY:
+    if size <= MAX_IN_MEMORY:
         return np.empty(shape, kind)
     try:
-        with tempfile.TemporaryFile() as file:  # the map holds it, and with the map it is gone
-            if hasattr(os, "posix_fallocate"):  # a full disk would be a bus error later
+        with tempfile.TemporaryFile() as file:  # the map keeps it open; it vanishes with the map
+            if hasattr(os, "posix_fallocate"):  # else a full disk is a bus error later
                 os.posix_fallocate(file.fileno(), 0, size)
             return np.memmap(file, kind, "w+", shape=shape)
     except OSError as error:
@@ -353,13 +368,13 @@ def _room(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
 
 
 def in_units(relative: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Relative depth with 1 as its largest value: its scale is free, and half floats are not."""
+    """Return relative depth scaled to a maximum of 1, within the range of half floats."""
     largest = np.max(np.abs(relative), where=np.isfinite(relative), initial=0.0)
     return relative / largest if largest > 0 else relative
 
 
 def sky_edge(label: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels within `EDGE` of the border between sky and what is known not to be sky."""
+    """Return the pixels within `EDGE` of a border between sky and other known classes."""
     sky, other = label == SKY, (label != SKY) & (label != UNKNOWN)
     near = []
     for side in (sky, other):

@@ -1,4 +1,4 @@
-"""Which folders a fit may write into. Imports no torch, so that it is known before all else."""
+"""Checks of run folders before a fit. Imports no torch, so that errors appear at once."""
 
 import dataclasses
 from pathlib import Path
@@ -13,7 +13,11 @@ OPTIMISER = "optimiser.safetensors"
 
 
 def check_folder(scene: Scene, run: Path, resume: bool) -> None:
-    """Refuses a folder in which a fit would destroy something, or could not go on."""
+    """Check that a fit would overwrite nothing in a folder, and could resume if it is to.
+
+    Raises:
+        UserError: the folder cannot be used.
+    """
     if run.resolve() == scene.root.resolve():
         raise UserError(f"{run} is the capture itself; give another folder for the run with -o")
     has_config = (run / "config.json").is_file()
@@ -26,7 +30,7 @@ def check_folder(scene: Scene, run: Path, resume: bool) -> None:
         )
     if not resume and (run / "scene.json").exists() and not has_config:
         raise UserError(f"{run} holds a scene, which would be overwritten; choose another -o")
-    # Of a checkpoint's files the optimiser's is written last: before it there is nothing to lose.
+    # The optimiser's file is the last that a checkpoint writes; without it nothing is lost.
     if not resume and ((run / OPTIMISER).exists() or (run / "metrics.json").exists()):
         raise UserError(
             f"{run} already holds a run; choose another -o, or continue it with --resume"
@@ -47,10 +51,10 @@ def check_config(run: Path) -> dict:
 
 
 def check_resumable(run: Path, settings: FitSettings) -> None:
-    """Refuses to go on with a fit that was begun in another way, before photos are read.
+    """Check that the settings can resume a run, before photos are read.
 
     Raises:
-        UserError: in one sentence, what to do instead.
+        UserError: the run was begun with settings that cannot be changed.
     """
     config = check_config(run)
     before, size = config.get("settings") or {}, settings.size

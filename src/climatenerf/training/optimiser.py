@@ -1,4 +1,4 @@
-"""Adam for hash grids: most rows get no gradient in a step, and Adam leaves those alone."""
+"""Adam for hash grids: most rows have no gradient in a step, and Adam leaves those unchanged."""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,16 +6,16 @@ import torch
 
 from climatenerf.ops import optimiser
 
-DECAY_EVERY = 8  # steps: all rows are read for it, while a step reads few
+DECAY_INTERVAL = 8  # steps; decay reads all rows, while a step reads few
 
 
 class GridAdam:
     """Adam (Kingma & Ba 2015) over large tables whose gradients are mostly zero.
 
-    Each table gets a gradient buffer that the encoding's backward pass adds to and `step` clears.
-    All values of a table fall by its share `decays` of the learning rate a step, whether they have
-    a gradient or not (decoupled as by Loshchilov & Hutter 2019; of hash grids also Barron et al.
-    2023, "Zip-NeRF"): so what few rays tell of stays what coarser levels say.
+    Each table gets a gradient buffer, to which the encoding's backward pass adds and which `step`
+    clears. All values of a table decay by a fraction of the learning rate, whether they have a
+    gradient or not (decoupled, as by Loshchilov & Hutter 2019; for hash grids also Barron et al.
+    2023, "Zip-NeRF"). Where few rays contribute, the coarser levels then determine the value.
     """
 
     def __init__(
@@ -24,7 +24,13 @@ class GridAdam:
         decays: Sequence[float] | None = None,
         epsilon: float = 1e-15,
     ):
-        """Epsilon only avoids 0/0; it is small because a hash row's gradients are."""
+        """Allocate moments and gradient buffers.
+
+        Args:
+            tables: the parameters.
+            decays: weight decay of each table, times its learning rate a step; None: 0.
+            epsilon: avoids 0/0; it is small because the gradients of a hash row are.
+        """
         self.tables = list(tables)
         self.decays = [0.0] * len(self.tables) if decays is None else decays
         self.epsilon = epsilon
@@ -35,7 +41,7 @@ class GridAdam:
             table.grad_buffer = torch.zeros_like(table.data)  # type: ignore[attr-defined]
 
     def step(self, rate: float, beta1: float = 0.9, beta2: float = 0.99) -> None:
-        """One update with learning rate `rate`."""
+        """Update all tables once with learning rate `rate`."""
         self.steps += 1
         for table, decay, *moments in zip(
             self.tables, self.decays, self.first, self.second, strict=True
@@ -49,18 +55,18 @@ class GridAdam:
                 self.epsilon,
                 self.steps,
             )
-            if decay and self.steps % DECAY_EVERY == 0:
-                table.data.mul_(1 - DECAY_EVERY * rate * decay)
+            if decay and self.steps % DECAY_INTERVAL == 0:
+                table.data.mul_(1 - DECAY_INTERVAL * rate * decay)
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Tensors that continue the optimisation elsewhere."""
+        """Return the tensors with which `load` continues the optimisation."""
         state = {"steps": torch.tensor(self.steps)}
         for i, (first, second) in enumerate(zip(self.first, self.second, strict=True)):
             state |= {f"{i}.first": first, f"{i}.second": second}
         return state
 
     def load(self, state: dict[str, torch.Tensor]) -> None:
-        """Continues from `state()`."""
+        """Continue from the tensors of `state`."""
         self.steps = int(state["steps"])
         for i in range(len(self.tables)):
             self.first[i].copy_(state[f"{i}.first"])

@@ -1,8 +1,8 @@
-"""Directions of pixels, from a coarse lattice of them.
+"""Directions of pixels, interpolated on a coarse lattice.
 
-Directions of every pixel would take four times the memory of the photos where each photo has a
-camera of its own. Distortion is smooth, so a lattice does, and for a pinhole it is exact. Cameras
-whose distortion has no inverse everywhere get a direction for each pixel.
+Where each photo has its own camera, the directions of all pixels would take four times the memory
+of the photos. Distortion is smooth, so a lattice suffices, and for a pinhole it is exact. Cameras
+whose distortion cannot be inverted everywhere get a direction for each pixel.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,16 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.device import to_device
 from climatenerf.core.vectors import unit
 
-SPACING = 4  # pixels
-WIDE = 0.1  # cosine from the axis below which directions are not scaled to depth 1
-EXACT = 1e-2  # pixels by which a lattice's point may come back elsewhere
+SPACING = 4  # pixels between lattice points
+MIN_COSINE = 0.1  # to the axis; below it directions are not scaled to z = 1
+MAX_ERROR = 1e-2  # pixels between a lattice point and its direction projected back
 
 
 class Directions:
-    """Directions of all pixels of some cameras."""
+    """Directions of all pixels of a list of cameras."""
 
     def __init__(self, cameras: Sequence[Camera]):
+        """Compute the lattices of the cameras."""
         found = [_lattice(camera) for camera in cameras]
         lattices = [lattice for lattice, _ in found]
         counts = [each.shape[0] * each.shape[1] for each in lattices]
@@ -37,7 +38,7 @@ class Directions:
     def of(
         self, camera: Int[Tensor, "n"], column: Int[Tensor, "n"], row: Int[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """Unit directions, in the cameras' frames, through the middles of pixels."""
+        """Return unit directions, in the cameras' frames, through the centres of pixels."""
         spacing = self.spacing[camera]
         corner_of_pixel = torch.where(spacing > 1, 0.5, 0.0)
         x, y = (column + corner_of_pixel) / spacing, (row + corner_of_pixel) / spacing
@@ -52,19 +53,20 @@ class Directions:
 
 
 def _lattice(camera: Camera) -> tuple[Float[np.ndarray, "h w 3"], int]:
-    """Vectors along the rays through every `SPACING`th pixel corner, to past the last pixel.
+    """Return the lattice of a camera, and its spacing in pixels.
 
-    Where the distortion folds, those through every pixel's middle, and a row and a column more.
-    Also the spacing.
+    The lattice holds vectors along the rays through every `SPACING`th pixel corner, to beyond the
+    last pixel. Where the distortion folds it holds those through every pixel's centre, with one
+    more row and column.
     """
     x = np.arange(-(-camera.width // SPACING) + 1) * SPACING
     y = np.arange(-(-camera.height // SPACING) + 1) * SPACING
     pixels = np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64)
     d = camera.directions(pixels)
     with np.errstate(invalid="ignore"):
-        back = np.abs(camera.project(d) - pixels).max(initial=0.0)
-    if not back < EXACT:
+        error = np.abs(camera.project(d) - pixels).max(initial=0.0)
+    if not error < MAX_ERROR:
         return np.pad(camera.directions(), ((0, 1), (0, 1), (0, 0)), mode="edge"), 1
     z = d[..., 2:].astype(np.float64)
-    # Of a plane without distortion the lattice is evenly spaced; a fisheye may look backwards.
-    return (d / z if z.min() > WIDE else d), SPACING
+    # At z = 1 the lattice of a pinhole is evenly spaced; a fisheye may see behind itself.
+    return (d / z if z.min() > MIN_COSINE else d), SPACING

@@ -1,18 +1,18 @@
-"""Corrections of the cameras while fitting: a small turn and shift for each image."""
+"""Corrections of the camera poses during a fit: a small rotation and translation an image."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-RATE = 2e-3  # rad and grid units a step, at first
-SMALL = 1e-3  # squared angle below which the series' next term is 1e-8 and less
-PULL = 1e-2  # towards the given poses, so that the scene does not drift as a whole
+SMALL_ANGLE = 1e-3  # squared, rad²; below it the next term of the series is 1e-8 or less
+PULL = 1e-2  # weight of the corrections in the loss, so that the scene does not drift as a whole
 
 
 class PoseCorrections(nn.Module):
-    """Six numbers for each image; zero leaves its pose as it is."""
+    """Six numbers for each image; zeros leave its pose unchanged."""
 
     def __init__(self, images: int):
+        """Begin with no corrections of `images` images."""
         super().__init__()
         self.turn = nn.Parameter(torch.zeros(images, 3))
         self.shift = nn.Parameter(torch.zeros(images, 3))
@@ -24,17 +24,24 @@ class PoseCorrections(nn.Module):
         image: Int[Tensor, "n"],
         unit: float,
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-        """Corrected origins (m) and unit directions of rays of some images; `unit` m to 1 shift."""
+        """Return the corrected origins (m) and unit directions of rays.
+
+        Args:
+            rays_o: origins, world m.
+            rays_d: unit directions.
+            image: index of each ray's image.
+            unit: metres per unit of the translations.
+        """
         turned = (rotations(self.turn)[image] @ rays_d[:, :, None])[:, :, 0]
         return rays_o + unit * self.shift[image], turned
 
     def loss(self) -> Float[Tensor, ""]:
-        """Squared corrections (rad, grid units), times `PULL`: their mean must not grow."""
+        """Return the mean squared correction (rad, grid units) times `PULL`."""
         return PULL * (self.turn.square().sum(-1) + self.shift.square().sum(-1)).mean()
 
     @torch.no_grad()
     def corrected(self, c2w: Float[Tensor, "v 4 4"], unit: float) -> Float[Tensor, "v 4 4"]:
-        """The poses (world m) as they are believed to be; `unit`: metres per grid unit."""
+        """Return the corrected poses (world m); `unit`: metres per grid unit."""
         out = c2w.clone()
         out[:, :3, :3] = rotations(self.turn) @ c2w[:, :3, :3]
         out[:, :3, 3] += unit * self.shift
@@ -42,19 +49,20 @@ class PoseCorrections(nn.Module):
 
 
 def rotations(turn: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
-    """Rotation matrices of rotation vectors, by Rodrigues' formula.
+    """Return the rotation matrices of rotation vectors (rad), by Rodrigues' formula.
 
-    The exponential of the cross-product matrix; `torch.linalg.matrix_exp` would wait for a GPU.
+    They are the exponentials of the cross-product matrices; `torch.linalg.matrix_exp` would
+    synchronise with a GPU.
     """
     x, y, z = turn.unbind(-1)
-    none = torch.zeros_like(x)
-    cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1).view(-1, 3, 3)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
     squared = turn.square().sum(-1)
-    small = squared < SMALL
-    # Where the angle is 0 the root has no gradient, and 0/0: there the series stand in.
+    small = squared < SMALL_ANGLE
+    # At angle 0 the root has no gradient and the quotients are 0/0: series replace them.
     angle = torch.where(small, 1.0, squared).sqrt()
     first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
     half = angle / 2  # (1 - cos) / angle², without its loss of digits
     second = torch.where(small, 0.5 - squared / 24, 0.5 * (half.sin() / half).square())
-    one = torch.eye(3, dtype=turn.dtype)
+    one = torch.eye(3, dtype=turn.dtype, device=turn.device)
     return one + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)

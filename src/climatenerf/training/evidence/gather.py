@@ -66,7 +66,7 @@ def gather_evidence(
         depths=depths,
         static_cells=find_static_cells(pixels, depths, len(pixels.cameras)),
         knows_sky=pixels.knows_sky,
-        classes_learnable=can_learn_classes(pixels.kinds()),
+        classes_learnable=can_learn_classes(pixels.classes()),
     )
 
 
