@@ -145,21 +145,21 @@ def test_held_out_views_are_rendered_in_the_appearance_of_nearby_photos(toy, tmp
     train = [scene.c2w_world(view) for view in scene.of_split("train")]
     field.embeddings.requires_grad_(False)
     field.embeddings[:] = torch.tensor([[c2w[1, 2]] for c2w in train])
-    seen = []
+    found = []
 
-    def noting(field, camera, c2w, appearance):
-        chosen = field.mean_embedding if appearance is None else appearance
-        seen.append(float(chosen.mean()))
+    def recorded(field, camera, c2w, appearance):
+        vector = field.mean_embedding if appearance is None else appearance
+        found.append(float(vector.mean()))
         return render_view(field, camera, c2w, appearance)
 
-    monkeypatch.setattr("climatenerf.training.run.render_view", noting)
+    monkeypatch.setattr("climatenerf.evaluation.heldout.render_view", recorded)
     evaluate(field, scene, 1, nothing)
     wanted = [scene.c2w_world(view)[1, 2] for view in scene.of_split("heldout")]
     assert np.ptp(wanted) > 0.5
-    assert np.allclose(seen, wanted, atol=0.1), (seen, wanted)
-    seen.clear()
+    assert np.allclose(found, wanted, atol=0.1), (found, wanted)
+    found.clear()
     evaluate(field, scene, 1, nothing, nearby=False)
-    assert np.ptp(seen) == 0
+    assert np.ptp(found) == 0
 
 
 def test_quality_is_none_without_held_out_photos(scene, tmp_path):
