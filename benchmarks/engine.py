@@ -46,6 +46,7 @@ from climatenerf.training.dataset import Batch
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.setup import compile_kernels
 from climatenerf.training.trainer import Report, Trainer
 
 GOALS = (20, 22, 24)  # dB
@@ -282,6 +283,7 @@ def time_to_psnr(
                 }
             )
 
+    compile_kernels(trainer)
     trainer.run(look)
     last = curve[-1]
     found = {"prepared_s": prepared, "samples_per_s": last["samples"] / trainer.seconds}

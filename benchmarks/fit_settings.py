@@ -26,6 +26,7 @@ from climatenerf.scene import Scene, load_image  # noqa: E402
 from climatenerf.training.run import load_pixels  # noqa: E402
 from climatenerf.training.schedule import Schedule  # noqa: E402
 from climatenerf.training.settings import FitSettings, Losses  # noqa: E402
+from climatenerf.training.setup import compile_kernels  # noqa: E402
 from climatenerf.training.trainer import make_trainer  # noqa: E402
 
 VARIANTS = {
@@ -49,6 +50,7 @@ def heldout_psnr(scene: Scene, seed: int, variant: dict) -> float:
     views = scene.of_split("train")
     extent = find_extent(np.stack([scene.c2w_world(view) for view in views]), None)
     trainer = make_trainer(load_pixels(scene, 1), extent, settings)
+    compile_kernels(trainer)
     trainer.run(lambda _: None)
     found = []
     for view in scene.of_split("heldout"):

@@ -36,6 +36,7 @@ from climatenerf.render.volume import camera_rays
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings, settings_of
+from climatenerf.training.setup import compile_kernels
 
 GOALS = (20, 22, 24, 25)  # dB
 WEATHERS = ("clean", "flood")
@@ -102,6 +103,7 @@ def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
         try:
+            compile_kernels(trainer)
             trainer.run(lambda _: ends.append(len(caught)))
         finally:
             torch.cuda.set_sync_debug_mode("default")

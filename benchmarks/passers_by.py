@@ -27,6 +27,7 @@ from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.scene import Scene
 from climatenerf.training.run import begin
 from climatenerf.training.settings import FitSettings
+from climatenerf.training.setup import compile_kernels
 from climatenerf.training.trainer import Trainer
 from climatenerf.training.transients import MASK_THRESHOLD
 
@@ -56,6 +57,7 @@ def people(scene: Scene) -> list[Bool[np.ndarray, "h w"]]:
 def fit(scene: Scene, settings: FitSettings, downscale: int) -> Trainer:
     """Fit a scene like `climatenerf fit`."""
     trainer = begin(scene, settings, downscale)
+    compile_kernels(trainer)
     trainer.run(lambda _: None)
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     return trainer

@@ -26,7 +26,7 @@ from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
-from climatenerf.training.trainer import make_trainer
+from climatenerf.training.setup import make_trainer
 from climatenerf.weather.description import weather_from_table
 
 WEATHER = {

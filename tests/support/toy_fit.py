@@ -11,7 +11,7 @@ from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.trainer import make_trainer
+from climatenerf.training.setup import make_trainer
 from climatenerf.weather.world import World
 from support.toy_scene import CAMERA, FIELD, TINY
 

@@ -9,7 +9,7 @@ from climatenerf.field.normalisation import find_extent
 from climatenerf.training.poses import PoseCorrections, rotations
 from climatenerf.training.run import load_pixels
 from climatenerf.training.settings import FitSettings
-from climatenerf.training.trainer import make_trainer
+from climatenerf.training.setup import make_trainer
 
 
 @pytest.mark.slow

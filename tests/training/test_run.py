@@ -35,7 +35,7 @@ from climatenerf.training.settings import (
     FitSettings,
     Losses,
 )
-from climatenerf.training.trainer import make_trainer
+from climatenerf.training.setup import make_trainer
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.run import load_pixels
 from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import FitSettings, Losses
-from climatenerf.training.trainer import make_trainer
+from climatenerf.training.setup import make_trainer
 
 
 def heldout_psnr(scene, render):

@@ -20,7 +20,7 @@ from climatenerf.training.evidence.sparse_depth import SparseDepth, read_sparse_
 from climatenerf.training.run import load_pixels
 from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import PAPER, FitSettings, Losses
-from climatenerf.training.trainer import make_trainer
+from climatenerf.training.setup import make_trainer
 from climatenerf.training.transients import MOVABLE_PRICE, find_static_cells
 
 

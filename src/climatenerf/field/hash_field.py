@@ -10,7 +10,6 @@ grid units.
 """
 
 import copy
-import math
 
 import numpy as np
 import torch
@@ -22,41 +21,16 @@ from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples
 from climatenerf.core.vectors import unit as unit_vector
 from climatenerf.field import activations, capabilities
 from climatenerf.field import spherical_harmonics as directions
+from climatenerf.field.networks import (
+    dense_layers,
+    level_resolutions,
+    uniform_parameter,
+    weights_and_biases,
+)
 from climatenerf.field.occupancy import Occupancy
 from climatenerf.field.presets import FieldSize
 from climatenerf.field.sampler import Sampler
 from climatenerf.ops import encoding, fused_render, marching, network, reference
-
-
-def _resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
-    """Return the cells per side of each level, in geometric progression."""
-    growth = math.log(finest / coarsest) / max(levels - 1, 1)
-    return torch.tensor([int(coarsest * math.exp(growth * i) + 1e-6) for i in range(levels)])
-
-
-def _uniform(
-    shape: tuple[int, ...], bound: float, generator: torch.Generator | None
-) -> nn.Parameter:
-    """Return a parameter drawn from (-bound, bound).
-
-    It is drawn on the CPU, so that a seed gives the same values on every device.
-    """
-    drawn = torch.empty(shape, device="cpu").uniform_(-bound, bound, generator=generator)
-    return nn.Parameter(drawn.to(torch.get_default_device()))
-
-
-def _layers(generator: torch.Generator | None, *widths: int) -> nn.ParameterList:
-    """Return weights [in, out] and biases [out] in turn, with He's initialisation."""
-    parameters = []
-    for i, o in zip(widths[:-1], widths[1:], strict=True):
-        parameters += [_uniform((i, o), math.sqrt(6.0 / i), generator)]
-        parameters += [nn.Parameter(torch.zeros(o))]
-    return nn.ParameterList(parameters)
-
-
-def _pairs(parameters: nn.ParameterList) -> list[tuple[Tensor, Tensor]]:
-    """Return the (weight, bias) of each layer."""
-    return list(zip(parameters[::2], parameters[1::2], strict=True))
 
 
 class Field(nn.Module):
@@ -97,39 +71,43 @@ class Field(nn.Module):
         self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
         self.register_buffer(
             "geometry_resolutions",
-            _resolutions(size.coarsest, size.geometry_finest, size.geometry_levels),
+            level_resolutions(size.coarsest, size.geometry_finest, size.geometry_levels),
         )
         self.register_buffer(
             "appearance_resolutions",
-            _resolutions(size.coarsest, size.appearance_finest, size.appearance_levels),
+            level_resolutions(size.coarsest, size.appearance_finest, size.appearance_levels),
         )
         self.register_buffer(
             "surface_resolutions",
-            _resolutions(size.coarsest, size.surface_finest, size.surface_levels),
+            level_resolutions(size.coarsest, size.surface_finest, size.surface_levels),
         )
         self.register_buffer(
-            "sky_resolutions", _resolutions(size.coarsest, size.sky_finest, size.sky_levels)
+            "sky_resolutions", level_resolutions(size.coarsest, size.sky_finest, size.sky_levels)
         )
-        self.geometry_grid = _uniform(
+        self.geometry_grid = uniform_parameter(
             (size.geometry_levels, 2**size.geometry_log2_rows, 2), 1e-4, generator
         )
-        self.appearance_grid = _uniform(
+        self.appearance_grid = uniform_parameter(
             (size.appearance_levels, 2**size.appearance_log2_rows, 2), 1e-4, generator
         )
-        self.geometry_net = _layers(generator, 2 * size.geometry_levels, size.geometry_hidden, 1)
+        self.geometry_net = dense_layers(
+            generator, 2 * size.geometry_levels, size.geometry_hidden, 1
+        )
         # A thin haze everywhere at first: dense enough for gradients, thin enough to prune.
         nn.init.constant_(self.geometry_net[-1], -1.5)
-        self.colour_net = _layers(generator, 2 * size.appearance_levels, size.colour_hidden, 3)
-        self.view_net = _layers(generator, 16 + size.embedding, size.colour_hidden)
+        self.colour_net = dense_layers(generator, 2 * size.appearance_levels, size.colour_hidden, 3)
+        self.view_net = dense_layers(generator, 16 + size.embedding, size.colour_hidden)
         nn.init.zeros_(self.view_net[0][:16])  # at first colour does not depend on the direction
-        self.surface_grid = _uniform(
+        self.surface_grid = uniform_parameter(
             (size.surface_levels, 2**size.surface_log2_rows, 2), 1e-4, generator
         )
         inputs = 2 * (size.surface_levels or size.appearance_levels)
-        self.surface_net = _layers(generator, inputs, size.surface_hidden, 3 + len(SOLID))
-        self.sky_grid = _uniform((size.sky_levels, 2**size.sky_log2_rows, 2), 1e-4, generator)
+        self.surface_net = dense_layers(generator, inputs, size.surface_hidden, 3 + len(SOLID))
+        self.sky_grid = uniform_parameter(
+            (size.sky_levels, 2**size.sky_log2_rows, 2), 1e-4, generator
+        )
         inputs = 16 + 2 * size.sky_levels + size.embedding
-        self.sky_net = _layers(generator, inputs, size.sky_hidden, size.sky_hidden, 3)
+        self.sky_net = dense_layers(generator, inputs, size.sky_hidden, size.sky_hidden, 3)
         self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
         # Whether the normals and the classes of the surface head were trained.
         self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))
@@ -264,7 +242,9 @@ class Field(nn.Module):
     def raw_density(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Return the logarithm of the density per contracted length at unit-cube coordinates."""
         grid, resolutions = self.geometry_grid, self.geometry_resolutions
-        return network.encoded_mlp(u, grid, resolutions, _pairs(self.geometry_net))[:, 0]
+        return network.encoded_mlp(u, grid, resolutions, weights_and_biases(self.geometry_net))[
+            :, 0
+        ]
 
     def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Return the density (1/grid unit) at unit-cube coordinates, with gradients."""
@@ -342,7 +322,7 @@ class Field(nn.Module):
         self, u: Float[Tensor, "s 3"], ray: Int[Tensor, "s"], shared: Float[Tensor, "n h"]
     ) -> Float[Tensor, "s 3"]:
         grid, resolutions = self.appearance_grid, self.appearance_resolutions
-        layers = _pairs(self.colour_net)
+        layers = weights_and_biases(self.colour_net)
         return activations.radiance(network.encoded_mlp(u, grid, resolutions, layers, shared, ray))
 
     def surface_raw(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s 3+c"]:
@@ -354,7 +334,7 @@ class Field(nn.Module):
             grid, resolutions = self.surface_grid, self.surface_resolutions
         else:
             grid, resolutions = self.appearance_grid, self.appearance_resolutions
-        return network.encoded_mlp(u, grid, resolutions, _pairs(self.surface_net))
+        return network.encoded_mlp(u, grid, resolutions, weights_and_biases(self.surface_net))
 
     def surface_at(
         self, u: Float[Tensor, "s 3"]
@@ -383,7 +363,7 @@ class Field(nn.Module):
         # them. In directions that no photo shows the grid stays near zero.
         detail = encoding.hash_encode(0.5 + 0.499 * d, self.sky_grid, self.sky_resolutions)
         x = torch.cat([directions.harmonics(d).T, detail.T, embedding.T])
-        return activations.radiance(network.mlp(x.T, _pairs(self.sky_net)))
+        return activations.radiance(network.mlp(x.T, weights_and_biases(self.sky_net)))
 
     @torch.no_grad()
     def colour(

@@ -32,7 +32,8 @@ from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
 from climatenerf.training.evidence.sparse_depth import unmasked_sparse_depth
 from climatenerf.training.folder import SCHEMA_VERSION, check_folder, check_resumable
 from climatenerf.training.settings import FitSettings, as_config
-from climatenerf.training.trainer import Report, Trainer, make_trainer
+from climatenerf.training.setup import compile_kernels, make_trainer
+from climatenerf.training.trainer import Report, Trainer
 
 CHECKPOINT_INTERVAL = 60.0  # seconds
 PREVIEW_INTERVAL = 20.0  # seconds
@@ -129,6 +130,7 @@ def fit_scene(
 
     interrupted = False
     try:
+        compile_kernels(trainer)
         trainer.run(save_sometimes)
     except KeyboardInterrupt:
         interrupted = True

@@ -17,25 +17,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.classes import SKY, UNKNOWN
-from climatenerf.core.device import to_numpy, uniform
+from climatenerf.core.device import uniform
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples, offsets_of
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import Extent
 from climatenerf.ops import compositing, marching, reference
 from climatenerf.training import losses
-from climatenerf.training.dataset import Batch, TrainingPixels
-from climatenerf.training.evidence.gather import Evidence, gather_evidence
-from climatenerf.training.evidence.monocular_depth import DepthAlignment
-from climatenerf.training.evidence.sparse_depth import SparseDepth, concatenate
+from climatenerf.training.dataset import Batch
+from climatenerf.training.evidence.gather import Evidence
+from climatenerf.training.evidence.sparse_depth import concatenate
 from climatenerf.training.losses import scale_gradient
 from climatenerf.training.objective import Objective, RenderedRays, VisibleSamples
 from climatenerf.training.optimiser import GridAdam
 from climatenerf.training.poses import PoseCorrections
 from climatenerf.training.sample_selection import select_samples
 from climatenerf.training.schedule import Rates
-from climatenerf.training.settings import FitSettings
-from climatenerf.training.static_shapes import Buffers, buffers_for
-from climatenerf.training.transients import TransientMasks
+from climatenerf.training.static_shapes import Buffers
 
 FAR = 1e9  # m, the end of rays to infinity
 STOP = 1e-4  # transmittance at which a marched ray ends
@@ -55,51 +52,6 @@ class Report:
     samples_per_ray: float
     samples: int
     """Samples evaluated so far."""
-
-
-def make_trainer(
-    pixels: TrainingPixels,
-    extent: Extent,
-    settings: FitSettings,
-    points: SparseDepth | None = None,
-    matched: SparseDepth | None = None,
-) -> "Trainer":
-    """Return a trainer with an untrained field and all evidence.
-
-    Args:
-        pixels: of all training photos.
-        extent: centre (world m), unit (m per grid unit) and nearest distance of the scene.
-        settings: of the fit, with the field's size.
-        points: rays to sparse points.
-        matched: rays with depths from multi-view stereo, some of them wrong.
-    """
-    images = len(pixels.cameras)
-    if not settings.sky_labels:
-        pixels = pixels.without_sky()
-    initial = torch.Generator(device="cpu").manual_seed(settings.seed)
-    centre = np.array(extent.centre)
-    field = Field(settings.size, images, centre, extent.unit, extent.near, initial)
-    masks = TransientMasks(images, initial)
-    generator = torch.Generator(device="cpu").manual_seed(settings.seed)
-    evidence = gather_evidence(field, pixels, settings, generator, points, matched)
-    learns_classes = settings.losses.classes > 0 and evidence.classes_learnable
-    field.learned[:] = torch.tensor([False, learns_classes])  # normals: see `normals_at`
-    field.sky_grid.requires_grad_(evidence.knows_sky)
-    objective = Objective(
-        settings=settings,
-        evidence=evidence,
-        pixels=pixels,
-        masks=masks,
-        depth_alignment=DepthAlignment(images),
-        buffers=buffers_for(field.geometry_grid.device),
-        learns_classes=learns_classes,
-        classes_trusted_at=settings.schedule.refine_at,
-    )
-    first_near = settings.schedule.first_near * extent.unit if settings.warm_up else 0.0
-    if points is not None:  # along a street surfaces may be nearer than that
-        nearest = float(np.quantile(to_numpy(points.depth), 0.02))
-        first_near = min(first_near, nearest / 2)
-    return Trainer(field, objective, extent, first_near, generator)
 
 
 class Trainer:
@@ -195,7 +147,6 @@ class Trainer:
 
     def run(self, report: Callable[[Report], None]) -> None:
         """Step until time or steps are over, and call `report` after each step."""
-        self.compile_kernels()
         while self.elapsed < 1:
             start = time.perf_counter()
             self.update_occupancy()
@@ -221,17 +172,6 @@ class Trainer:
                     samples=self.samples,
                 )
             )
-
-    def compile_kernels(self) -> None:
-        """Run every kernel once on a few rays, so that compiling does not count as fitting."""
-        small = replace(self.field.size, geometry_log2_rows=10, appearance_log2_rows=10)
-        weights = replace(self.settings.losses, ground_height=0.0)
-        settings = replace(self.settings, size=small, free_space=False, losses=weights)
-        points = self.evidence.free_space.sparse
-        twin = make_trainer(self.pixels, self.extent, settings, points)
-        twin.step(twin.pixels.draw(16, twin.generator))
-        twin.field.grid_density(torch.zeros(16, 3))
-        twin.field.density_normal(torch.zeros(16, 3))
 
     def draw_batch(self) -> Batch:
         """Draw the pixels of a step."""

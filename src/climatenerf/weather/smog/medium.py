@@ -7,7 +7,7 @@ it. All integrals are closed forms: there is no step size, and empty space costs
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -15,8 +15,6 @@ from torch import Tensor
 
 from climatenerf.core.srgb import linear_colour
 from climatenerf.weather.smog.parameters import Smog
-from climatenerf.weather.weather import Weather
-from climatenerf.weather.world import Preparation, World
 
 # Rays with a smaller |dz| count as horizontal. The gradient of a division by dz contains 1/dz^2,
 # which still fits float32 at this bound.
@@ -176,24 +174,3 @@ def transmittance(
     Args and units: see `optical_depth`.
     """
     return torch.exp(-optical_depth(air, rays_o, rays_d, t))
-
-
-@dataclass(frozen=True)
-class SmogEntity:
-    """Smog in a scene whose ground datum lies at world height `ground_z` (m)."""
-
-    ground_z: float
-
-    def place(self, world: World, weather: Weather, time: float) -> World:
-        """The world with smog in its air."""
-        air = medium(weather.smog, self.ground_z)
-        return world if air is None else replace(world, media=(*world.media, air))
-
-    def facts(self) -> dict[str, float]:
-        """Nothing is prepared."""
-        return {}
-
-
-def prepare(preparation: Preparation) -> SmogEntity:
-    """Smog needs nothing of the field."""
-    return SmogEntity(preparation.scene.ground_z)

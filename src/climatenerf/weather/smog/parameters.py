@@ -30,7 +30,7 @@ SMOG = Effect(
     name="smog",
     parameters=Smog,
     enabled_by=("visibility", "sigma"),
-    prepare="climatenerf.weather.smog.medium:prepare",
+    prepare="climatenerf.weather.smog.entity:prepare",
     layers=(Layer("mask_smog", "1", "share of the pixel's light that smog added", 1 / 255, 8),),
     alternatives=(("visibility", "sigma"),),
 )
