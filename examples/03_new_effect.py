@@ -26,7 +26,7 @@ class Ash:
     depth: Annotated[float | None, extend.quantity(extend.LENGTH, 0.0, 1.0, optional=True)] = None
     """Thickness on open level ground. none: no ash."""
     albedo: Annotated[float, extend.number(0.0, 1.0)] = 0.12
-    """Share of the light that ash reflects."""
+    """fraction of the light that ash reflects."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +72,9 @@ class AshEntity:
         ash = AshLayer(shape, self.white, weather.ash.albedo)
         return dataclasses.replace(world, matters=(*world.matters, ash))
 
+    def check(self, moments):
+        """Any ash fits any scene."""
+
     def facts(self):
         """Nothing to report."""
         return {}
@@ -95,7 +98,7 @@ ASH = extend.Effect(
     prepare=prepare,
     layers=(
         extend.Layer("ash_thickness", "m", "ash upon the surface that is seen, else 0", 1e-4, 16),
-        extend.Layer("mask_ash", "1", "share of the pixel that shows ash", 1 / 255, 8),
+        extend.Layer("mask_ash", "1", "fraction of the pixel that shows ash", 1 / 255, 8),
     ),
     measures=(extend.Measure("ash_share", "mask_ash"),),
 )

@@ -6,8 +6,11 @@
 
 The fit is 300 steps on the embedded street at half size with seed 0, on one thread. The frames show
 one training view clean, flooded, in smog, under snow and in all weathers at once, each with all
-layers. The script speaks to the command line alone, so that it survives every move of the code.
-With --run FOLDER an existing run is rendered and nothing is fitted.
+layers. The script calls the command line alone, so that it survives every move of the code. With
+--run FOLDER an existing run is rendered and nothing is fitted.
+
+Kernels that Numba has just compiled and kernels that it loads from its cache differ in roundings,
+which a fit amplifies. Therefore every comparison begins with an empty cache of its own.
 """
 
 import argparse
@@ -53,6 +56,7 @@ def main() -> None:
     if options.out is None:
         parser.error("give the JSON file to write, or --compare BEFORE AFTER")
     with tempfile.TemporaryDirectory() as temporary:
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(temporary) / "numba")
         hashes = golden(options.keep or Path(temporary), options.run)
     options.out.write_text(json.dumps(hashes, indent=1) + "\n")
 

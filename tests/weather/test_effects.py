@@ -109,7 +109,7 @@ def test_an_installed_effect_has_flags_keyframes_and_layers(installed, tmp_path)
     assert done.returncode == 0, done.stderr
     sidecar = json.loads((out / "movie.json").read_text())
     assert sidecar["weather"]["ash"] == {"depth": {"0 s": "0 m", "1 s": "0.04 m"}, "albedo": 0.3}
-    assert sidecar["layers"]["mask_ash"]["meaning"] == "share of the pixel that shows ash"
+    assert sidecar["layers"]["mask_ash"]["meaning"] == "fraction of the pixel that shows ash"
     first, last = (frame["measured"]["ash_share"] for frame in sidecar["frames"])
     assert first == 0 < last
     with np.load(out / "mask_ash" / "0001.npz") as arrays:

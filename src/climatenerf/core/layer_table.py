@@ -36,7 +36,12 @@ FRAME_LAYERS = (
     Layer("normal", "1", "surface normal in world axes; no surface: 0 0 0 (PNG 128)", None, 8),
     Layer("label", "1", f"class of the dry scene: {_CLASSES}", 1.0, 8),
     Layer(
-        "transmittance", "1", "share of the surface's light that passes the air", 1 / 65535, 16, 1.0
+        "transmittance",
+        "1",
+        "fraction of light that the air transmits",
+        1 / 65535,
+        16,
+        1.0,
     ),
 )
 """Layers of every frame, whatever the weather."""

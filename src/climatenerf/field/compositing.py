@@ -13,18 +13,50 @@ from climatenerf.field.protocol import RadianceField
 from climatenerf.ops import compositing
 
 RAYS_AT_ONCE = 16384  # bounds memory; the march buffers take 12 kB a ray
-GPU_RAYS_AT_ONCE = (
-    2**16
-)  # each launch has a cost; a ray that hits water sends five, traced together
-# Of the step that fits end with. Longer steps hit thin, dense matter by chance: with .5, 1, 1.5 and
-# 2 the capture `fox` has 30.66, 30.56, 29.98 and 29.01 dB (`benchmarks/render_step.py`).
+GPU_RAYS_AT_ONCE = 2**16  # each launch has a cost; a ray that hits water sends five more
+# Marching step of a render, relative to the last step of a fit. Longer steps miss thin, dense
+# matter: with .5, 1, 1.5 and 2 the capture `fox` has 30.66, 30.56, 29.98 and 29.01 dB
+# (`benchmarks/render_step.py`).
 RENDER_STEP = 1.0
-CHUNK_SECONDS = 0.01  # aim for a chunk that can be cancelled; half of the 20 ms that are promised
-FIRST_CHUNK = 256  # rays of the first such chunk, whose pace is not known
+STAGE_SECONDS = 0.01  # aimed at between two questions whether to stop; 20 ms are promised
+FIRST_CHUNK = 512  # rays of the first chunk of a render that can be cancelled
+MIN_CHUNK = 256  # rays; smaller chunks cost more than they gain
 
 
 class RenderCancelled(Exception):
     """The caller of a render has cancelled it."""
+
+
+class Checkpoints:
+    """Asks at many points of a render whether to stop, and keeps the longest time between two."""
+
+    def __init__(self, cancelled: Callable[[], bool] | None):
+        """Takes the caller's question; None: the render cannot be cancelled."""
+        self._cancelled = cancelled
+        self._last = time.perf_counter()
+        self.longest = 0.0
+
+    @property
+    def active(self) -> bool:
+        """Whether there is anybody to ask."""
+        return self._cancelled is not None
+
+    def __call__(self) -> None:
+        """Ask.
+
+        Raises:
+            RenderCancelled: the answer is True.
+        """
+        if self._cancelled is None:
+            return
+        now = time.perf_counter()
+        self.longest, self._last = max(self.longest, now - self._last), now
+        if self._cancelled():
+            raise RenderCancelled
+
+
+NEVER = Checkpoints(None)
+"""For renders that cannot be cancelled."""
 
 
 def rays_at_once(rays: Tensor) -> int:
@@ -32,27 +64,27 @@ def rays_at_once(rays: Tensor) -> int:
     return RAYS_AT_ONCE if rays.device.type == "cpu" else GPU_RAYS_AT_ONCE
 
 
-def chunks(rays: Tensor, cancelled: Callable[[], bool] | None = None) -> Iterator[slice]:
+def chunks(rays: Tensor, checkpoint: Checkpoints = NEVER) -> Iterator[slice]:
     """Slices of a list of rays, to be traced one after the other.
 
-    Without `cancelled` they are as long as memory allows. With it, each is as long as takes about
-    `CHUNK_SECONDS`, judged by the time that the caller spent on the one before.
+    They are as long as memory allows, or, if the render can be cancelled, so long that about
+    `STAGE_SECONDS` pass between two checkpoints.
 
     Raises:
-        RenderCancelled: `cancelled` answers True; asked before each slice.
+        RenderCancelled: see `Checkpoints`; asked before each slice.
     """
     most, start = rays_at_once(rays), 0
-    size = most if cancelled is None else FIRST_CHUNK
+    size = FIRST_CHUNK if checkpoint.active else most
     while start < rays.shape[0]:
-        if cancelled is not None and cancelled():
-            raise RenderCancelled
-        begun = time.perf_counter()
+        checkpoint()
+        checkpoint.longest = 0.0
         yield slice(start, start + size)
         start += size
-        if cancelled is not None:
-            # 1e-6 s: a clock too coarse to see the chunk would divide by 0.
-            pace = CHUNK_SECONDS / max(time.perf_counter() - begun, 1e-6)
-            size = int(min(most, max(16, size * min(2.0, pace))))
+        if checkpoint.active:
+            checkpoint()
+            # 1e-6 s: a clock too coarse to see the stage would divide by 0.
+            pace = STAGE_SECONDS / max(checkpoint.longest, 1e-6)
+            size = int(min(most, max(MIN_CHUNK, size * min(2.0, pace))))
 
 
 @torch.no_grad()

@@ -128,6 +128,7 @@ class RenderJob:
             "layers": self.layers,
             "formats": self.formats,
             "appearance": self.appearance,
+            "effects": {effect.name: effect.version for effect in self.effects},
         }
         return _hash(described)
 

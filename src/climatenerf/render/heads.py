@@ -9,7 +9,7 @@ from torch import Tensor
 from climatenerf.core.classes import SKY, SOLID
 from climatenerf.core.device import to_device
 from climatenerf.core.samples import MIN_WEIGHT, offsets_of
-from climatenerf.field.compositing import RENDER_STEP, chunks
+from climatenerf.field.compositing import RENDER_STEP, Checkpoints, chunks
 from climatenerf.field.protocol import RadianceField
 from climatenerf.ops import compositing
 
@@ -34,7 +34,7 @@ def see_surface(
         (`scene.classes`), sky there.
     """
     normals, labels = [], []
-    for chunk in chunks(rays_o, cancelled):
+    for chunk in chunks(rays_o, Checkpoints(cancelled)):
         o, d = rays_o[chunk], rays_d[chunk]
         near, far = torch.full((len(o),), field.near), torch.full((len(o),), 1e9)
         samples = field.march(o, d, near, far, RENDER_STEP)

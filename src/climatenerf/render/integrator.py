@@ -16,9 +16,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.samples import MIN_WEIGHT, Samples, offsets_of
-from climatenerf.field.compositing import RENDER_STEP, chunks, composited
+from climatenerf.field.compositing import (
+    NEVER,
+    RENDER_STEP,
+    Checkpoints,
+    chunks,
+    composited,
+)
 from climatenerf.ops import compositing
-from climatenerf.render.measurements import MIN_FRACTION, LightShares, measure, total
+from climatenerf.render.measurements import MIN_FRACTION, LightFractions, measure, total
 from climatenerf.weather import media
 from climatenerf.weather.world import (
     SKY_OPACITY,
@@ -53,17 +59,17 @@ def trace(
         pixel_angle: angle that a pixel spans, rad.
         sample_rotation: angle that rotates each ray's glossy sample set, rad; see
             `flood.optics.pixel_rotation`.
-        cancelled: asked between chunks of rays; see `field.compositing.chunks`.
+        cancelled: asked every 10 to 20 ms of computing; see `field.compositing.Checkpoints`.
 
     Raises:
         RenderCancelled: `cancelled` has answered True.
     """
-    parts = []
-    for chunk in chunks(rays_o, cancelled):
+    parts, checkpoint = [], Checkpoints(cancelled)
+    for chunk in chunks(rays_o, checkpoint):
         rotation = None if sample_rotation is None else sample_rotation[chunk]
         start = torch.full_like(pixel_angle[chunk], world.field.near)
         rays = rays_o[chunk], rays_d[chunk], pixel_angle[chunk], rotation, start
-        parts.append(_trace(world, *rays, bounces=BOUNCES))
+        parts.append(_trace(world, *rays, bounces=BOUNCES, checkpoint=checkpoint))
     return concatenate(parts, slice(None))
 
 
@@ -75,6 +81,7 @@ def _trace(
     sample_rotation: Float[Tensor, "n"] | None,
     t_min: Float[Tensor, "n"],
     bounces: int,
+    checkpoint: Checkpoints = NEVER,
 ) -> RenderOutput:
     """See `trace`; at most `bounces` more hits on surfaces."""
     n = rays_o.shape[0]
@@ -91,12 +98,14 @@ def _trace(
             if wet.numel():
                 rotation = None if sample_rotation is None else sample_rotation[wet]
                 given = rays_o[wet], rays_d[wet], pixel_angle[wet], rotation, t_min[wet]
-                parts.append(_trace(world, *given, bounces))
+                checkpoint()
+                parts.append(_trace(world, *given, bounces, checkpoint))
             return concatenate(parts, torch.cat([dry, wet]).argsort())
     samples, kind = _all_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     along = RaySamples(samples, ray, weights)
+    checkpoint()
 
     # --- Which fraction of the light comes from behind a surface? ---------------------------------
     t_surface = torch.full((n,), torch.inf)
@@ -115,6 +124,7 @@ def _trace(
     sky_weight = transmittance * (t_surface == torch.inf)
     arrive = partial(_arrive, world, surfaces, rays_o, rays_d)
 
+    checkpoint()
     # --- Light of the field and of matter in front of the surface ---------------------------------
     keep = (front > MIN_WEIGHT).nonzero()[:, 0]
     colour = _sample_colour(world, samples, ray, kind, keep, rays_o, rays_d)
@@ -129,6 +139,7 @@ def _trace(
     sky = arrive(sky, skyward, endless[skyward])
     rgb = rgb.index_add(0, skyward, sky_weight[skyward, None] * sky)
 
+    checkpoint()
     # --- Surfaces -----------------------------------------------------------------------------
     layers = {name: torch.zeros(n) for name in world.layer_names}
     normal = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
@@ -146,7 +157,7 @@ def _trace(
         rotation = None if sample_rotation is None else sample_rotation[hit]
         rays = rays_o[hit], rays_d[hit], t_surface[hit], t_bottom[hit], pixel_angle[hit], rotation
         shaded, own_normal, extra = surface.shade(
-            world, SurfaceHits(*rays), partial(_radiance, world, bounces - 1)
+            world, SurfaceHits(*rays), partial(_radiance, world, bounces - 1, checkpoint)
         )
         normal = normal.index_copy(0, hit, own_normal)
         shaded = arrive(shaded, hit, t_surface[hit])
@@ -156,16 +167,24 @@ def _trace(
 
     if bounces < BOUNCES:
         return _radiance_alone(rgb)
-    shares = LightShares(along, kind, front, surface_weight, sky_weight, t_surface)
+    shares = LightFractions(along, kind, front, surface_weight, sky_weight, t_surface)
     return measure(world, rays_o, rays_d, rgb, shares, normal, layers)
 
 
 def _radiance(
-    world: World, bounces: int, rays_o: Tensor, rays_d: Tensor, pixel_angle: Tensor
+    world: World,
+    bounces: int,
+    checkpoint: Checkpoints,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    pixel_angle: Float[Tensor, "n"],
 ) -> Float[Tensor, "n 3"]:
     """Radiance along secondary rays, for surfaces."""
     start = torch.zeros(rays_o.shape[0])
-    return _trace(world, rays_o, rays_d, pixel_angle, None, start, bounces).rgb
+    checkpoint()
+    rgb = _trace(world, rays_o, rays_d, pixel_angle, None, start, bounces, checkpoint).rgb
+    checkpoint()
+    return rgb
 
 
 def _radiance_alone(rgb: Float[Tensor, "n 3"]) -> RenderOutput:

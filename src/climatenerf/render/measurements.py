@@ -15,7 +15,7 @@ MIN_FRACTION = 1.0 / 2048  # of a pixel, below an 8-bit step: less is neither sh
 
 
 @dataclass(frozen=True)
-class LightShares:
+class LightFractions:
     """How the light of n rays is divided among samples, surfaces and sky."""
 
     along: RaySamples
@@ -36,7 +36,7 @@ def measure(
     rays_o: Float[Tensor, "n 3"],
     rays_d: Float[Tensor, "n 3"],
     rgb: Float[Tensor, "n 3"],
-    shares: LightShares,
+    shares: LightFractions,
     surface_normal: Float[Tensor, "n 3"],
     layers: dict[str, Float[Tensor, "n"]],
 ) -> RenderOutput:

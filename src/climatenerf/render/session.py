@@ -68,7 +68,7 @@ class RenderSession:
                 the training photos.
             times: moments of the frames, s. Default: 0 s alone.
             appearance: exposure and light of the field's colours; None: the mean of all photos.
-            progress: called with what is being done and the share that is done, [0, 1].
+            progress: called with what is being done and the fraction that is done, [0, 1].
             effects: effects that `weather` has sections for.
 
         Raises:
@@ -111,8 +111,9 @@ class RenderSession:
             require(self.field, effect.needs, f"the weather effect {effect.name!r}")
             key = _key(effect, own)
             if self._keys.get(effect.name) != key:
-                self._progress(effect.name, 0.0)
                 prepared[effect.name] = key, function(self._preparation(own))
+            else:
+                self._entities[effect.name].check(own)
         for name, (key, entity) in prepared.items():
             self._keys[name], self._entities[name] = key, entity
         self.weather = weather
@@ -161,7 +162,7 @@ class RenderSession:
             layers: names of wanted layers; `normal` and `label` are computed on demand, the others
                 always.
             preview: called with the display picture as it becomes finer.
-            cancelled: asked between chunks of rays that take at most about 20 ms.
+            cancelled: asked every 10 to 20 ms of computing; True ends the render.
 
         Raises:
             RenderCancelled: `cancelled` has answered True.

@@ -33,6 +33,14 @@ class Entity(Protocol):
         """
         ...
 
+    def check(self, moments: "tuple[Weather, ...]") -> None:
+        """Refuse parameters that do not fit the scene, before anything is rendered.
+
+        Raises:
+            UserError: a parameter does not fit.
+        """
+        ...
+
     def facts(self) -> Mapping[str, float]:
         """Numbers about the prepared effect for the sidecar, with units in their names."""
         ...
@@ -72,6 +80,7 @@ class Effect:
         after: Names of effects that are placed before this one, because it reads what they place.
         prepared_from: Parameters ("snow.fall_tilt", "seed") whose change prepares the entity again.
             A change of any other parameter only places it anew.
+        version: Version of the effect's code. A new one renders finished frames again.
     """
 
     name: str
@@ -84,6 +93,7 @@ class Effect:
     needs: frozenset[str] = frozenset()
     after: tuple[str, ...] = ()
     prepared_from: tuple[str, ...] = ()
+    version: str = ""
 
     def present(self, section: Any) -> bool:
         """Whether parameters put this effect into the scene."""

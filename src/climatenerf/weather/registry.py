@@ -36,12 +36,10 @@ def installed_effects() -> tuple[Effect, ...]:
         except Exception as error:  # whatever a foreign package raises
             raise UserError(
                 f"the weather effect {point.value} does not load ({type(error).__name__}: {error});"
-                " mend or uninstall its package"
+                " fix or uninstall its package"
             ) from error
         if not isinstance(effect, Effect):
-            raise UserError(
-                f"{point.value} is no climatenerf Effect; mend or uninstall its package"
-            )
+            raise UserError(f"{point.value} is no climatenerf Effect; fix or uninstall its package")
         effects.append(effect)
     return check_effects(tuple(effects))
 

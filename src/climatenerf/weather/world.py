@@ -29,7 +29,7 @@ class Medium(Protocol):
 
     @property
     def mask(self) -> str:
-        """Name of the layer with the share of light that the medium adds."""
+        """Name of the layer with the fraction of light that the medium adds."""
         ...
 
     def optical_depth(
@@ -59,7 +59,7 @@ class Matter(Protocol):
 
     @property
     def mask(self) -> str:
-        """Name of the layer with the share of the pixel that shows this matter."""
+        """Name of the layer with the fraction of the pixel that shows this matter."""
         ...
 
     @property
@@ -98,7 +98,7 @@ class RaySamples:
     ray: Int[Tensor, "s"]
     """Ray of each sample."""
     weights: Float[Tensor, "s"]
-    """Share of its ray's light that ends on each sample."""
+    """Fraction of its ray's light that ends on each sample."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Surface(Protocol):
 
     @property
     def mask(self) -> str:
-        """Name of the layer with the share of the pixel that shows this surface."""
+        """Name of the layer with the fraction of the pixel that shows this surface."""
         ...
 
     @property
@@ -160,7 +160,7 @@ class Surface(Protocol):
         t: Float[Tensor, "n"],
         pixel_angle: Float[Tensor, "n"],
     ) -> Float[Tensor, "s"]:
-        """Share of each sample that lies behind the surface, which rays meet at length t (m)."""
+        """Fraction of each sample that lies behind the surface, which rays meet at length t (m)."""
         ...
 
     def attenuate(
@@ -259,7 +259,7 @@ class Preparation:
         camera_positions: world m; detail is finest around them.
         appearance: exposure and light of the field's colours; None: the mean of all photos.
         irradiance: gives the linear irradiance on open level ground; computed at its first call.
-        progress: called with what is being done and the share that is done, [0, 1].
+        progress: called with what is being done and the fraction that is done, [0, 1].
     """
 
     field: RadianceField

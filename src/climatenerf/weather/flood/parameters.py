@@ -47,7 +47,7 @@ FLOOD = Effect(
     prepare="climatenerf.weather.flood.surface:prepare",
     layers=(
         Layer("water_depth", "m", "water above the ground where water is seen, else 0", 1e-3, 16),
-        Layer("mask_water", "1", "share of the pixel that shows water", 1 / 255, 8),
+        Layer("mask_water", "1", "fraction of the pixel that shows water", 1 / 255, 8),
     ),
     measures=(
         Measure("water_share", "mask_water"),

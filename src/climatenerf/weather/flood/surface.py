@@ -234,6 +234,11 @@ class FloodEntity:
         )
         return replace(world, surfaces=(*world.surfaces, water))
 
+    def check(self, moments: tuple[Weather, ...]) -> None:
+        """Refuse levels above the whole scene; see `check_level`."""
+        for moment in moments:
+            check_level(moment.flood.level, self.top)
+
     def facts(self) -> dict[str, float]:
         """Height of the waves."""
         return {"significant_wave_height_m": self.waves.significant_height}

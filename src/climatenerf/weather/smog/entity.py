@@ -18,6 +18,9 @@ class SmogEntity:
         air = medium(weather.smog, self.ground_z)
         return world if air is None else replace(world, media=(*world.media, air))
 
+    def check(self, moments: tuple[Weather, ...]) -> None:
+        """Any parameters fit any scene."""
+
     def facts(self) -> dict[str, float]:
         """Nothing is prepared."""
         return {}

@@ -31,6 +31,6 @@ SMOG = Effect(
     parameters=Smog,
     enabled_by=("visibility", "sigma"),
     prepare="climatenerf.weather.smog.entity:prepare",
-    layers=(Layer("mask_smog", "1", "share of the pixel's light that smog added", 1 / 255, 8),),
+    layers=(Layer("mask_smog", "1", "fraction of the pixel's light that smog added", 1 / 255, 8),),
     alternatives=(("visibility", "sigma"),),
 )

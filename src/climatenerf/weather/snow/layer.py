@@ -167,7 +167,7 @@ def bake_snow(
         sun_direction: unit vector towards the sun; None: diffuse light only.
         seed: of the fall direction's spread.
         grid: where snow is simulated and how finely; None: chosen from bounds and cameras.
-        progress: called with the share that is done, 0 to 1.
+        progress: called with the fraction that is done, 0 to 1.
         appearance: exposure and light of the field's colours; None: the mean of all photos.
 
     Returns:
@@ -224,6 +224,9 @@ class SnowEntity:
         floor = max((surface.level for surface in world.surfaces), default=None)
         snow = replace(self._grown, snow=look, floor_z=floor)
         return replace(world, matters=(*world.matters, snow))
+
+    def check(self, moments: tuple[Weather, ...]) -> None:
+        """Any parameters fit any scene."""
 
     def facts(self) -> dict[str, float]:
         """None: thickness is a layer."""

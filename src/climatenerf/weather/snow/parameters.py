@@ -42,7 +42,7 @@ SNOW = Effect(
     prepare="climatenerf.weather.snow.layer:prepare",
     layers=(
         Layer("snow_thickness", "m", "snow upon the surface that is seen, else 0", 1e-4, 16),
-        Layer("mask_snow", "1", "share of the pixel that shows snow", 1 / 255, 8),
+        Layer("mask_snow", "1", "fraction of the pixel that shows snow", 1 / 255, 8),
     ),
     measures=(
         Measure("snow_share", "mask_snow"),
