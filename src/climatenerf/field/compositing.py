@@ -121,12 +121,12 @@ def composited(
     samples = field.march(
         rays_o, rays_d, t_min, endless, step_scale, stop=stop, pruning_threshold=pruning_threshold
     )
-    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
-    far = compositing.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
+    weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    length = compositing.accumulate(weights, samples.t[:, None], samples.offsets)[:, 0]
     keep = (weights > MIN_WEIGHT).nonzero()[:, 0]
     ray = samples.ray_index()[keep]
     x = rays_o[ray] + samples.t[keep, None] * rays_d[ray]
     ids = None if samples.ids is None else samples.ids[keep]
     colour = field.colour(x, rays_d, ray, ids=ids, appearance=appearance)
     offsets = offsets_of(ray, t_min.shape[0])
-    return compositing.accumulate(weights[keep], colour, offsets), left, far
+    return compositing.accumulate(weights[keep], colour, offsets), transmittance, length

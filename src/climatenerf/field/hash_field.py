@@ -135,6 +135,10 @@ class Field(nn.Module):
         """Return an appearance vector, or the mean one for None, for each of n rays."""
         return (self.mean_embedding if vector is None else vector).expand(n, -1)
 
+    def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
+        """Return the appearance of a training photo."""
+        return self.embeddings[[index]].detach()
+
     @property
     def capabilities(self) -> frozenset[str]:
         """Optional methods that this field answers; see `field.capabilities`."""

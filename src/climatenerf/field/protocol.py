@@ -1,4 +1,4 @@
-"""What rendering asks of a radiance field, whatever it is made of.
+"""What rendering asks of any radiance field.
 
 Renderer, weather and scores use this protocol alone and never ask for a field's class. A field
 states in `capabilities` which of the optional methods it answers; whoever needs one checks that
@@ -107,6 +107,10 @@ class RadianceField(Protocol):
         """The same field without density that no photo shows. Needs `OBSERVED`."""
         ...
 
+    def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
+        """Appearance of a training photo, by its index. Needs `APPEARANCE`."""
+        ...
+
     def composite(
         self,
         rays_o: Float[Tensor, "n 3"],
@@ -122,7 +126,7 @@ class RadianceField(Protocol):
 
 
 def observed(field: RadianceField) -> RadianceField:
-    """The field without density that no photo shows, where it can tell; else the field itself."""
+    """The field without density that no photo shows, if it can leave that out; else the field."""
     return field.observed_only() if OBSERVED in field.capabilities else field
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -24,6 +24,7 @@ import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.layer_table import Layer
 from climatenerf.core.storage import explain, plain, read_json, write_json
+from climatenerf.field.capabilities import APPEARANCE
 from climatenerf.output import render_folder
 from climatenerf.output.layers import LayerFormat, require_exr, save_layers
 from climatenerf.output.render_folder import MOVIE, PREVIEW, SIDECAR
@@ -41,6 +42,9 @@ from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import EFFECTS, layer_table
+
+if TYPE_CHECKING:
+    from climatenerf.field.protocol import RadianceField
 
 MAX_SIDE = 8192
 MAX_RAYS = 2**26
@@ -411,7 +415,7 @@ def render_movie(
 
 
 def frame_source(
-    job: RenderJob, field: Any, scene: Scene, progress: Progress | None = None
+    job: RenderJob, field: "RadianceField", scene: Scene, progress: Progress | None = None
 ) -> FrameSource:
     """Prepare light, waves and snow for a job, and return what renders its frames.
 
@@ -424,9 +428,13 @@ def frame_source(
     Raises:
         UserError: the weather does not fit the scene.
     """
+    from climatenerf.field.protocol import require
     from climatenerf.render.session import RenderSession
 
-    appearance = None if job.appearance is None else field.embeddings[[job.appearance]].detach()
+    appearance = None
+    if job.appearance is not None:
+        require(field, frozenset({APPEARANCE}), "the appearance of a photo")
+        appearance = field.photo_appearance(job.appearance)
     times = np.array([job.time(index) for index in range(len(job))])
     positions = job.path.c2w[:, :3, 3]
     session = RenderSession(

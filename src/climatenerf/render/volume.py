@@ -34,8 +34,8 @@ def field_radiance(
     for chunk in chunks(rays_o):
         o, d = rays_o[chunk], rays_d[chunk]
         near = torch.full((o.shape[0],), field.near)
-        matter, left, _ = composited(field, o, d, near, appearance=appearance)
-        out.append(matter + left[:, None] * field.sky(d, appearance))
+        matter, transmittance, _ = composited(field, o, d, near, appearance=appearance)
+        out.append(matter + transmittance[:, None] * field.sky(d, appearance))
     return torch.cat(out)
 
 
