@@ -123,8 +123,8 @@ def far_sky_loss(distance: Float[Tensor, "n"], is_sky: Float[Tensor, "n"]) -> Fl
 def second_difference(z: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
     """Return the relative second difference of 1/z over pixels in a line: middle, left, right.
 
-    The inverse z-depth of a plane is affine in pixel coordinates, so a plane gives 0 whatever its
-    tilt.
+    The inverse z-depth of a plane is affine in pixel coordinates, so a plane gives 0 at
+    any tilt.
     """
     middle, left, right = z.unbind(-1)
     return middle / left + middle / right - 2.0
