@@ -73,7 +73,9 @@ def test_missing_and_unknown_verbs_are_refused(capsys):
     complaint = "climatenerf: there is no verb 'rendr'; did you mean render?\n"
     assert capsys.readouterr().err == complaint
     assert cli.main(["xyzzy"]) == 2
-    assert "use one of capture, fit, render, evaluate, export, demo" in capsys.readouterr().err
+    assert (
+        "use one of capture, check, fit, render, evaluate, export, demo" in capsys.readouterr().err
+    )
 
 
 def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):

@@ -105,7 +105,7 @@ def test_safetensors_round_trip(tmp_path):
 
 @pytest.mark.parametrize(
     "content, message",
-    [(b'{"a": 1', "line 1, column"), (b"[1]", "object"), (b"\xff\xfe\x00", "not text")],
+    [(b'{"a": 1', "line 1, column"), (b"[1]", "object"), (b"\xff\xfe\x00", "encoding UTF-16")],
 )
 def test_read_json_error_names_file_and_cause(tmp_path, content, message):
     path = tmp_path / "a.json"

@@ -67,8 +67,7 @@ def run(options: Capture) -> int:
     for kind in SIDECAR_KINDS:
         if kept := [path for path in made.kept if path.startswith(f"{kind}/")]:
             progress.say(f"Files of yours stay in {options.out / kind}: {listed(kept)}.")
-    for warning in made.scene.warnings:
-        progress.warn(warning)
+    progress.report_findings(made.scene.findings)
     progress.say(frame_line(made.scene))
     for picture in made.unposed:
         progress.warn(f"{picture.source} has no pose: {picture.reason}; {picture.remedy}")

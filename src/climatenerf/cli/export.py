@@ -26,6 +26,7 @@ class Export:
 def run(options: Export) -> int:
     """Write the files, and print where they are."""
     scene = read_scene(options.scene)
+    progress.report_findings(scene.findings)
     writers = {"transforms": export_transforms, "colmap": export_colmap}
     for name in dict.fromkeys(options.format):
         progress.result(f"{name}: {writers[name](scene, options.out)}")

@@ -16,7 +16,7 @@ from climatenerf.scene.alignment.known_length import (
     measure,
     read_marks,
 )
-from climatenerf.scene.alignment.scale import scale_summary, scale_warnings
+from climatenerf.scene.alignment.scale import scale_findings, scale_summary
 from climatenerf.training.folder import check_folder, check_resumable
 from climatenerf.training.settings import RENAMED_LOSSES, FitSettings, Losses, settings_of
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
@@ -104,8 +104,7 @@ def run(options: Fit) -> int:
         label_space=options.label_space,
     )
     scene = with_known_lengths(scene, options.known_length, options.marks)
-    for warning in dict.fromkeys((*scene.warnings, *scale_warnings(scene))):
-        progress.warn(warning)
+    progress.report_findings((*scene.findings, *scale_findings(scene)))
     progress.say(frame_line(scene))
     # Checked before labels, which may take minutes.
     check_folder(scene, options.out, options.resume)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
+    from climatenerf.scene.findings import Finding
+
 LINE_EVERY = 10.0
 """Seconds between two lines if standard error is no terminal."""
 
@@ -174,6 +176,17 @@ def say(text: str) -> None:
 def warn(text: str) -> None:
     """Print a warning on standard error."""
     say(f"warning: {text}")
+
+
+def report_findings(findings: "Iterable[Finding]") -> None:
+    """Print each finding about a capture once, on standard error: warnings, then notes."""
+    unique = dict.fromkeys(findings)
+    for finding in unique:
+        if finding.severity != "note":
+            warn(str(finding))
+    for finding in unique:
+        if finding.severity == "note":
+            say(f"note: {finding}")
 
 
 def result(text: str) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.text import read_text
 
 
 def explain(error: OSError, path: Path) -> UserError:
@@ -134,13 +135,13 @@ def read_json(path: Path | str, what: str = "file") -> dict[str, Any]:
         UserError: absent, unreadable, not JSON, or not an object.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = read_text(Path(path))
+    except UserError as error:  # another encoding
+        raise UserError(f"{what}: {error}") from error
     except FileNotFoundError as error:
         raise UserError(f"{what}: {path} does not exist; check the path") from error
     except OSError as error:
         raise explain(error, Path(path)) from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{what}: {path} is not text; it is damaged or not JSON") from error
     try:
         value = json.loads(text)
     except RecursionError as error:

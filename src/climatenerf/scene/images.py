@@ -15,10 +15,12 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.srgb import to_linear
 from climatenerf.scene.label_spaces import to_train_ids
-from climatenerf.scene.scene import Scene, View
+from climatenerf.scene.scene import MILLIMETRES, Scene, View
 
 RELATIVE_DEPTH = "depth_relative"
-_ORIENTATION_TAG = 0x0112
+SATURATED = 65535  # of 16-bit depth files
+MAX_FLOAT_DEPTH = 1e5  # m; bytes of colours give larger numbers, or none
+_ORIENTATION_TAG, _EXIF_TAG, _FOCAL_35MM_TAG = 0x0112, 0x8769, 0xA405
 # Pillow operation that displays a stored image upright, by EXIF orientation.
 EXIF_TRANSPOSES = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -84,6 +86,17 @@ def read_header(path: Path) -> Header:
             return _header(image)
     except _IMAGE_ERRORS as error:
         raise _image_error(path, error) from None
+
+
+def focal_35mm(path: Path) -> float | None:
+    """Return EXIF's FocalLengthIn35mmFilm, mm; None if absent or the image is unreadable."""
+    try:
+        with Image.open(path) as image:
+            value = image.getexif().get_ifd(_EXIF_TAG).get(_FOCAL_35MM_TAG)
+            number = float(value) if value else 0.0
+    except (*_IMAGE_ERRORS, TypeError, ZeroDivisionError):
+        return None
+    return number if 0 < number < 1e4 else None
 
 
 def _header(image: Image.Image) -> Header:
@@ -155,7 +168,7 @@ def load_depth(view: View, scene: Scene, downscale: int = 1) -> Float[np.ndarray
     """
     if view.depth_path is None:
         return None
-    depth = read_depth(view.depth_path)
+    depth = read_depth(view.depth_path, scene.depth_scale)
     return _decimate(_resize_nearest(depth, scene.cameras[view.camera], view.depth_path), downscale)
 
 
@@ -229,11 +242,16 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     return (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
 
 
-def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
-    """Read z-depths: NPY or NPZ (one array) in metres, or 16-bit PNG in millimetres (0 unknown).
+def read_depth(path: Path, scale: float = MILLIMETRES) -> Float[np.ndarray, "h w"]:
+    """Read z-depths: NPY or NPZ (one array) in metres, a 16-bit PNG of integers, or floats as RGBA.
+
+    Args:
+        path: The file.
+        scale: Metres per unit of a 16-bit PNG. 0 and 65535 are unknown: the second is where
+            sensors and programs, this one too, store the sky and what is beyond their range.
 
     Returns:
-        float32; NaN where not finite or not above 0.
+        float32; NaN where unknown, not finite or not above 0.
 
     Raises:
         UserError: The file cannot be read or holds no two-dimensional array of numbers.
@@ -242,11 +260,12 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
         if path.suffix in (".npy", ".npz"):
             depth = _read_array(path)
         else:
-            depth = np.asarray(_read_image(path)) / 1000
-            if depth.ndim == 2 and _read_image(path).mode == "L":
+            image = _read_image(path)
+            if image.mode == "L":
                 raise UserError(
                     f"The depth {path} has 8 bits; use 16-bit PNG (millimetres), NPY or NPZ (m)."
                 )
+            depth = _float_depth(image) if image.mode == "RGBA" else _integer_depth(image, scale)
     except _ARRAY_ERRORS as error:
         raise _array_error("depth", path, error) from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
@@ -257,6 +276,19 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
         )
     depth = depth.astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+
+
+def _integer_depth(image: Image.Image, scale: float) -> np.ndarray:
+    units = np.asarray(image)
+    return np.where(units == SATURATED, np.nan, units / (1 / scale))
+
+
+def _float_depth(image: Image.Image) -> np.ndarray:
+    """Return the depths, m, of a PNG that NeRFCapture wrote: the bytes of floats as RGBA."""
+    depth = np.ascontiguousarray(np.asarray(image)).view("<f4")[..., 0]
+    if not (np.isfinite(depth) & (depth >= 0) & (depth < MAX_FLOAT_DEPTH)).all():
+        raise ValueError("its four channels are no depths in metres")
+    return depth
 
 
 def downscaled_camera(camera: Camera, downscale: int) -> Camera:

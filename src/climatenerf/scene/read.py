@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,9 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.scene.alignment.scale import rescale_by_camera_height
 from climatenerf.scene.alignment.world_frame import align_scene
+from climatenerf.scene.checks.check import corrected
+from climatenerf.scene.checks.sidecars import sidecar_findings, unused_findings
+from climatenerf.scene.findings import Finding, without_repeats
 from climatenerf.scene.images import Header, read_header
 from climatenerf.scene.label_spaces import checked_label_space
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
@@ -55,7 +59,8 @@ def read_scene(
             numbering that the format prescribes.
 
     Returns:
-        The scene; `warnings` holds sentences for the user.
+        The scene. Its `findings` are what is odd about the capture. One of severity "error", such
+        as a label file that cannot be read, is raised by whatever loads that file.
 
     Raises:
         UserError: The input cannot be used; the message names the cause and the remedy.
@@ -84,18 +89,38 @@ def read_scene(
         root=capture.root,
         source=capture.source,
         cameras=capture.cameras,
-        views=_split(capture.views, capture.predefined_split, holdout, capture.root),
+        views=capture.views,
         points=capture.points,
-        warnings=capture.warnings,
+        findings=capture.findings,
         label_space=label_space or capture.label_space,
+        depth_scale=capture.depth_scale,
     )
+    scene = corrected(scene, capture.point_transforms)
+    scene = replace(
+        scene, views=_split(scene.views, capture.predefined_split, holdout, capture.root)
+    )
+    aligned = _aligned(scene, saved, camera_height, metric_input, capture.metric, gravity)
+    odd = (*aligned.findings, *sidecar_findings(aligned), *unused_findings(aligned, capture.views))
+    return replace(aligned, findings=without_repeats(odd))
+
+
+def _aligned(
+    scene: Scene,
+    saved: Scene | None,
+    camera_height: float | None,
+    metric_input: bool,
+    metric_capture: bool,
+    gravity: Mapping[str, Sequence[float]] | None,
+) -> Scene:
+    """Return the scene in the world frame: that of a saved scene, or a new one."""
     if saved is not None and not metric_input:
         # Keep the saved alignment: it may rest on GPS or gravity, which the images lack.
         aligned = replace(
             saved,
             cameras=scene.cameras,
             views=scene.views,
-            warnings=tuple(dict.fromkeys((*saved.warnings, *scene.warnings))),
+            points=scene.points,
+            findings=_merged(saved.findings, scene.findings),
             label_space=scene.label_space,
         )
         if camera_height is None:
@@ -103,10 +128,16 @@ def read_scene(
         if (rescaled := rescale_by_camera_height(aligned, camera_height)) is not None:
             return rescaled
     # An explicit camera height takes precedence over the scale of a metric format.
-    metric_input |= capture.metric and camera_height is None
+    metric_input |= metric_capture and camera_height is None
     return align_scene(
         scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity
     )
+
+
+def _merged(saved: tuple[Finding, ...], new: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    """Return saved findings, each code replaced by the new ones of the same code."""
+    codes = {each.code for each in new}
+    return without_repeats((*(each for each in saved if each.code not in codes), *new))
 
 
 def _capture_from_scene(scene: Scene, path: Path) -> Capture:
@@ -121,6 +152,7 @@ def _capture_from_scene(scene: Scene, path: Path) -> Capture:
         scene.points,
         predefined_split=True,
         label_space=scene.label_space,
+        depth_scale=scene.depth_scale,
     )
 
 
@@ -155,7 +187,7 @@ def _has_images(folder: Path) -> bool:
 
 def _check_images(capture: Capture) -> Capture:
     """Leave out missing images, fit the cameras to the image sizes, and sort views by name."""
-    warnings = list(capture.warnings)
+    findings = list(capture.findings)
     present = [v for v in capture.views if v.path.is_file()]
     missing = len(capture.views) - len(present)
     if len(present) < MIN_IMAGES:
@@ -166,11 +198,12 @@ def _check_images(capture: Capture) -> Capture:
         )
     if missing:
         first = next(v.name for v in capture.views if not v.path.is_file())
-        warnings.append(
+        message = (
             f"{missing} of the {len(capture.views)} images with poses are not on disk "
-            f"(first: {first}); they are left out."
+            f"(first: {first}); they are left out"
         )
-    present.sort(key=lambda v: v.name)
+        findings.append(Finding("photo-missing", message, file=str(capture.root)))
+    present = sorted(_with_inner_names(present), key=lambda v: v.name)
     for a, b in zip(present, present[1:], strict=False):
         if a.name == b.name:
             raise UserError(f"The image {a.name} has two poses; remove one of them.")
@@ -184,24 +217,39 @@ def _check_images(capture: Capture) -> Capture:
         transparent += header.alpha
         views.append(replace(view, camera=cameras.setdefault(fitted, len(cameras))))
     if scaled:
-        warnings.append(
+        message = (
             f"{scaled} images differ in size from their cameras but have the same shape; their "
-            "intrinsics are scaled."
+            "intrinsics are scaled"
         )
+        findings.append(Finding("photo-resized", message))
     if transparent:
-        warnings.append(
-            f"{transparent} images have an alpha channel, which is ignored; use masks to exclude "
-            "pixels."
-        )
+        message = f"{transparent} images have an alpha channel, which is ignored"
+        findings.append(Finding("photo-alpha", message, "use masks to exclude pixels"))
     for camera in cameras:
         error = _round_trip_error(camera)
         if error > MAX_ROUND_TRIP:
-            warnings.append(
+            message = (
                 f"The lens distortion of a {camera.width}x{camera.height} camera cannot be "
-                f"inverted everywhere (error {error:.1f} px near the border); undistort the images "
-                "if the border matters."
+                f"inverted everywhere (error {error:.1f} px near the border)"
             )
-    return replace(capture, cameras=tuple(cameras), views=tuple(views), warnings=tuple(warnings))
+            remedy = "undistort the images if the border matters"
+            findings.append(Finding("distortion-fold", message, remedy))
+    return replace(capture, cameras=tuple(cameras), views=tuple(views), findings=tuple(findings))
+
+
+def _with_inner_names(views: Sequence[View]) -> list[View]:
+    """Return the views with names that lie below a folder, for photos outside the capture's.
+
+    Names are also paths of labels and depths, so `../photos/a.jpg` and `/photos/a.jpg` become
+    `a.jpg`: the path below the folder that all such photos are in.
+    """
+    outer = [v for v in views if Path(v.name).is_absolute() or ".." in Path(v.name).parts]
+    if not outer:
+        return list(views)
+    common = os.path.commonpath([os.path.normpath(view.path.parent) for view in outer])
+    inner = {v.name: Path(os.path.relpath(v.path, common)).as_posix() for v in outer}
+    renamed = [replace(view, name=inner.get(view.name, view.name)) for view in views]
+    return renamed if len({v.name for v in renamed}) == len(renamed) else list(views)
 
 
 def _fit_camera(view: View, camera: Camera, header: Header) -> Camera:
@@ -243,8 +291,8 @@ def _find_sidecars(capture: Capture) -> Capture:
         if mask is not None and not mask.is_file():
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
         views.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
-    warnings = (*capture.warnings, *_sidecar_warnings(capture.root, views))
-    return replace(capture, views=tuple(views), warnings=warnings)
+    findings = (*capture.findings, *_sidecar_findings(capture.root, views))
+    return replace(capture, views=tuple(views), findings=findings)
 
 
 def _sidecar(folder: Path, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
@@ -255,8 +303,8 @@ def _sidecar(folder: Path, view: View, suffixes: tuple[str, ...] = (".png",)) ->
     return next((p for p in candidates if p.is_file()), None)
 
 
-def _sidecar_warnings(root: Path, views: Sequence[View]) -> list[str]:
-    """Return a warning for each sidecar folder that does not cover all views."""
+def _sidecar_findings(root: Path, views: Sequence[View]) -> list[Finding]:
+    """Return a finding for each sidecar folder that does not cover all views."""
     out = []
     for name, paths, formats in (
         ("labels", [v.label_path for v in views], "PNG"),
@@ -268,10 +316,9 @@ def _sidecar_warnings(root: Path, views: Sequence[View]) -> list[str]:
             continue
         suffixes = {*_SUFFIXES, ".npz", ".npy"}
         if any(p.suffix.lower() in suffixes for p in folder.rglob("*")):
-            out.append(
-                f"Only {count} of {len(views)} images have a file in {name}/; name each file after "
-                f"its image and store it as {formats}."
-            )
+            message = f"Only {count} of {len(views)} images have a file in {name}/"
+            remedy = f"name each file after its image and store it as {formats}"
+            out.append(Finding("sidecar-partial", message, remedy, file=str(folder)))
     return out
 
 

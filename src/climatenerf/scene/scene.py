@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, check_schema, make_folder, read_json, write_bytes
+from climatenerf.scene.findings import Finding, finding_from_json
 from climatenerf.scene.label_spaces import TRAIN_IDS, checked_label_space
 from climatenerf.scene.readers.ply import read_points, write_points
 
@@ -28,6 +29,8 @@ SCHEMA_VERSION = 1
 FILE_NAME = "scene.json"
 POINTS_NAME = "points.ply"
 OBSERVATIONS_NAME = "points_seen.npz"
+MILLIMETRES = 0.001
+"""Metres per unit of integer depth files, unless a capture states another scale."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,9 @@ class Scene:
         lowest_ground_z: Height of the lowest ground near the camera path, m.
         up_report: Under "used" the methods that determine up; under each method's name its angle
             to the result, degrees.
-        warnings: Sentences for the user.
+        findings: What is odd about the capture; see `findings.py`.
         label_space: Numbering of the class ids in the label files; see `label_spaces.py`.
+        depth_scale: Metres per unit of integer depth files.
     """
 
     root: Path
@@ -96,8 +100,14 @@ class Scene:
     ground_z: float = 0.0
     lowest_ground_z: float = 0.0
     up_report: dict[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     label_space: str = TRAIN_IDS
+    depth_scale: float = MILLIMETRES
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The findings as sentences, without notes."""
+        return tuple(str(each) for each in self.findings if each.severity != "note")
 
     @property
     def scale(self) -> float:
@@ -152,6 +162,7 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "root": os.path.relpath(scene.root, folder),
         "root_absolute": str(scene.root),
         "label_space": scene.label_space,
+        "depth_scale": scene.depth_scale,
         "axes": "OpenCV camera-to-input",
         "cameras": [asdict(c) for c in scene.cameras],
         "views": [_view_to_json(v, scene.root) for v in scene.views],
@@ -165,7 +176,8 @@ def save_scene(scene: Scene, folder: Path | str) -> Path:
         "scale_report": scene.scale_report,
         "georeference": scene.georeference,
         "up_report": scene.up_report,
-        "warnings": list(scene.warnings),
+        "findings": [each.as_json() for each in scene.findings],
+        "warnings": list(scene.warnings),  # for versions that read no findings
     }
     target = folder / FILE_NAME
     write_bytes(target, json.dumps(data, indent=1).encode())
@@ -244,10 +256,11 @@ def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
         ground_z=_number(data["ground_z"]),
         lowest_ground_z=_number(data["lowest_ground_z"]),
         up_report=dict(data["up_report"]),
-        warnings=tuple(_text(w) for w in data["warnings"]),
+        findings=tuple(finding_from_json(f) for f in data.get("findings", data["warnings"])),
         label_space=checked_label_space(
             _text(data.get("label_space", TRAIN_IDS)), f"The label_space in {folder / FILE_NAME}"
         ),
+        depth_scale=_number(data.get("depth_scale", MILLIMETRES)),
     )
 
 

@@ -14,15 +14,16 @@ from climatenerf.scene.alignment.georeference import (
     Georeference,
     apply_georeference,
     find_georeference,
-    gps_warning,
+    gps_finding,
 )
 from climatenerf.scene.alignment.known_length import apply_known_lengths, measure, read_marks
 from climatenerf.scene.alignment.scale import (
+    scale_findings,
     scale_from_depth_files,
-    scale_warnings,
     with_capture_flags,
     with_scale_evidence,
 )
+from climatenerf.scene.findings import without_repeats
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.colmap import read_colmap
 from climatenerf.scene.scene import FILE_NAME
@@ -173,8 +174,8 @@ def capture(settings: CaptureSettings, listener: Listener) -> Captured:
                 raise UserError(f"{error} (the scene in {out} is unchanged)") from error
             # Keep the poses: the user needs the page written below to make the marks.
             length_error = error
-        warnings = dict.fromkeys((*scene.warnings, *scale_warnings(scene)))
-        scene = replace(scene, warnings=tuple(warnings))
+        findings = without_repeats((*scene.findings, *scale_findings(scene)))
+        scene = replace(scene, findings=findings)
         save_scene(scene, new)
         write_mark_page(new / "mark.html", scene)
         write_report(new, scene, imported, model, unposed)
@@ -268,9 +269,9 @@ def in_metres(settings: CaptureSettings, new: Path, imported: PhotoImport) -> Sc
     scene = with_capture_flags(scene)
     positions = {name: each.gps for name, each in exif.items() if each.gps is not None}
     found = find_georeference(scene, positions)
-    warning = gps_warning(found, {picture.name: picture.source for picture in imported.pictures})
-    if warning is not None:
-        scene = replace(scene, warnings=(*scene.warnings, warning))
+    finding = gps_finding(found, {picture.name: picture.source for picture in imported.pictures})
+    if finding is not None:
+        scene = replace(scene, findings=(*scene.findings, finding))
     if not isinstance(found, Georeference):
         return scene
     return apply_georeference(scene, found, keep_scale=settings.camera_height is not None)

@@ -15,6 +15,7 @@ from PIL import Image
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, make_folder
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.images import read_depth, read_labels, read_mask
 from climatenerf.scene.scene import Scene, View
 
@@ -70,16 +71,21 @@ def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, 
             sidecar = _resample(sidecar, photo.lens, scene.cameras[view.camera], OUTSIDE[kind])
             view = replace(view, **{FIELDS[kind]: _write(scene.root / kind, kind, view, sidecar)})
         views.append(view)
-    warnings = list(scene.warnings)
+    findings = list(scene.findings)
     missing = sum(path is None for path in found.values())
     if missing:
-        warnings.append(f"{missing} of {len(views)} pictures have no {kind}.")
+        message = f"{missing} of {len(views)} pictures have no {kind}"
+        findings.append(Finding("sidecar-partial", message))
     if not certain:
-        warnings.append(
-            f"EXIF rotates some photos by 180 degrees or mirrors them. Their {kind} are assumed to"
-            " match the photos as shown, not as stored; check them."
+        findings.append(
+            Finding(
+                "sidecar-orientation",
+                f"EXIF rotates some photos by 180 degrees or mirrors them. Their {kind} are assumed"
+                " to match the photos as shown, not as stored",
+                "check them",
+            )
         )
-    return replace(scene, views=tuple(views), warnings=tuple(warnings))
+    return replace(scene, views=tuple(views), findings=tuple(findings))
 
 
 def _infer_stored(

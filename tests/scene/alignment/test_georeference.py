@@ -12,9 +12,10 @@ from climatenerf.scene.alignment.georeference import (
     apply_georeference,
     east_north,
     find_georeference,
-    gps_warning,
+    gps_finding,
 )
-from climatenerf.scene.alignment.scale import scale_warnings
+from climatenerf.scene.alignment.scale import scale_findings
+from climatenerf.scene.findings import Finding
 
 CAMERA = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
 HOME = np.array([47.3769, 8.5417])
@@ -32,7 +33,7 @@ def scene_of(poses, tmp_path):
     return Scene(
         tmp_path, "test", (CAMERA,), views, scale_source="camera-height-assumed",
         scale_error=0.3, lowest_ground_z=-2.0,
-        warnings=("The scale is assumed: cameras 1.6 m.", "Something else."),
+        findings=(Finding("scale-assumed", "The scale is assumed"), Finding("gps", "Else")),
     )  # fmt: skip
 
 
@@ -62,14 +63,14 @@ def test_georeference_recovers_scale_and_heading(tmp_path, noise):
     scene = scene_of(ring(24, radius=15.0), tmp_path)
     positions = gps_positions(scene, 1.7, 2.1, noise)
     found = find_georeference(scene, positions)
-    assert isinstance(found, Georeference) and gps_warning(found, {}) is None
+    assert isinstance(found, Georeference) and gps_finding(found, {}) is None
     assert found.scale == pytest.approx(1.7, rel=max(1e-3, 3 * found.scale_error))
     assert found.scale_error < 0.06
     assert found.heading == pytest.approx(2.1, abs=max(1e-3, 3 * found.scale_error))
     out = apply_georeference(scene, found, keep_scale=False)
     assert out.scale == pytest.approx(found.scale) and out.scale_source == "gps"
     assert out.ground_z == 0 and out.lowest_ground_z == pytest.approx(-2 * found.scale)
-    assert out.warnings == ("Something else.",)
+    assert out.warnings == ("Else.",)
     assert out.georeference["photos"] == 24
     assert out.scale_report["camera-height-assumed"]["times"] == pytest.approx(1 / found.scale)
     # x is east, y is north.
@@ -135,7 +136,7 @@ def test_a_third_of_outliers_is_left_out(tmp_path):
     found = find_georeference(scene, positions)
     assert isinstance(found, Georeference) and found.scale == pytest.approx(1.3, rel=0.05)
     assert set(found.left_out) == {f"{i}.png" for i in range(8)} and found.photos == 16
-    warning = gps_warning(found, {"0.png": "IMG_0.HEIC"})
+    warning = str(gps_finding(found, {"0.png": "IMG_0.HEIC"}))
     assert warning is not None
     assert "GPS of 8 of 24 photos" in warning and "IMG_0.HEIC, 1.png, " in warning
 
@@ -148,7 +149,7 @@ def test_keep_scale_adds_gps_to_the_scale_report(tmp_path):
     out = apply_georeference(scene, found, keep_scale=True)
     assert out.scale == pytest.approx(1.0) and out.scale_source == "camera-height"
     assert out.scale_report["gps"]["times"] == pytest.approx(1.7, rel=1e-3)
-    (warning,) = scale_warnings(out)
+    (warning,) = map(str, scale_findings(out))
     assert warning.startswith("The scale from gps is 1.70 times the one from camera-height")
 
 
@@ -173,9 +174,9 @@ def test_insufficient_gps_gives_a_warning(tmp_path, case, warning):
     if case == "lag":
         positions = dict.fromkeys(positions, positions["0.png"])
     found = find_georeference(scene, positions)
-    assert isinstance(found, UnusableGps) and str(gps_warning(found, {})).startswith(warning)
+    assert isinstance(found, UnusableGps) and str(gps_finding(found, {})).startswith(warning)
 
 
 def test_absent_gps_gives_no_warning(tmp_path):
     found = find_georeference(scene_of(ring(9), tmp_path), {})
-    assert isinstance(found, UnusableGps) and gps_warning(found, {}) is None
+    assert isinstance(found, UnusableGps) and gps_finding(found, {}) is None

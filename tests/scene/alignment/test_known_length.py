@@ -12,6 +12,7 @@ from climatenerf.scene.alignment.known_length import (
     measure,
     read_marks,
 )
+from climatenerf.scene.findings import Finding
 
 CAMERA = Camera(640, 480, 600.0, 600.0, 320.0, 240.0, k1=-0.05)
 FOOT, HEAD = np.array([0.3, -0.2, 0.0]), np.array([0.3, -0.2, 2.0])
@@ -25,7 +26,8 @@ def scene(tmp_path):
     )
     return Scene(
         tmp_path, "test", (CAMERA,), views, scale_source="camera-height-assumed",
-        scale_error=0.3, lowest_ground_z=-1.0, warnings=("The scale is assumed: 1.6 m.", "Other."),
+        scale_error=0.3, lowest_ground_z=-1.0,
+        findings=(Finding("scale-assumed", "1.6 m"), Finding("gps", "Other")),
     )  # fmt: skip
 
 

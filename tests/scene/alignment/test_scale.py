@@ -9,9 +9,9 @@ from climatenerf.scene import Camera, Scene, View, read_scene, save_scene
 from climatenerf.scene.alignment.scale import (
     rescale_by_camera_height,
     rescaled,
+    scale_findings,
     scale_from_depth_files,
     scale_summary,
-    scale_warnings,
     with_scale_evidence,
 )
 
@@ -53,8 +53,8 @@ def test_rescaling_converts_the_scale_report(scene):
 
 
 def test_only_significant_differences_give_a_warning(scene):
-    assert scale_warnings(scene) == []
-    warnings = scale_warnings(with_scale_evidence(scene, "depth files", 1.3, 0.02))
+    assert scale_findings(scene) == []
+    warnings = list(map(str, scale_findings(with_scale_evidence(scene, "depth files", 1.3, 0.02))))
     assert warnings == ["The scale from depth files is 1.30 times the one from gps; check both."]
 
 

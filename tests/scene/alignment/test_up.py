@@ -18,7 +18,8 @@ def test_vertical_lines_correct_a_common_pitch(tmp_path):
     out = align_scene(scene)
     assert angle(up_of(out), up) < 1
     assert out.up_report["cameras"] > 5 and "lines" in out.up_report["used"]
-    assert any("Up is uncertain: cameras" in w for w in out.warnings)
+    # The pitch that cameras have in common may be 8 degrees, so nothing is odd.
+    assert not any("Up is uncertain" in w for w in out.warnings)
 
 
 def gravity_readings(scene, up, tilt=0.0):

@@ -75,7 +75,7 @@ def test_distant_map_coordinates_are_shifted_by_whole_kilometres(tmp_path):
     assert np.abs(centre[:2]).max() < 1001 and centre[2] > 10
     np.testing.assert_array_equal(out.world_from_input[:3, :3], np.eye(3))
     assert (out.world_from_input[:2, 3] % 1000 == 0).all()
-    assert any("far from their origin" in w for w in out.warnings)
+    assert any("far from their origin" in str(each) for each in out.findings)
 
 
 def test_metric_input_with_another_up_gives_a_warning(tmp_path):

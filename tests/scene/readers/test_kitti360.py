@@ -123,7 +123,8 @@ def test_frames_without_a_pose_are_left_out(tmp_path):
     make(tmp_path, unposed=(1539, 1541))
     scene = read_scene(tmp_path)
     assert [int(v.path.stem) for v in scene.views] == [1538, 1540, 1542, 1543] * 2
-    assert any(w.startswith("4 images of") and "no pose" in w for w in scene.warnings)
+    notes = map(str, scene.findings)
+    assert any(note.startswith("4 images of") and "no pose" in note for note in notes)
 
 
 @pytest.mark.parametrize("frames", ["1539:1541", (1539, 1541), " 1539 : 1541 "])

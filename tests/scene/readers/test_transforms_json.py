@@ -4,10 +4,12 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.scene_builders import names_of, ring, write_images, write_transforms
 
 from climatenerf.core.errors import UserError
-from climatenerf.scene import read_scene
+from climatenerf.scene import load_scene, read_scene, save_scene
+from climatenerf.scene.images import load_depth, read_depth
 from climatenerf.scene.readers.ply import write_points
 from climatenerf.scene.readers.transforms_json import read_transforms
 
@@ -202,7 +204,6 @@ def test_scaled_and_rounded_rotations_are_orthonormalised(tmp_path):
     ("top", "message"),
     [
         ({"fl_x": 0}, "focal length 0"),
-        ({"fl_y": -3}, "focal length -3"),
         ({"fl_x": "wide"}, "fl_x .* is not a number"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR .*undistort"),
         ({"k4": 0.1}, "k4 without a fisheye"),
@@ -221,3 +222,68 @@ def test_invalid_json_raises(tmp_path):
     (tmp_path / "transforms.json").write_text('{"frames": [')
     with pytest.raises(UserError, match=r"transforms\.json is not readable JSON"):
         read_scene(tmp_path)
+
+
+def write_depths(folder, scale, suffix=".png"):
+    """Depth files of 7.5 m."""
+    (folder / "depths").mkdir()
+    for name in names_of(4):
+        values = np.full((24, 32), 7.5 / scale)
+        Image.fromarray(values.astype(np.uint16)).save(folder / "depths" / name)
+
+
+@pytest.mark.parametrize("key", ["depth_path", "depth_file_path"])
+@pytest.mark.parametrize(
+    ("scale", "top"),
+    [
+        (0.001, {}),
+        (0.001, {"integer_depth_scale": 0.001}),
+        (0.0005, {"integer_depth_scale": 0.0005}),
+        (0.01, {"depth_unit_scale_factor": 0.01}),
+    ],
+)
+def test_named_depth_files_are_read_in_their_unit(tmp_path, key, scale, top):
+    write_images(tmp_path, names_of(4))
+    write_depths(tmp_path, scale)
+    write_transforms(tmp_path / "transforms.json", ring(4), names_of(4), fl_x=30.0, **top)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in data["frames"]:
+        frame[key] = f"depths/{frame['file_path']}"
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    save_scene(read_scene(tmp_path), tmp_path / "run")
+    scene = load_scene(tmp_path / "run")
+    assert all(view.depth_path is not None for view in scene.views)
+    np.testing.assert_allclose(load_depth(scene.views[0], scene), 7.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("scale", ["wide", 0, -1, 1e9, True])
+def test_a_wrong_depth_scale_raises(tmp_path, scale):
+    write_images(tmp_path, names_of(4))
+    top = {"fl_x": 30.0, "integer_depth_scale": scale}
+    write_transforms(tmp_path / "transforms.json", ring(4), names_of(4), **top)
+    with pytest.raises(UserError, match="integer_depth_scale"):
+        read_scene(tmp_path)
+
+
+def test_floats_in_four_channels_are_depths(tmp_path):
+    """As NeRFCapture writes them."""
+    depth = np.random.default_rng(0).uniform(0, 5, (6, 8)).astype("<f4")
+    Image.fromarray(depth.view(np.uint8).reshape(6, 8, 4), "RGBA").save(tmp_path / "d.png")
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.png"), depth)
+    Image.new("RGBA", (8, 6), (200, 10, 20, 255)).save(tmp_path / "colour.png")
+    with pytest.raises(UserError, match="no depths in metres"):
+        read_depth(tmp_path / "colour.png")
+
+
+@pytest.mark.parametrize(
+    "named", ["../photos/{}", "/elsewhere/project/photos/{}", "{root}/photos/{}"]
+)
+def test_photos_outside_the_folder_have_names_below_one(tmp_path, named):
+    inside = named.startswith("/elsewhere")
+    photos = tmp_path / ("nerf/photos" if inside else "photos")
+    write_images(photos, names_of(4))
+    names = [named.format(name, root=tmp_path) for name in names_of(4)]
+    write_transforms(tmp_path / "nerf/transforms.json", ring(4), names, fl_x=30.0)
+    scene = read_scene(tmp_path / "nerf")
+    assert [view.path for view in scene.views] == [photos / name for name in names_of(4)]
+    assert [view.name for view in scene.views] == names_of(4)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.scene import Scene
 
 MIN_FIXES = 5
@@ -145,8 +146,8 @@ def find_georeference(
     )
 
 
-def gps_warning(found: Georeference | UnusableGps, sources: Mapping[str, str]) -> str | None:
-    """Return a warning about GPS positions that are not used; None if there is nothing to report.
+def gps_finding(found: Georeference | UnusableGps, sources: Mapping[str, str]) -> Finding | None:
+    """Return a finding about GPS positions that are not used; None if there is nothing to report.
 
     Args:
         found: Result of `find_georeference`.
@@ -155,14 +156,15 @@ def gps_warning(found: Georeference | UnusableGps, sources: Mapping[str, str]) -
     if isinstance(found, UnusableGps):
         if not found.photos:
             return None
-        return f"GPS of {found.photos} photos is of no use here: {found.reason}."
+        return Finding("gps", f"GPS of {found.photos} photos is of no use here: {found.reason}")
     if not found.left_out:
         return None
     listed = ", ".join(sources.get(name, name) for name in found.left_out[:MAX_LISTED])
     more = ", ..." if len(found.left_out) > MAX_LISTED else ""
-    return (
+    return Finding(
+        "gps",
         f"GPS of {len(found.left_out)} of {found.photos + len(found.left_out)} photos is far from"
-        f" their camera positions and is left out: {listed}{more}."
+        f" their camera positions and is left out: {listed}{more}",
     )
 
 

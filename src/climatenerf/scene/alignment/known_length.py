@@ -19,7 +19,9 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.text import read_text
 from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.scene import Scene
 
 FILE_NAME = "marks.toml"
@@ -55,7 +57,7 @@ def read_marks(path: Path) -> Marks:
         UserError: The file is absent, not TOML, or not of the form above.
     """
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise UserError(
             f"{path} does not exist; mark both ends of the length in two images or more (open"
@@ -186,6 +188,7 @@ def apply_known_lengths(scene: Scene, lengths: list[LengthMeasurement]) -> Scene
             out = with_scale_evidence(out, m.name, float(r) / factor, m.error)
     if spread > DISAGREEMENT:
         listed = ", ".join(f"{m.name} x{r:.2f}" for m, r in zip(lengths, ratio, strict=True))
-        warning = f"The known lengths disagree ({listed}); check their marks."
-        out = replace(out, warnings=(*out.warnings, warning))
+        message = f"The known lengths disagree ({listed})"
+        finding = Finding("scale-disagrees", message, "check their marks")
+        out = replace(out, findings=(*out.findings, finding))
     return out

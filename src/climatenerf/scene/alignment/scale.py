@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from climatenerf.scene.alignment.ground_plane import find_ground
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.images import load_depth
 from climatenerf.scene.scene import Scene
 
@@ -16,7 +17,6 @@ MIN_DEPTHS = 5  # points per view, and views, that a scale from depth files need
 MIN_DEPTH_ERROR = 0.01  # relative, of a scale from depth files
 MAX_SPREAD = 0.15  # of log depth over points: metric depth is mostly within a tenth
 MIN_HEIGHT_ERROR = 0.05  # relative, of a scale from the camera height
-ASSUMED_WARNING = "The scale is assumed"  # first words of the warning
 SIGMAS = 2.0  # difference between two pieces of evidence that is worth a warning
 
 
@@ -41,7 +41,7 @@ def rescaled(scene: Scene, factor: float, source: str, error: float) -> Scene:
         scale_error=error,
         scale_report=report,
         lowest_ground_z=scene.ground_z + factor * (scene.lowest_ground_z - scene.ground_z),
-        warnings=tuple(w for w in scene.warnings if not w.startswith(ASSUMED_WARNING)),
+        findings=tuple(f for f in scene.findings if f.code != "scale-assumed"),
     )
 
 
@@ -115,24 +115,27 @@ def scale_summary(scene: Scene) -> str:
     return "; ".join(clauses)
 
 
-def scale_warnings(scene: Scene) -> list[str]:
-    """Return a warning for each piece of evidence that differs by more than the errors allow."""
+def scale_findings(scene: Scene) -> list[Finding]:
+    """Return a finding for each piece of evidence that differs by more than the errors allow."""
     return [
-        f"The scale from {name} is {entry['times']:.2f} times the one from {scene.scale_source};"
-        " check both."
+        Finding(
+            "scale-disagrees",
+            f"The scale from {name} is {entry['times']:.2f} times the one from"
+            f" {scene.scale_source}",
+            "check both",
+        )
         for name, entry in scene.scale_report.items()
         if abs(np.log(entry["times"])) > SIGMAS * (entry["error"] + scene.scale_error)
     ]
 
 
 def with_capture_flags(scene: Scene) -> Scene:
-    """Return the scene with the warning of an assumed scale naming the flags of `capture`."""
-    remedy = "; give --camera-height or --known-length."
-    warnings = [
-        w.partition("; give ")[0] + remedy if w.startswith(ASSUMED_WARNING) else w
-        for w in scene.warnings
+    """Return the scene with the finding of an assumed scale naming the flags of `capture`."""
+    remedy = "give --camera-height or --known-length"
+    findings = [
+        replace(f, remedy=remedy) if f.code == "scale-assumed" else f for f in scene.findings
     ]
-    return replace(scene, warnings=tuple(warnings))
+    return replace(scene, findings=tuple(findings))
 
 
 def percent(fraction: float) -> str:

@@ -10,10 +10,12 @@ from jaxtyping import Float
 
 from climatenerf.scene.alignment.ground_plane import find_ground, ground_plane
 from climatenerf.scene.alignment.vanishing_point import VanishingPoint, find_vanishing_point
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.images import read_header
 from climatenerf.scene.scene import Scene
 
 DISAGREEMENT = 5.0  # degrees between methods that are worth a warning
+SIGMAS = 1.5  # the same in standard errors of a method
 OUTLIER = 10.0  # degrees from the combined direction that exclude a method
 ROLL_SIGMA = 2.5  # degrees: roll of a hand-held camera
 PITCH_SIGMA = 8.0  # degrees: mean pitch of the cameras
@@ -45,12 +47,12 @@ class Up:
     Attributes:
         direction: Unit vector, input frame.
         report: As `Scene.up_report`.
-        warnings: Sentences for the user.
+        findings: The disagreement of the methods, if there is one.
     """
 
     direction: Float[np.ndarray, " 3"]
     report: dict[str, object]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
 
 def estimate_up(
@@ -95,14 +97,22 @@ def estimate_up(
     report |= {method: round(angle, 2) for method, angle in angles.items()}
     if lines is not None and not reliable:
         report["lines (too few to use)"] = round(_angle(lines.up, up), 2)
-    worst = max(angles, key=lambda method: angles[method])
-    if angles[worst] <= DISAGREEMENT:
+    # The angle in standard errors, of which the cameras' pitch has many degrees.
+    excess = {e.method: _angle(e.direction, up) / allowed_angle(e.sigma) for e in estimates}
+    worst = max(excess, key=lambda method: excess[method])
+    if excess[worst] <= 1:
         return Up(up, report, ())
-    warning = (
-        f"Up is uncertain: {worst} and {name} disagree by {angles[worst]:.0f} degrees; check the "
-        "result for tilted water."
+    finding = Finding(
+        "up-uncertain",
+        f"Up is uncertain: {worst} and {name} disagree by {angles[worst]:.0f} degrees",
+        "check the result for tilted water",
     )
-    return Up(up, report, (warning,))
+    return Up(up, report, (finding,))
+
+
+def allowed_angle(sigma: float) -> float:
+    """Return the angle, degrees, from the chosen up that a method of this error may have."""
+    return max(DISAGREEMENT, SIGMAS * sigma)
 
 
 def up_from_cameras(axes: Float[np.ndarray, "n 3 2"]) -> UpEstimate:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.scene.alignment.ground_plane import Ground, find_ground
-from climatenerf.scene.alignment.scale import ASSUMED_WARNING
 from climatenerf.scene.alignment.up import estimate_up, rotation_to_z
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.scene import Scene
 
 ASSUMED_CAMERA_HEIGHT = 1.6  # m: a camera held at eye height
@@ -47,7 +47,7 @@ def align_scene(
     """
     poses = np.stack([v.c2w for v in scene.views])
     up = estimate_up(scene, gravity or {}, input_is_upright=metric_input)
-    scene = replace(scene, up_report=up.report, warnings=(*scene.warnings, *up.warnings))
+    scene = replace(scene, up_report=up.report, findings=(*scene.findings, *up.findings))
     rotation = np.eye(3) if metric_input else rotation_to_z(up.direction)
     positions = poses[:, :3, 3] @ rotation.T
     points = None if scene.points is None else scene.points @ rotation.T
@@ -73,7 +73,7 @@ def align_scene(
         scale_error=error,
         ground_z=0.0,
         lowest_ground_z=float(scale * (lowest_z - ground_z)),
-        warnings=(*scene.warnings, *_scale_warnings(ground, camera_height, error)),
+        findings=(*scene.findings, *_scale_findings(ground, camera_height, error)),
     )
 
 
@@ -81,12 +81,16 @@ def _keep_metric_frame(
     scene: Scene, positions: Float[np.ndarray, "n 3"], ground: Ground | None
 ) -> Scene:
     """Return the scene with the input frame as world frame, moved only if far from its origin."""
-    warnings = list(scene.warnings)
+    findings = list(scene.findings)
     if ground is None:
         ground_z = lowest_z = float(np.median(positions[:, 2])) - ASSUMED_CAMERA_HEIGHT
-        warnings.append(
-            f"No ground was found below the cameras, so it is assumed {ASSUMED_CAMERA_HEIGHT} m"
-            " below them; check water levels in the result."
+        findings.append(
+            Finding(
+                "ground-missing",
+                "No ground was found below the cameras, so it is assumed"
+                f" {ASSUMED_CAMERA_HEIGHT} m below them",
+                "check water levels in the result",
+            )
         )
     else:
         ground_z, lowest_z = ground.under_path, ground.lowest
@@ -94,9 +98,13 @@ def _keep_metric_frame(
     origin = np.round(positions[:, :2].mean(axis=0), -3)
     if np.abs(origin).max() > MAX_ORIGIN_DISTANCE:
         world[:2, 3] = -origin
-        warnings.append(
-            f"The poses are far from their origin; the world's origin is moved to x {origin[0]:.0f}"
-            f" m, y {origin[1]:.0f} m of the input."
+        findings.append(
+            Finding(
+                "origin-moved",
+                "The poses are far from their origin; the world's origin is moved to x"
+                f" {origin[0]:.0f} m, y {origin[1]:.0f} m of the input",
+                severity="note",
+            )
         )
     return replace(
         scene,
@@ -105,7 +113,7 @@ def _keep_metric_frame(
         scale_error=0.0,
         ground_z=float(ground_z),
         lowest_ground_z=float(lowest_z),
-        warnings=tuple(warnings),
+        findings=tuple(findings),
     )
 
 
@@ -134,17 +142,21 @@ def _assumed_height(poses: Float[np.ndarray, "n 4 4"], z: Float[np.ndarray, " n"
     return max(FOCUS_FRACTION * distance, float(np.median(z) - z.min()) + 0.1 * distance)
 
 
-def _scale_warnings(ground: Ground | None, camera_height: float | None, error: float) -> list[str]:
+def _scale_findings(
+    ground: Ground | None, camera_height: float | None, error: float
+) -> list[Finding]:
     if ground is None:
-        return [
+        message = (
             "No ground was found below the cameras, so scale and ground height are estimates "
-            f"(+-{error:.0%}); check water levels in the result."
-        ]
+            f"(+-{error:.0%})"
+        )
+        return [Finding("ground-missing", message, "check water levels in the result")]
     if camera_height is None:
-        # `scale.with_capture_flags` replaces what follows "; give ".
-        return [
-            f"{ASSUMED_WARNING}: cameras {ASSUMED_CAMERA_HEIGHT} m above the ground "
-            f"(+-{error:.0%}); give --camera-height, or --metric-input if the poses are in metres "
-            "with z up."
-        ]
+        # `scale.with_capture_flags` replaces the remedy.
+        message = (
+            f"The scale is assumed: cameras {ASSUMED_CAMERA_HEIGHT} m above the ground "
+            f"(+-{error:.0%})"
+        )
+        remedy = "give --camera-height, or --metric-input if the poses are in metres with z up"
+        return [Finding("scale-assumed", message, remedy)]
     return []

@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.label_spaces import TRAIN_IDS
-from climatenerf.scene.scene import View
+from climatenerf.scene.scene import MILLIMETRES, View
 
 # No real pose, focal length or size comes near; above it, products of several numbers overflow.
 _MAX_VALUE = 1e12
@@ -32,7 +33,9 @@ class Capture:
         predefined_split: Whether the capture defines the split of its views.
         metric: Whether the input frame is in metres with z up.
         label_space: Numbering of the ids in its label files; see `label_spaces.py`.
-        warnings: Sentences for the user.
+        findings: What is odd about the files.
+        depth_scale: Metres per unit of integer depth files.
+        point_transforms: Transforms that the points may lack although the poses include them, 4x4.
     """
 
     root: Path
@@ -43,7 +46,9 @@ class Capture:
     predefined_split: bool = False
     metric: bool = False
     label_space: str = TRAIN_IDS
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    depth_scale: float = MILLIMETRES
+    point_transforms: tuple[Float[np.ndarray, "4 4"], ...] = ()
 
 
 def checked_camera(camera: Camera, where: str) -> Camera:
@@ -63,10 +68,10 @@ def checked_camera(camera: Camera, where: str) -> Camera:
             f"A camera in {where} has intrinsics that are not finite or far too large; calibrate "
             "again."
         )
-    if camera.fx < 1e-6 or camera.fy < 1e-6:
+    # `checks.intrinsics` takes the absolute value of a negative one.
+    if min(abs(camera.fx), abs(camera.fy)) < 1e-6:
         raise UserError(
-            f"A camera in {where} has focal length {min(camera.fx, camera.fy):g} pixels; it must "
-            "be above 0, so calibrate again or correct the file."
+            f"A camera in {where} has focal length 0; calibrate again or correct the file."
         )
     if not (0 < camera.width < _MAX_VALUE and 0 < camera.height < _MAX_VALUE):
         raise UserError(

@@ -6,8 +6,8 @@ with w first, camera axes x right, y down, z forward, centre of the top-left pix
 
 from __future__ import annotations
 
-import itertools
 import struct
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +18,9 @@ from jaxtyping import Float, Int
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.rotations import rotation_matrices
+from climatenerf.core.text import decode, lines_of, read_text
+from climatenerf.scene.file_names import FileNames
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.scene import View
 
@@ -47,13 +50,14 @@ _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 
 class _Image(NamedTuple):
-    """One entry of the images file."""
+    """One entry of the images file; a text model may lack the features."""
 
     name: str
     camera: int
     c2w: Float[np.ndarray, "4 4"]
-    points: Int[np.ndarray, " k"]
-    """Point id of each feature, -1 for a feature without a point."""
+    points: Int[np.ndarray, " k"] | None
+    """Point id of each feature, -1 for a feature without a point; None if the file has no line of
+    features."""
 
 
 def model_folders(root: Path) -> list[Path]:
@@ -76,7 +80,7 @@ def read_colmap(root: Path) -> Capture:
     Raises:
         UserError: A file is damaged, the model is empty, or its camera model is not supported.
     """
-    model, chosen, warnings = _largest(root)
+    model, chosen, findings = _largest(root)
     by_id = _read_cameras(model)
     missing = {image.camera for image in chosen} - set(by_id)
     if missing:
@@ -85,15 +89,18 @@ def read_colmap(root: Path) -> Capture:
             "export the model again."
         )
     ids = sorted({image.camera for image in chosen})
-    image_root, folder = _image_folder(root, [image.name for image in chosen])
+    image_root, files = _image_folder(root, [image.name for image in chosen])
     point_ids, points = _read_points3d(model)
+    if len(points) and not any(image.points is not None and len(image.points) for image in chosen):
+        # Empty lines in place of features that were left out.
+        chosen = [image._replace(points=None) for image in chosen]
     views = tuple(
         View(
             name=image.name,
-            path=folder / image.name,
+            path=files.find(image.name) or files.folder / image.name,
             camera=ids.index(image.camera),
             c2w=image.c2w,
-            seen=_observed_rows(image.points, point_ids),
+            seen=None if image.points is None else _observed_rows(image.points, point_ids),
         )
         for image in chosen
     )
@@ -103,8 +110,21 @@ def read_colmap(root: Path) -> Capture:
         cameras=tuple(by_id[i] for i in ids),
         views=views,
         points=points if len(points) else None,
-        warnings=warnings,
+        findings=(*findings, *_feature_lines(model, chosen), *files.findings()),
     )
+
+
+def _feature_lines(model: Path, images: list[_Image]) -> list[Finding]:
+    """Return a finding if a text model has images without a line of features."""
+    count = sum(image.points is None for image in images)
+    if not count:
+        return []
+    message = (
+        f"The COLMAP model {model} has no features for {count} of its {len(images)} images, so it"
+        " is unknown which points they show"
+    )
+    remedy = "export the model with features if that is possible"
+    return [Finding("model-lines", message, remedy, "note", str(model))]
 
 
 def largest_model(root: Path) -> Path:
@@ -116,8 +136,8 @@ def largest_model(root: Path) -> Path:
     return _largest(root)[0]
 
 
-def _largest(root: Path) -> tuple[Path, list[_Image], tuple[str, ...]]:
-    """Return the model folder with the most images, its images, and warnings."""
+def _largest(root: Path) -> tuple[Path, list[_Image], tuple[Finding, ...]]:
+    """Return the model folder with the most images, its images, and findings."""
     models = model_folders(root)
     if not models:
         raise UserError(
@@ -132,11 +152,11 @@ def _largest(root: Path) -> tuple[Path, list[_Image], tuple[str, ...]]:
     if len(models) == 1:
         return model, chosen, ()
     sizes = ", ".join(f"{m.name}: {len(p)}" for m, p in poses)
-    warning = (
+    message = (
         f"COLMAP produced {len(models)} separate models (images in each: {sizes}); "
-        f"{model.name} is used, the others are left out."
+        f"{model.name} is used, the others are left out"
     )
-    return model, chosen, (warning,)
+    return model, chosen, (Finding("model-parts", message, file=str(model)),)
 
 
 def _suffix(folder: Path) -> str | None:
@@ -154,16 +174,18 @@ def _subfolders(folder: Path) -> list[Path]:
     return sorted(found, key=lambda p: (len(p.name), p.name))
 
 
-def _image_folder(root: Path, names: list[str]) -> tuple[Path, Path]:
+def _image_folder(root: Path, names: list[str]) -> tuple[Path, FileNames]:
     """Return the capture's folder and the folder in it that has most of the named images."""
     roots = [root, root.parent, root.parent.parent] if _suffix(root) else [root]
-    best, best_count = (roots[0], roots[0] / "images"), 0
+    best, best_count = (roots[0], FileNames(roots[0] / "images")), 0
     for base in roots:
         for sub in IMAGE_FOLDERS:
-            folder = base / sub
-            count = sum((folder / n).is_file() for n in names) if folder.is_dir() else 0
+            files = FileNames(base / sub)
+            count = sum(files.find(n) is not None for n in names) if files.folder.is_dir() else 0
             if count > best_count:
-                best, best_count = (base, folder), count
+                best, best_count = (base, files), count
+            if count == len(names):
+                return best
     return best
 
 
@@ -265,13 +287,17 @@ class _Cursor:
         if end < 0:
             raise self.damaged()
         raw, self.offset = self.data[self.offset : end], end + 1
-        try:
-            text = raw.decode("utf-8")
-        except UnicodeDecodeError:
-            raise self.damaged() from None
-        if not text or not text.isprintable():
-            raise self.damaged()
-        return text
+        return _checked_name(decode(raw, f"The image name {raw[:60]!r} in {self.path}"), self.path)
+
+
+def _checked_name(name: str, path: Path) -> str:
+    """Return a name that a file can have: any characters except control characters."""
+    if not name or any(unicodedata.category(c) == "Cc" for c in name):
+        raise UserError(
+            f"{path} has the image name {name[:60]!r}, which is empty or holds control characters;"
+            " it is truncated or damaged, so export the COLMAP model again."
+        )
+    return name
 
 
 def _read_cameras(model: Path) -> dict[int, Camera]:
@@ -353,12 +379,13 @@ def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray
 def _lines(path: Path) -> list[str]:
     """Return the lines without comments; an empty line means an image without features."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(path)
+    except OSError as error:
         raise UserError(
-            f"{path} cannot be read as text ({error}); export the COLMAP model again."
+            f"{path} cannot be read ({error.strerror}); export the COLMAP model again."
         ) from None
-    return [line.strip() for line in text.splitlines() if not line.startswith("#")]
+    lines = (line.strip(" \t") for line in lines_of(text))
+    return [line for line in lines if not line.startswith("#")]
 
 
 def _line_error(path: Path, line: str) -> UserError:
@@ -381,20 +408,68 @@ def _cameras_text(path: Path) -> dict[int, Camera]:
 
 
 def _images_text(path: Path) -> list[_Image]:
-    lines = _lines(path)
-    while lines and not lines[0]:
-        lines.pop(0)
-    out = []
-    for line, features in itertools.zip_longest(lines[::2], lines[1::2], fillvalue=""):
-        if not line:
-            continue
-        words = line.split(maxsplit=9)
-        try:
-            numbers = [float(w) for w in words[1:8]]
-            camera, name = int(words[8]), words[9]
-            observed = np.array([int(w) for w in features.split()[2::3]], np.int64)
-        except (ValueError, IndexError, OverflowError):
-            raise _line_error(path, line) from None
-        pose = _pose(numbers[:4], numbers[4:], name, str(path))
-        out.append(_Image(name, camera, pose, observed))
-    return out
+    """Read pairs of lines, an image and its features, which may be an empty line.
+
+    Tools that write or edit such files by hand add empty lines or leave the features out, so every
+    line is recognised by its words instead of its position.
+    """
+    lines = iter([*_lines(path), ""])
+    out: list[_Image] = []
+    line = next(lines)
+    try:
+        while True:
+            if not line:
+                line = next(lines)
+                continue
+            image = _image_line(line, path)
+            line, following = next(lines), line
+            if _is_image_line(line):
+                out.append(image)
+                continue
+            out.append(image._replace(points=_features(line, following, path)))
+            line = next(lines)
+    except StopIteration:
+        return out
+
+
+def _is_image_line(line: str) -> bool:
+    """Return whether a line describes an image: ten words, of which the last is no number."""
+    words = line.split(maxsplit=9)
+    if len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
+        return False
+    if not all(map(_is_number, words[1:8])):
+        return False
+    return not (_is_number(words[9].split()[-1]) and len(line.split()) % 3 == 0)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _image_line(line: str, path: Path) -> _Image:
+    words = line.split(maxsplit=9)
+    try:
+        numbers = [float(w) for w in words[1:8]]
+        camera, name = int(words[8]), words[9]
+    except (ValueError, IndexError, OverflowError):
+        raise _line_error(path, line) from None
+    name = _checked_name(name, path)
+    return _Image(name, camera, _pose(numbers[:4], numbers[4:], name, str(path)), None)
+
+
+def _features(line: str, image: str, path: Path) -> Int[np.ndarray, " k"]:
+    """Return the point ids of a line of features, which are triples (x, y, point id)."""
+    words = line.split()
+    try:
+        if len(words) % 3:
+            raise ValueError
+        return np.array([int(w) for w in words[2::3]], np.int64)
+    except (ValueError, OverflowError):
+        raise UserError(
+            f"{path} has after the image {image.split()[-1]!r} a line that is neither its features"
+            f" (x, y, point id) nor another image: {line[:60]!r}; export the COLMAP model again."
+        ) from None

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.label_spaces import CITYSCAPES_IDS, TRAIN_IDS
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.text import frame_rows, keyed_lines, parse_array
@@ -114,13 +115,17 @@ def read_kitti360(path: Path, frames: tuple[int, int] | None = None) -> Capture:
             " --frames FIRST:LAST, such as --frames 1538:1601."
         )
     labelled = any(v.label_path for v in views)
-    left_out = f"{unposed} images of {drive} have no pose; they are left out."
+    left_out = Finding(
+        "photo-without-pose",
+        f"{unposed} images of {drive} have no pose; they are left out",
+        severity="note",
+    )
     return Capture(
         root=root,
         source="kitti360",
         cameras=tuple(cameras),
         views=tuple(views),
-        warnings=(left_out,) if unposed else (),
+        findings=(left_out,) if unposed else (),
         metric=True,
         label_space=CITYSCAPES_IDS if labelled else TRAIN_IDS,
     )

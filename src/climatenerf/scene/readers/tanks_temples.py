@@ -15,6 +15,7 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.scene.findings import Finding
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.text import parse_numbers, text_lines
@@ -66,12 +67,13 @@ def read_tanks_temples(root: Path) -> Capture:
         cameras=(_camera(root / "intrinsics.txt", header.width, header.height),),
         views=views,
         predefined_split=any(v.split == "heldout" for v in views),
-        warnings=(
-            (f"{len(unposed)} images have no pose (first: {unposed[0]}); they are left out.",)
-            if unposed
-            else ()
-        ),
+        findings=_unposed(unposed) if unposed else (),
     )
+
+
+def _unposed(names: list[str]) -> tuple[Finding]:
+    message = f"{len(names)} images have no pose (first: {names[0]}); they are left out"
+    return (Finding("photo-without-pose", message),)
 
 
 def _pose(path: Path, name: str) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.text import lines_of, read_text
 
 
 def text_lines(path: Path) -> list[str]:
@@ -18,12 +19,12 @@ def text_lines(path: Path) -> list[str]:
         UserError: The file is missing or not text.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except FileNotFoundError:
         raise UserError(f"{path} is missing; restore it from the source of the capture.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read as text ({error}); replace it.") from None
-    return [line.strip() for line in text.splitlines() if line.strip()]
+    except OSError as error:
+        raise UserError(f"{path} cannot be read ({error.strerror}); replace it.") from None
+    return [line.strip() for line in lines_of(text) if line.strip()]
 
 
 def parse_numbers(line: str, path: Path) -> list[float]:

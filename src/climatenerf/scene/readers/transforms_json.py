@@ -3,7 +3,9 @@
 Poses are camera-to-world with OpenGL axes (x right, y up, z backward); columns 1 and 2 are negated
 on reading to give OpenCV axes. The frame of the file is the input frame. It already includes
 nerfstudio's `applied_transform`, which is not undone. instant-ngp's `scale` and `offset` concern
-its viewer and are not applied.
+its viewer and are not applied. Depth files are those of nerfstudio (`depth_file_path`,
+`depth_unit_scale_factor`) and of NeRFCapture, Record3D and Polycam (`depth_path`,
+`integer_depth_scale`).
 """
 
 from __future__ import annotations
@@ -15,16 +17,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.text import read_text
+from climatenerf.scene.file_names import FileNames, normalised
+from climatenerf.scene.findings import Finding, examples
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.ply import read_points
-from climatenerf.scene.scene import View
+from climatenerf.scene.scene import MILLIMETRES, View
 
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+_DEPTH_KEYS = ("depth_file_path", "depth_path")
+_DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
+_READ_PATHS = {"file_path", "mask_path", "ply_file_path", *_DEPTH_KEYS}
+# Coefficients of lens models that this program lacks; zero values change nothing.
+_UNREAD_NUMBERS = ("k5", "k6", "s1", "s2", "s3", "s4", "rolling_shutter_time")
 
 
 def transforms_files(root: Path) -> list[Path]:
@@ -55,22 +68,34 @@ def read_transforms(root: Path) -> Capture:
         by_name.pop(SPLIT_FILES[1], None)
     cameras: dict[Camera, int] = {}
     views: list[View] = []
-    points, predefined_split, unlisted = None, False, 0
+    points, predefined_split, unlisted, depth_scale = None, False, 0, None
+    files_below, transforms = FileNames(base), []
+    unread: dict[str, int] = {}
+    absent: list[str] = []
     for name, path in by_name.items():
         data = _load(path)
         train, heldout = _listed_split(data)
         predefined_split |= bool(train or heldout) or name in SPLIT_FILES
         for frame in data["frames"]:
-            view = _view(frame, data, base, path, cameras)
-            key = _normalised(frame["file_path"])
+            view = _view(frame, data, files_below, path, cameras)
+            for key in _unread_keys(frame, base):
+                unread[key] = unread.get(key, 0) + 1
+            absent += _absent(frame, view)
+            key = normalised(frame["file_path"])
             held_out = key in heldout or name in SPLIT_FILES[1:]
             if not train or key in train or held_out:
                 views.append(replace(view, split="heldout" if held_out else "train"))
             else:
                 unlisted += 1
-        cloud = data.get("ply_file_path")
-        if isinstance(cloud, str) and (base / cloud).is_file():
-            points = read_points(base / cloud)
+        for key in _unread_keys(data, base):
+            unread[key] = unread.get(key, 0) + 1
+        depth_scale = _depth_scale(data, str(path)) or depth_scale
+        transforms += _point_transforms(data)
+        if isinstance(cloud := data.get("ply_file_path"), str):
+            if (file := files_below.find(cloud)) is not None:
+                points = read_points(file)
+            else:
+                absent.append(cloud)
     if unlisted and not views:
         raise UserError(
             f"The lists of {files[0].name} (train_filenames, ...) name none of its frames; correct"
@@ -83,17 +108,92 @@ def read_transforms(root: Path) -> Capture:
         views=tuple(views),
         points=points if points is not None and len(points) else None,
         predefined_split=predefined_split,
-        warnings=(
-            (f"{unlisted} images are in none of the lists of {files[0].name}; they are left out.",)
-            if unlisted
-            else ()
+        findings=(
+            *_named_data_findings(files[0], unlisted, absent, unread),
+            *files_below.findings(),
         ),
+        depth_scale=depth_scale or MILLIMETRES,
+        point_transforms=tuple(transforms),
     )
+
+
+def _named_data_findings(
+    file: Path, unlisted: int, absent: list[str], unread: dict[str, int]
+) -> list[Finding]:
+    """Return findings about images in no list, absent files and keys that are not read."""
+    out = []
+    if unlisted:
+        message = f"{unlisted} images are in none of the lists of {file.name}; they are left out"
+        out.append(Finding("photo-unlisted", message, file=str(file)))
+    if absent:
+        message = f"{len(absent)} files that {file.name} names are not on disk ({examples(absent)})"
+        remedy = "restore them if they matter"
+        out.append(Finding("file-missing", message, remedy, file=str(file)))
+    if unread:
+        counts = [f"{key} of {n} entries" for key, n in unread.items()]
+        message = f"{file.name} has data that is not read: {examples(counts, 6)}"
+        remedy = "convert it to a key that docs/formats.md lists if it matters"
+        out.append(Finding("file-unread", message, remedy, file=str(file)))
+    return out
+
+
+def _unread_keys(table: dict[str, Any], base: Path) -> list[str]:
+    """Return the keys of a table that name a file on disk or a lens coefficient and are not read.
+
+    Other keys (`sharpness`, `colmap_im_id`, `aabb_scale`, time stamps) carry nothing that a fit
+    could use.
+    """
+    out = []
+    for key, value in table.items():
+        if key in _UNREAD_NUMBERS:
+            if isinstance(value, int | float) and value:
+                out.append(key)
+        elif key not in _READ_PATHS and isinstance(value, str) and 0 < len(value) < 1024:
+            is_path = "/" in value or "\\" in value or "." in value
+            if is_path and "\0" not in value and (base / normalised(value)).is_file():
+                out.append(key)
+    return out
+
+
+def _absent(frame: dict[str, Any], view: View) -> list[str]:
+    """Return the files, other than the photo, that a frame names and that are not on disk."""
+    named = next((frame[key] for key in _DEPTH_KEYS if isinstance(frame.get(key), str)), None)
+    return [named] if named is not None and view.depth_path is None else []
+
+
+def _depth_scale(data: dict[str, Any], where: str) -> float | None:
+    """Return the metres per unit of integer depth files, None if the file states none."""
+    for key in _DEPTH_SCALES:
+        value = data.get(key)
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise UserError(f"{key} in {where} is not a number; correct the file.")
+        if not 1e-9 < value < 1e3:
+            raise UserError(
+                f"{key} in {where} is {value:g}; it must be the metres per unit of the depth files,"
+                " such as 0.001, so correct it."
+            )
+        return float(value)
+    return None
+
+
+def _point_transforms(data: dict[str, Any]) -> list[Float[np.ndarray, "4 4"]]:
+    """Return `applied_transform`, which the poses include and a point cloud may lack."""
+    try:
+        given = np.array(data.get("applied_transform"), dtype=np.float64)
+    except (TypeError, ValueError):
+        return []
+    if given.shape not in ((3, 4), (4, 4)) or not np.isfinite(given).all():
+        return []
+    out = np.eye(4)
+    out[: len(given)] = given
+    return [out] if abs(np.linalg.det(out[:3, :3])) > 1e-6 else []
 
 
 def _load(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is not readable JSON ({error}); export it again.") from None
     frames = data.get("frames") if isinstance(data, dict) else None
@@ -105,43 +205,45 @@ def _load(path: Path) -> dict[str, Any]:
     return data
 
 
-def _normalised(file_path: str) -> str:
-    return file_path.replace("\\", "/").removeprefix("./")
-
-
 def _listed_split(data: dict[str, Any]) -> tuple[set[str], set[str]]:
     """Return the file paths listed for training and those listed for validation or testing."""
     names = {k: data.get(f"{k}_filenames") for k in ("train", "val", "test")}
     names = {k: v if isinstance(v, list) else [] for k, v in names.items()}
-    paths = {k: {_normalised(str(n)) for n in v} for k, v in names.items()}
+    paths = {k: {normalised(str(n)) for n in v} for k, v in names.items()}
     return paths["train"], (paths["val"] | paths["test"])
 
 
 def _view(
     frame: dict[str, Any],
     data: dict[str, Any],
-    base: Path,
+    files: FileNames,
     file: Path,
     cameras: dict[Camera, int],
 ) -> View:
-    relative = _normalised(frame["file_path"])
-    path = base / relative
+    relative = normalised(frame["file_path"])
+    path = files.find(relative) or files.folder / relative
     if not path.is_file() and path.suffix.lower() not in (s.lower() for s in _IMAGE_SUFFIXES):
-        found = [p for s in _IMAGE_SUFFIXES if (p := Path(f"{path}{s}")).is_file()]
-        path = found[0] if found else Path(f"{path}.png")
+        found = (files.find(f"{relative}{suffix}") for suffix in _IMAGE_SUFFIXES)
+        path = next((file for file in found if file is not None), Path(f"{path}.png"))
     name = relative.removeprefix("images/")
     name = name if Path(name).suffix == path.suffix else name + path.suffix
     pose = checked_pose(frame.get("transform_matrix"), name, str(file))
     pose[:3, 1:3] *= -1
     mask = frame.get("mask_path")
+    depths = [frame[key] for key in _DEPTH_KEYS if isinstance(frame.get(key), str)]
     camera = _camera(frame, data, path, str(file))
     return View(
         name=name,
         path=path,
         camera=cameras.setdefault(camera, len(cameras)),
         c2w=pose,
-        mask_path=base / _normalised(mask) if isinstance(mask, str) else None,
+        mask_path=_named(files, mask) if isinstance(mask, str) else None,
+        depth_path=files.find(depths[0]) if depths else None,
     )
+
+
+def _named(files: FileNames, name: str) -> Path:
+    return files.find(name) or files.folder / normalised(name)
 
 
 def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str) -> Camera:

@@ -1,0 +1,1 @@
+"""Checks of a capture against itself: its photos, intrinsics, poses, points and sidecars."""

@@ -1,0 +1,238 @@
+"""Poses and intrinsics held against the sparse points: do points fall into the photos?
+
+Where a capture records which photos show a point, nearly every such point falls into its photo.
+Otherwise a point falls into at least one photo. If few do, other conventions are tried: OpenGL's
+axes in place of OpenCV's, inverted poses, points in another frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from climatenerf.core.cameras import Camera
+from climatenerf.scene.checks.conventions import CONVENTIONS, with_poses
+from climatenerf.scene.checks.intrinsics import SAME_SHAPE, scaled_by, size_ratio
+from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.scene import Scene, View
+
+MAX_POINTS = 1000  # points a view; more change a share by less than two hundredths
+MAX_VIEWS = 48  # views of which other conventions are tried
+MIN_POINTS = 8  # seen points from which a view is judged
+FEW_SEEN = 0.5  # share of a photo's own points inside it below which its pose is in doubt
+FEW_UNION = 0.5  # share of all points inside any photo; a laser scan may reach far beyond them
+FEW_ALL = 0.05  # median share of all points inside a photo
+BETTER = 0.3  # share that another convention must gain to be taken
+SMALLER = 0.75  # of the middle: principal points of smaller photos; rarer crops reach it too
+STILL_INSIDE = 0.95  # of the share of points, with intrinsics scaled to the photo
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of the sparse points in front of the cameras and inside the photos, 0 to 1.
+
+    Attributes:
+        by_view: Of the view's own points where these are recorded, of all points otherwise; NaN
+            for a view with fewer than `MIN_POINTS` points.
+        union: Share of all points inside at least one photo.
+        recorded: Whether the capture records which photos show a point.
+    """
+
+    by_view: Float[np.ndarray, " v"]
+    union: float
+    recorded: bool
+
+    @property
+    def median(self) -> float:
+        """Median over the views; 0 if no view has points."""
+        known = self.by_view[np.isfinite(self.by_view)]
+        return float(np.median(known)) if len(known) else 0.0
+
+    @property
+    def agreement(self) -> float:
+        """One number to compare conventions by."""
+        return self.median if self.recorded else self.union
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether poses, intrinsics and points contradict each other."""
+        if self.recorded:
+            return self.median < FEW_SEEN
+        return self.union < FEW_UNION and self.median < FEW_ALL
+
+
+def point_shares(
+    cameras: Sequence[Camera],
+    views: Sequence[View],
+    points: Float[np.ndarray, "n 3"],
+) -> Shares:
+    """Measure how many points fall into the photos.
+
+    Args:
+        cameras: Intrinsics.
+        views: Photos with poses.
+        points: Sparse points in the frame of the poses.
+    """
+    recorded = any(view.seen is not None and len(view.seen) for view in views)
+    common = points[_spread(len(points), MAX_POINTS)]
+    inside_any = np.zeros(len(common), bool)
+    shares = np.full(len(views), np.nan)
+    for i, view in enumerate(views):
+        camera = cameras[view.camera]
+        if recorded:
+            seen = np.empty(0, np.int64) if view.seen is None else view.seen
+            own = points[seen[_spread(len(seen), MAX_POINTS)]]
+            if len(own) >= MIN_POINTS:
+                shares[i] = _inside(camera, view.c2w, own).mean()
+        else:
+            inside = _inside(camera, view.c2w, common)
+            inside_any |= inside
+            shares[i] = inside.mean()
+    union = float(np.nanmean(shares)) if recorded and np.isfinite(shares).any() else 0.0
+    return Shares(shares, union if recorded else float(inside_any.mean()), recorded)
+
+
+def _spread(count: int, limit: int) -> np.ndarray:
+    """Return up to `limit` indices, evenly spread."""
+    return np.arange(count) if count <= limit else np.arange(limit) * count // limit
+
+
+def _inside(
+    camera: Camera, c2w: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> np.ndarray:
+    local = (points - c2w[:3, 3]) @ c2w[:3, :3]
+    with np.errstate(all="ignore"):  # points at infinity overflow, and count as outside
+        pixel = camera.project(local)
+    x, y = pixel[:, 0], pixel[:, 1]
+    return (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Another reading of a capture's numbers.
+
+    Attributes:
+        code: Code of the finding.
+        message: What was wrong and is done about it.
+        scene: The scene under this reading.
+    """
+
+    code: str
+    message: str
+    scene: Scene
+
+
+def other_conventions(
+    scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]] = ()
+) -> list[Convention]:
+    """Return the readings that are tried if a capture contradicts itself."""
+    assert scene.points is not None
+    out = [
+        Convention("pose-axes", f"The poses {what}; they are converted", with_poses(scene, change))
+        for what, change in CONVENTIONS
+    ]
+    for transform in point_transforms:
+        for matrix in (transform, np.linalg.inv(transform)):
+            moved = scene.points @ matrix[:3, :3].T + matrix[:3, 3]
+            message = "The sparse points lack the applied_transform of the poses; it is applied"
+            out.append(Convention("points-frame", message, replace(scene, points=moved)))
+    return out
+
+
+def of_smaller_photos(scene: Scene) -> tuple[Scene, list[Finding]]:
+    """Return the scene with intrinsics scaled up if they belong to smaller photos.
+
+    A principal point at the same fraction of both sides, well above the middle, is that of a
+    smaller photo or of a crop. It is that of a smaller photo if the points still fall into the
+    photos with intrinsics that are scaled to put it into the middle.
+    """
+    assert scene.points is not None
+    cameras = []
+    for camera in scene.cameras:
+        across, down = 2 * camera.cx / camera.width, 2 * camera.cy / camera.height
+        small = 0 < max(across, down) < SMALLER and abs(across / down - 1) < SAME_SHAPE
+        cameras.append(scaled_by(camera, size_ratio(across, down)) if small else camera)
+    if tuple(cameras) == scene.cameras:
+        return scene, []
+    before = point_shares(scene.cameras, scene.views, scene.points).agreement
+    after = point_shares(cameras, scene.views, scene.points).agreement
+    if after < STILL_INSIDE * before:
+        return scene, []
+    old, new = next((a, b) for a, b in zip(scene.cameras, cameras, strict=True) if a != b)
+    message = (
+        f"The principal point ({old.cx:g}, {old.cy:g}) belongs to photos {old.cx / new.cx:.3g}"
+        f" times the size of these {old.width}x{old.height}; the intrinsics are scaled"
+    )
+    remedy = "give w and h of the photos that were calibrated, or correct the intrinsics"
+    finding = Finding("intrinsics-resolution", message, remedy)
+    return replace(scene, cameras=tuple(cameras)), [finding]
+
+
+def agreeing_convention(
+    scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]] = ()
+) -> tuple[Scene, Shares, list[Finding]]:
+    """Return the scene in the convention in which its points fall into its photos.
+
+    Args:
+        scene: Scene with points.
+        point_transforms: Transforms that the points may lack.
+
+    Returns:
+        The scene, the shares of its points, and what is odd.
+    """
+    assert scene.points is not None
+    scene, findings = of_smaller_photos(scene)
+    assert scene.points is not None
+    shares = point_shares(scene.cameras, scene.views, scene.points)
+    if not shares.doubtful:
+        return scene, shares, findings
+    chosen = _spread(len(scene.views), MAX_VIEWS)
+    best, best_shares = None, _shares_of(scene, chosen)
+    first = best_shares.agreement
+    for other in other_conventions(scene, point_transforms):
+        found = _shares_of(other.scene, chosen)
+        if not found.doubtful and found.agreement > max(best_shares.agreement, first + BETTER):
+            best, best_shares = other, found
+    what = "its own sparse points" if shares.recorded else "the sparse points"
+    if best is not None:
+        assert best.scene.points is not None
+        finding = Finding(
+            best.code,
+            f"{best.message} (inside a photo are then {best_shares.agreement:.0%} of {what},"
+            f" {first:.1%} before)",
+            "correct the file to keep it from being guessed",
+        )
+        scene = best.scene
+        return scene, point_shares(scene.cameras, scene.views, scene.points), [*findings, finding]
+    finding = Finding(
+        "points-outside",
+        f"Only {shares.agreement:.1%} of {what} lie inside a photo and in front of its camera",
+        "check that intrinsics, poses, points and photos belong together; a fit will be blurred",
+    )
+    return scene, shares, [*findings, finding]
+
+
+def _shares_of(scene: Scene, chosen: np.ndarray) -> Shares:
+    assert scene.points is not None
+    return point_shares(scene.cameras, [scene.views[i] for i in chosen], scene.points)
+
+
+def view_findings(scene: Scene, shares: Shares) -> list[Finding]:
+    """Return a finding about photos whose poses contradict their own points, unlike the others'."""
+    if not shares.recorded or shares.doubtful:
+        return []
+    wrong = [
+        view.name
+        for view, share in zip(scene.views, shares.by_view, strict=True)
+        if share < FEW_SEEN  # False for NaN
+    ]
+    if not wrong:
+        return []
+    message = (
+        f"Of {len(wrong)} photos less than half of their own sparse points lie inside them"
+        f" ({examples(wrong)})"
+    )
+    return [Finding("pose-disagrees", message, "remove these photos or compute their poses again")]

@@ -1,0 +1,119 @@
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from support.scene_builders import OPENGL
+from support.textured_scene import CAMERA, textured_scene
+
+from climatenerf.cli import main
+from climatenerf.scene.findings import CODES
+from climatenerf.scene.readers.ply import write_points
+
+ROOT = Path(__file__).resolve().parents[2]
+FAULTS = ROOT.parent / "shared" / "faults"
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A folder with transforms.json, and a function that writes it anew with changes."""
+    scene = textured_scene(tmp_path / "images", 12, seen=False)
+    write_points(tmp_path / "points.ply", scene.points)
+
+    def write(change=lambda pose: pose, **top):
+        frames = [
+            {
+                "file_path": f"images/{view.name}",
+                "transform_matrix": change(view.c2w @ OPENGL).tolist(),
+            }
+            for view in scene.views
+        ]
+        data = {"fl_x": CAMERA.fx, "fl_y": CAMERA.fy, "w": CAMERA.width, "h": CAMERA.height}
+        data |= {"ply_file_path": "points.ply", "frames": frames} | top
+        (tmp_path / "transforms.json").write_text(json.dumps(data))
+        return tmp_path
+
+    write()
+    return write
+
+
+def checked(folder, capsys):
+    status = main(["check", str(folder), "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_a_consistent_capture_has_no_findings(capture, capsys):
+    status, report = checked(capture(), capsys)
+    assert status == 0 and report["findings"] == []
+    assert report["used"]["photos"] == 12 and report["used"]["sparse points"] > 1000
+    assert main(["check", str(capture())]) == 0
+    assert "Nothing is odd." in capsys.readouterr().out
+
+
+def test_findings_have_code_severity_file_message_and_remedy(capture, capsys):
+    status, report = checked(capture(lambda pose: pose @ OPENGL), capsys)
+    (finding,) = report["findings"]
+    assert status == 0 and finding["code"] == "pose-axes"
+    assert set(finding) == {"code", "severity", "file", "message", "remedy"}
+    assert finding["severity"] == "warning" and finding["message"].endswith(".")
+
+
+def test_named_data_that_is_absent_or_not_read_is_told(capture, capsys):
+    folder = capture(ply_file_path="other.ply", semantics_path="images/000.png", k5=0.2)
+    _, report = checked(folder, capsys)
+    messages = {each["code"]: each["message"] for each in report["findings"]}
+    assert set(messages) == {"file-missing", "file-unread"}
+    assert "other.ply" in messages["file-missing"]
+    assert "semantics_path" in messages["file-unread"] and "k5" in messages["file-unread"]
+
+
+def test_an_unusable_capture_has_status_2_and_one_sentence(tmp_path, capsys):
+    assert main(["check", str(tmp_path / "absent")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    status, report = checked(tmp_path / "absent", capsys)
+    assert status == 2 and [each["code"] for each in report["findings"]] == ["unreadable"]
+
+
+def test_fit_export_and_scene_file_tell_the_same(capture, tmp_path, capsys):
+    folder = capture(lambda pose: pose @ OPENGL)
+    assert main(["export", str(folder), "-o", str(tmp_path / "out")]) == 0
+    assert "OpenGL's camera axes" in capsys.readouterr().err
+    again = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    (tmp_path / "out" / "images").mkdir()
+    for path in (folder / "images").iterdir():
+        shutil.copy(path, tmp_path / "out" / "images")
+    assert len(again["frames"]) == 12
+    assert main(["check", str(tmp_path / "out")]) == 0
+    assert "Nothing is odd." in capsys.readouterr().out
+
+
+def test_the_guide_lists_every_code():
+    listed = re.findall(r"^\| `([\w-]+)` \|", (ROOT / "docs/guide/check.md").read_text(), re.M)
+    assert listed == list(CODES)
+
+
+@pytest.mark.skipif(not FAULTS.is_dir(), reason="the folder of faulty inputs is absent")
+@pytest.mark.parametrize(
+    ("folder", "codes"),
+    [
+        ("01-bom-crlf/scene", []),
+        ("01-bom-crlf/scene_json", []),
+        ("02-parent-folder/project/nerf", []),
+        ("03-no-second-lines/scene", ["model-lines"]),
+        ("03-no-second-lines/scene_blank", []),
+        ("04-narrow-space/scene", []),
+        ("06-nfd-names/scene", ["name-normalised"]),
+        ("07-no-size/scene", ["intrinsics-resolution"]),
+        ("10-outlier/scene", ["pose-outlier"]),
+        ("11-nerfcapture/scene", []),
+        ("13-sky-65535/scene", ["depth-disagrees", "depth-saturated"]),
+    ],
+)
+def test_situations_from_public_reports(folder, codes, capsys):
+    status, report = checked(FAULTS / folder, capsys)
+    found = sorted(each["code"] for each in report["findings"])
+    assert status == 0 and found == codes
+    photos = 11 if "outlier" in folder else 12
+    assert report["used"]["photos"] == photos
+    assert report["used"]["depths"] == (12 if "11-" in folder or "13-" in folder else 0)
