@@ -127,6 +127,33 @@ def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray
     return np.searchsorted(_LINEAR_EDGES, linear).astype(np.uint8)
 
 
+def load_grey(view: View, scene: Scene, side: int) -> UInt8[np.ndarray, "h w"]:
+    """Load a view's image as 8-bit grey, reduced to at most `side` pixels along the longer side.
+
+    JPEG files are decoded at a reduced size, which is several times faster. Sizes are those of
+    `camera.resized(...)` with both sides rounded.
+
+    Raises:
+        UserError: The image cannot be read, or its size differs from its camera's.
+    """
+    camera = scene.cameras[view.camera]
+    factor = min(1.0, side / max(camera.width, camera.height))
+    size = round(camera.width * factor), round(camera.height * factor)
+    try:
+        with Image.open(view.path) as image:
+            header = _header(image)
+            rotated = header.rotates_to_fit(camera)
+            if not rotated and image.size != (camera.width, camera.height):
+                raise _size_error(view.path, *image.size, camera)
+            image.draft("L", size[::-1] if rotated else size)
+            grey = image.convert("L")
+    except _IMAGE_ERRORS as error:
+        raise _image_error(view.path, error) from None
+    if rotated:
+        grey = grey.transpose(EXIF_TRANSPOSES[header.orientation])
+    return np.asarray(grey.resize(size, Image.Resampling.BOX))
+
+
 def load_labels(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray, "h w"] | None:
     """Load a view's labels as Cityscapes train ids, 255 unknown; None if it has none.
 

@@ -11,13 +11,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 from scipy import ndimage
 
 from climatenerf.core.cameras import Camera
 from climatenerf.scene.checks.conventions import CONVENTIONS, Pose, with_poses
 from climatenerf.scene.findings import Finding
-from climatenerf.scene.images import load_image
+from climatenerf.scene.images import load_grey
 from climatenerf.scene.scene import Scene, View
 
 PAIRS = 6
@@ -136,12 +135,8 @@ def _described(
     scene: Scene, view: View
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n d"], Camera]:
     """Return corners (x, y) of a reduced photo, their normalised patches, and its camera."""
-    camera = scene.cameras[view.camera]
-    grey = Image.fromarray(load_image(view, scene)).convert("L")
-    factor = min(1.0, SIDE / max(camera.width, camera.height))
-    camera = camera.resized(round(camera.width * factor), round(camera.height * factor))
-    small = grey.resize((camera.width, camera.height), Image.Resampling.BOX)
-    values = np.asarray(small, np.float32)
+    values = load_grey(view, scene, SIDE).astype(np.float32)
+    camera = scene.cameras[view.camera].resized(values.shape[1], values.shape[0])
     dy, dx = (ndimage.gaussian_filter(values, 1.0, order) for order in ((1, 0), (0, 1)))
     xx, yy, xy = (ndimage.gaussian_filter(v, 1.5) for v in (dx * dx, dy * dy, dx * dy))
     strength = xx * yy - xy * xy - 0.05 * (xx + yy) ** 2
