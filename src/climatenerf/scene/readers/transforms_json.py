@@ -24,7 +24,7 @@ from climatenerf.scene.scene import View
 
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".heic", ".HEIC")
 
 
 def transforms_files(root: Path) -> list[Path]:
