@@ -11,8 +11,10 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.scene.alignment.scale import rescale_by_camera_height
 from climatenerf.scene.alignment.world_frame import align_scene
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import Header, read_header
 from climatenerf.scene.label_spaces import checked_label_space
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
@@ -26,7 +28,6 @@ from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_spl
 HOLDOUT_EVERY = 8
 MIN_IMAGES = 3
 MAX_ROUND_TRIP = 0.5  # pixels: error of inverting the lens distortion that is worth a warning
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def read_scene(
@@ -150,7 +151,7 @@ def _read_capture(path: Path, frames: tuple[int, int] | None) -> Capture:
 
 
 def _has_images(folder: Path) -> bool:
-    return any(p.suffix.lower() in _SUFFIXES for p in folder.iterdir())
+    return any(p.suffix.lower() in PHOTO_SUFFIXES for p in visible(folder.iterdir()))
 
 
 def _check_images(capture: Capture) -> Capture:
@@ -266,8 +267,8 @@ def _sidecar_warnings(root: Path, views: Sequence[View]) -> list[str]:
         count, folder = sum(path is not None for path in paths), root / name
         if count == len(views) or not folder.is_dir():
             continue
-        suffixes = {*_SUFFIXES, ".npz", ".npy"}
-        if any(p.suffix.lower() in suffixes for p in folder.rglob("*")):
+        suffixes = {*PHOTO_SUFFIXES, ".npz", ".npy"}
+        if any(p.suffix.lower() in suffixes for p in visible(folder.rglob("*"), folder)):
             out.append(
                 f"Only {count} of {len(views)} images have a file in {name}/; name each file after "
                 f"its image and store it as {formats}."
