@@ -7,17 +7,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.hdr_signals import CHART, patches
 from support.photo_builders import exif, photo
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.hdr import KNEE
+from climatenerf.core.srgb import to_linear
+from climatenerf.scene import image_files
+from climatenerf.scene.images import to_rgb
 from climatenerf.sfm import photo_import as module
-from climatenerf.sfm.photo_import import import_photos, open_upright, sharpness, small_grey
+from climatenerf.sfm import video as video_module
+from climatenerf.sfm.photo_import import import_photos, open_upright
 from climatenerf.sfm.reconstruct import (
     EXHAUSTIVE_UP_TO,
     camera_groups,
     image_pairs,
     retry_pairs,
 )
+from climatenerf.sfm.video import sharpness, small_grey
 
 
 def no_progress(*_):
@@ -126,13 +133,13 @@ def test_too_few_usable_pictures_name_the_cause(tmp_path):
 def test_large_pictures_are_reduced_and_huge_ones_refused(tmp_path, monkeypatch):
     fill(tmp_path / "in", 3)
     monkeypatch.setattr(module, "MAX_SIDE", 100)
-    monkeypatch.setattr(module, "MAX_PIXELS", 100_000)
+    monkeypatch.setattr(image_files, "MAX_PIXELS", 100_000)
     photo(tmp_path / "in" / "large.jpg", (300, 150))
     photo(tmp_path / "in" / "huge.png", (600, 400))
     imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
     large = next(p for p in imported.pictures if p.source == "large.jpg")
     assert (large.width, large.height) == (100, 50)
-    assert "600x400" in imported.unusable["huge.png"] or "exceeds" in imported.unusable["huge.png"]
+    assert "huge.png has 600x400 pixels, above the limit" in imported.unusable["huge.png"]
 
 
 def test_second_run_reads_only_changed_files(tmp_path, monkeypatch):
@@ -179,7 +186,7 @@ def video(tmp_path):
 
 
 def test_sharpest_frame_of_each_interval_is_used(video, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "VIDEO_FRAMES", 6)
+    monkeypatch.setattr(video_module, "VIDEO_FRAMES", 6)
     imported = import_photos(video, tmp_path / "work", no_progress)
     assert imported.is_video and 5 <= len(imported.pictures) <= 7
     sharp = [p.sharpness for p in imported.pictures]
@@ -237,7 +244,7 @@ def test_damaged_exif_does_not_fail(tmp_path, kind):
             changed[at % len(changed)] = rng.integers(256)
         (tmp_path / f"a.{kind}").write_bytes(changed)
         try:
-            image, found = open_upright(tmp_path / f"a.{kind}")
+            image, found, _ = open_upright(tmp_path / f"a.{kind}")
         except UserError:
             continue
         assert image.mode == "RGB" and 1 <= found.orientation <= 8
@@ -258,7 +265,59 @@ def test_pictures_of_every_mode_are_rotated_once(tmp_path, kind, mode):
     data = Image.Exif()
     data[0x0112] = 6
     image.save(tmp_path / f"a.{kind}", exif=data)
-    shown, _ = open_upright(tmp_path / f"a.{kind}")
+    shown = open_upright(tmp_path / f"a.{kind}").image
     assert shown.size == (30, 40)
     assert min(shown.getpixel((26, 3))) > 200 and max(shown.getpixel((3, 3))) < 60
     assert max(shown.getpixel((26, 36))) < 60
+
+
+@pytest.mark.parametrize("name", ["HLG", "PQ"])
+def test_hdr_photos_are_tone_mapped_and_told_once(tmp_path, name):
+    """A chart of 10 bits with an nclx box, written by pillow-heif 1.8."""
+    pytest.importorskip("pi_heif")
+    for i in range(3):
+        chart = Path(__file__).with_name(f"chart-{name.lower()}.heic")
+        photo(tmp_path / "in" / f"{i}.jpg", seed=i)
+        shutil.copy(chart, tmp_path / "in" / f"chart{i}.HIF")
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    assert imported.notes == (f"3 of 6 photos are HDR ({name}); they are tone-mapped to sRGB.",)
+    one = next(p for p in imported.pictures if p.source == "chart0.HIF")
+    found = patches(Image.open(imported.folder / one.name), 16)
+    below = to_linear(CHART / 255).max(axis=1) <= KNEE
+    assert np.abs(found - CHART)[below].max() <= 3
+    again = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    assert again.pictures == imported.pictures and again.notes == imported.notes
+    large, _, _ = open_upright(tmp_path / "in" / "chart0.HIF")
+    assert large.size == (96, 64)
+
+
+def test_hdr_photos_are_reduced(monkeypatch):
+    pytest.importorskip("pi_heif")
+    monkeypatch.setattr(module, "MAX_SIDE", 48)
+    small = open_upright(Path(__file__).with_name("chart-hlg.heic")).image
+    assert small.size == (48, 32)
+    assert np.abs(np.asarray(small)[4, 4].astype(int) - CHART[0]).max() <= 3
+
+
+def test_gain_maps_are_told_once_and_not_used(tmp_path):
+    for i in range(3):
+        xmp = b'<rdf:Description hdrgm:Version="1.0"/>'
+        photo(tmp_path / "in" / f"{i}.jpg", seed=i, xmp=xmp)
+    imported = import_photos(tmp_path / "in", tmp_path / "work", no_progress)
+    (note,) = imported.notes
+    assert "3 of 3 photos have an HDR gain map, which is not used" in note
+
+
+@pytest.mark.parametrize("mode", ["I;16", "RGBA", "LA", "P", "CMYK", "L", "RGB", "1"])
+def test_reduction_of_each_mode_equals_that_of_its_rgb_picture(mode, monkeypatch):
+    monkeypatch.setattr(module, "MAX_SIDE", 90)
+    rng = np.random.default_rng(0)
+    if mode == "I;16":
+        image = Image.fromarray(rng.integers(0, 65536, (300, 700)).astype(np.uint16))
+    else:
+        image = Image.fromarray(rng.integers(0, 256, (300, 700, 3), dtype=np.uint8)).convert(mode)
+    if mode == "RGBA":
+        image.putalpha(Image.fromarray(rng.integers(0, 256, (300, 700), dtype=np.uint8)))
+    whole = Image.fromarray(to_rgb(image))
+    whole.thumbnail((90, 90), Image.Resampling.LANCZOS, reducing_gap=3.0)
+    np.testing.assert_array_equal(module._reduced(image).convert("RGB"), whole)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
 
+from climatenerf.core.listing import is_passed_over
 from climatenerf.scene.findings import Finding, examples
 
 MAX_FILES = 200_000
@@ -125,6 +126,8 @@ def _files(folder: Path) -> Iterator[str]:
         visited.add(real)
         base = Path(parent).relative_to(folder).as_posix()
         for name in names:
+            if is_passed_over(name):
+                continue
             count += 1
             if count > MAX_FILES:
                 return

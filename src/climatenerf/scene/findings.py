@@ -16,6 +16,7 @@ CODES: dict[str, str] = {
     "photo-without-pose": "Photos on disk have no pose; they are left out.",
     "photo-unlisted": "Photos are in none of the capture's lists of a split; they are left out.",
     "photo-alpha": "Photos have an alpha channel, which is ignored.",
+    "photo-hdr": "Photos are HDR (HLG or PQ); they are tone-mapped to sRGB.",
     "photo-resized": "Photos differ in size from their cameras; the intrinsics are scaled.",
     "name-normalised": "Names in the pose files and on disk differ in their spelling; matched.",
     "name-ambiguous": "A name in the pose files matches several files on disk.",

@@ -14,6 +14,13 @@ from PIL import Image
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.srgb import to_linear
+from climatenerf.scene.image_files import (
+    differs_from_srgb,
+    hdr_of,
+    hdr_to_srgb,
+    open_image,
+    profile_to_srgb,
+)
 from climatenerf.scene.label_spaces import to_train_ids
 from climatenerf.scene.scene import MILLIMETRES, Scene, View
 
@@ -34,13 +41,21 @@ EXIF_TRANSPOSES = {
 _SWAPS_SIDES = (5, 6, 7, 8)  # orientations that exchange width and height
 # Direction of the displayed image's top in stored pixels, (x, y) with y down, by EXIF orientation.
 _DISPLAYED_UP = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-_ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
-_IMAGE_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
+ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
+_IMAGE_ERRORS = (
+    OSError,
+    ValueError,
+    SyntaxError,
+    EOFError,
+    RuntimeError,  # of the HEIC decoder
+    Image.DecompressionBombError,
+)
 _ARRAY_ERRORS = (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error)
 
 # Linear light of each 8-bit value, and the midpoints between consecutive values for re-encoding.
 _LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
 _LINEAR_EDGES = to_linear((np.arange(255) + 0.5) / 255).astype(np.float32)
+_STRIP = 1 << 20  # pixels of an image that are converted at once
 
 
 @dataclass(frozen=True)
@@ -51,13 +66,15 @@ class Header:
         width: Stored width, pixels.
         height: Stored height, pixels.
         alpha: Whether the image has an alpha channel or a transparent colour.
-        orientation: EXIF orientation, 1 to 8; 1 if absent.
+        orientation: EXIF orientation, 1 to 8; 1 if absent, and for HEIC, which is decoded upright.
+        hdr: Whether the image has an HDR signal (HLG or PQ), which loading tone-maps.
     """
 
     width: int
     height: int
     alpha: bool
     orientation: int
+    hdr: bool = False
 
     def rotates_to_fit(self, camera: Camera) -> bool:
         """Return whether loading rotates the image by 90 degrees to match the camera's size.
@@ -82,7 +99,7 @@ def read_header(path: Path) -> Header:
         UserError: The file is missing or is not an image that Pillow can read.
     """
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return _header(image)
     except _IMAGE_ERRORS as error:
         raise _image_error(path, error) from None
@@ -91,10 +108,10 @@ def read_header(path: Path) -> Header:
 def focal_35mm(path: Path) -> float | None:
     """Return EXIF's FocalLengthIn35mmFilm, mm; None if absent or the image is unreadable."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             value = image.getexif().get_ifd(_EXIF_TAG).get(_FOCAL_35MM_TAG)
             number = float(value) if value else 0.0
-    except (*_IMAGE_ERRORS, TypeError, ZeroDivisionError):
+    except (*_IMAGE_ERRORS, TypeError, ZeroDivisionError, UserError):
         return None
     return number if 0 < number < 1e4 else None
 
@@ -103,8 +120,9 @@ def _header(image: Image.Image) -> Header:
     orientation = image.getexif().get(_ORIENTATION_TAG, 1)
     return Header(
         *image.size,
-        alpha=image.mode in _ALPHA_MODES or "transparency" in image.info,
+        alpha=image.mode in ALPHA_MODES or "transparency" in image.info,
         orientation=orientation if isinstance(orientation, int) else 1,
+        hdr=hdr_of(image) is not None,
     )
 
 
@@ -112,7 +130,8 @@ def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray
     """Load a view's image as 8-bit sRGB, averaged over `downscale` x `downscale` pixels.
 
     The average is taken in linear light. Alpha is dropped (use a mask to exclude pixels), grey
-    becomes RGB and 16-bit images are reduced to 8 bits. EXIF orientation is ignored unless only the
+    becomes RGB and 16-bit images are reduced to 8 bits. HDR (HLG, PQ) is tone-mapped, and colour
+    profiles that differ from sRGB are converted. EXIF orientation is ignored unless only the
     rotated image has the camera's size. The result matches `downscaled_camera(camera, downscale)`.
 
     Raises:
@@ -123,8 +142,14 @@ def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray
     if downscale == 1:
         return values
     # A larger pixel integrates light, so the average is over linear values.
-    linear = _area_average(_LINEAR[values], downscale)
-    return np.searchsorted(_LINEAR_EDGES, linear).astype(np.uint8)
+    values = _crop(values, downscale)
+    out = np.empty((values.shape[0] // downscale, values.shape[1] // downscale, 3), np.uint8)
+    rows = max(1, _STRIP // (values.shape[1] * downscale))  # at once: floats take 12 bytes a pixel
+    for start in range(0, len(out), rows):
+        strip = values[start * downscale : (start + rows) * downscale]
+        linear = _area_average(_LINEAR[strip], downscale)
+        out[start : start + rows] = np.searchsorted(_LINEAR_EDGES, linear)
+    return out
 
 
 def load_grey(view: View, scene: Scene, side: int) -> UInt8[np.ndarray, "h w"]:
@@ -140,7 +165,7 @@ def load_grey(view: View, scene: Scene, side: int) -> UInt8[np.ndarray, "h w"]:
     factor = min(1.0, side / max(camera.width, camera.height))
     size = round(camera.width * factor), round(camera.height * factor)
     try:
-        with Image.open(view.path) as image:
+        with open_image(view.path) as image:
             header = _header(image)
             rotated = header.rotates_to_fit(camera)
             if not rotated and image.size != (camera.width, camera.height):
@@ -336,36 +361,51 @@ def downscaled_camera(camera: Camera, downscale: int) -> Camera:
 
 def to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
     """Convert an image of any mode to 8-bit RGB, dropping alpha without compositing."""
-    if image.mode in _ALPHA_MODES or "transparency" in image.info:
+    if image.mode in ALPHA_MODES or "transparency" in image.info:
         # Pillow's conversion to RGB via RGBA keeps the stored colours of transparent pixels.
         image = image.convert("RGBA")
     if image.mode.startswith("I") or image.mode == "F":
-        values = np.asarray(image, dtype=np.float64)
-        top = 255.0 if values.max(initial=0.0) <= 255 and image.mode != "I;16" else 65535.0
-        grey = np.rint(np.clip(values / top, 0, 1) * 255).astype(np.uint8)
-        return np.repeat(grey[..., None], 3, axis=-1)
+        return np.repeat(wide_grey_to_8_bits(image)[..., None], 3, axis=-1)
     return np.array(image.convert("RGB"))
+
+
+def wide_grey_to_8_bits(image: Image.Image) -> UInt8[np.ndarray, "h w"]:
+    """Reduce a grey image of more than 8 bits to 8 bits, in strips that bound the memory."""
+    grey = np.asarray(image)
+    top = 255.0 if image.mode != "I;16" and grey.max(initial=0) <= 255 else 65535.0
+    out = np.empty(grey.shape, np.uint8)
+    rows = max(1, _STRIP // max(grey.shape[1], 1))
+    for start in range(0, len(grey), rows):
+        strip = grey[start : start + rows].astype(np.float64)
+        out[start : start + rows] = np.rint(np.clip(strip / top, 0, 1) * 255)
+    return out
 
 
 def _read_image(path: Path) -> Image.Image:
     """Read and decode an image as stored."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             image.load()
-            return image.copy()
+            return image
     except _IMAGE_ERRORS as error:
         raise _image_error(path, error) from None
 
 
 def _read_posed_image(path: Path, camera: Camera) -> Image.Image:
-    """Read an image, rotated by its EXIF orientation only if that gives the camera's size."""
+    """Read an image in sRGB; rotate it by EXIF only if that gives the camera's size."""
     try:
-        with Image.open(path) as image:
-            image.load()
-            header = _header(image)
-            if header.rotates_to_fit(camera):
-                return image.transpose(EXIF_TRANSPOSES[header.orientation])
-            decoded = image.copy()
+        with open_image(path) as image:
+            header, hdr, profile = _header(image), hdr_of(image), image.info.get("icc_profile")
+            if hdr is not None:
+                decoded = hdr_to_srgb(image, hdr)
+            else:
+                image.load()
+                decoded = image
+                if profile and differs_from_srgb(profile):
+                    decoded = profile_to_srgb(Image.fromarray(to_rgb(image)), profile)
+            # A TIFF decoder rotates the picture itself.
+            if header.rotates_to_fit(camera) and decoded.size == (header.width, header.height):
+                decoded = decoded.transpose(EXIF_TRANSPOSES[header.orientation])
     except _IMAGE_ERRORS as error:
         raise _image_error(path, error) from None
     if decoded.size != (camera.width, camera.height):

@@ -12,11 +12,13 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.scene.alignment.scale import rescale_by_camera_height
 from climatenerf.scene.alignment.world_frame import align_scene
 from climatenerf.scene.checks.check import corrected
 from climatenerf.scene.checks.sidecars import sidecar_findings, unused_findings
 from climatenerf.scene.findings import Finding, without_repeats
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import Header, read_header
 from climatenerf.scene.label_spaces import checked_label_space
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
@@ -30,7 +32,6 @@ from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_spl
 HOLDOUT_EVERY = 8
 MIN_IMAGES = 3
 MAX_ROUND_TRIP = 0.5  # pixels: error of inverting the lens distortion that is worth a warning
-_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
 
 def read_scene(
@@ -182,7 +183,7 @@ def _read_capture(path: Path, frames: tuple[int, int] | None) -> Capture:
 
 
 def _has_images(folder: Path) -> bool:
-    return any(p.suffix.lower() in _SUFFIXES for p in folder.iterdir())
+    return any(p.suffix.lower() in PHOTO_SUFFIXES for p in visible(folder.iterdir()))
 
 
 def _check_images(capture: Capture) -> Capture:
@@ -208,13 +209,14 @@ def _check_images(capture: Capture) -> Capture:
         if a.name == b.name:
             raise UserError(f"The image {a.name} has two poses; remove one of them.")
     cameras: dict[Camera, int] = {}
-    views, scaled, transparent = [], 0, 0
+    views, scaled, transparent, hdr = [], 0, 0, 0
     for view in present:
         camera = capture.cameras[view.camera]
         header = read_header(view.path)
         fitted = _fit_camera(view, camera, header)
         scaled += fitted != camera
         transparent += header.alpha
+        hdr += header.hdr
         views.append(replace(view, camera=cameras.setdefault(fitted, len(cameras))))
     if scaled:
         message = (
@@ -222,6 +224,9 @@ def _check_images(capture: Capture) -> Capture:
             "intrinsics are scaled"
         )
         findings.append(Finding("photo-resized", message))
+    if hdr:
+        message = f"{hdr} images are HDR (HLG or PQ) and are tone-mapped to sRGB"
+        findings.append(Finding("photo-hdr", message, severity="note"))
     if transparent:
         message = f"{transparent} images have an alpha channel, which is ignored"
         findings.append(Finding("photo-alpha", message, "use masks to exclude pixels"))
@@ -314,8 +319,8 @@ def _sidecar_findings(root: Path, views: Sequence[View]) -> list[Finding]:
         count, folder = sum(path is not None for path in paths), root / name
         if count == len(views) or not folder.is_dir():
             continue
-        suffixes = {*_SUFFIXES, ".npz", ".npy"}
-        if any(p.suffix.lower() in suffixes for p in folder.rglob("*")):
+        suffixes = {*PHOTO_SUFFIXES, ".npz", ".npy"}
+        if any(p.suffix.lower() in suffixes for p in visible(folder.rglob("*"), folder)):
             message = f"Only {count} of {len(views)} images have a file in {name}/"
             remedy = f"name each file after its image and store it as {formats}"
             out.append(Finding("sidecar-partial", message, remedy, file=str(folder)))

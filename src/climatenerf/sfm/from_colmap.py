@@ -5,10 +5,9 @@ import shutil
 from collections.abc import Collection
 from pathlib import Path
 
-from PIL import Image
-
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import explain, make_folder
+from climatenerf.scene.image_files import open_image
 from climatenerf.scene.readers.colmap import largest_model, read_colmap
 from climatenerf.sfm.diagnose import Unposed
 from climatenerf.sfm.exif import Exif, read_exif
@@ -78,7 +77,7 @@ def import_posed(
 
 def _picture(photos: Path, name: str) -> Picture:
     try:
-        with Image.open(photos / name) as image:
+        with open_image(photos / name) as image:
             exif, size = read_exif(image), image.size
     except Exception:  # the reader of the scene reports any damage
         exif, size = Exif(), (0, 0)

@@ -1,31 +1,34 @@
 """Import photos or frames of a video as upright JPEG pictures with their EXIF metadata."""
 
-import contextlib
-import errno
-import io
 import math
 import re
-import shutil
-import subprocess
-from collections.abc import Callable, Collection
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-import numpy as np
-from jaxtyping import UInt8
-from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+from PIL import ExifTags, Image, UnidentifiedImageError
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.storage import atomic_path, explain, make_folder, read_json, write_json
-from climatenerf.scene.images import EXIF_TRANSPOSES, to_rgb
+from climatenerf.core.storage import atomic_path, make_folder, read_json, write_json
+from climatenerf.scene.image_files import (
+    MissingDecoder,
+    has_gain_map,
+    hdr_of,
+    hdr_to_srgb,
+    open_image,
+    profile_to_srgb,
+)
+from climatenerf.scene.images import ALPHA_MODES, EXIF_TRANSPOSES, wide_grey_to_8_bits
 from climatenerf.sfm.exif import Exif, read_exif
 from climatenerf.sfm.photos import MIN_PHOTOS, find_photos, is_video, too_few_photos
+from climatenerf.sfm.video import extract_frames, sharpness, small_grey
 
 MAX_SIDE = 2000  # pixels; more than a radiance field resolves and than features need
-MAX_PIXELS = 400_000_000  # largest picture that is decoded: 1.2 GB in memory
 JPEG_QUALITY = 96
-VIDEO_FRAMES = 100  # intervals of a video; the sharpest frame of each is used
-CANDIDATES_PER_INTERVAL = 5  # decoded frames per interval
+GAIN_MAP = "gain map"
+CONVERSION = 2  # version of the conversion of photos; pictures of another are made anew
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class Picture:
         exif: metadata of the original file.
         sharpness: variance of the Laplacian of grey values at a width of 640 pixels.
         brightness: mean grey value, [0, 1].
+        hdr: "HLG" or "PQ" if the photo was tone-mapped, `GAIN_MAP` if it has one; "" for SDR.
     """
 
     name: str
@@ -49,6 +53,15 @@ class Picture:
     exif: Exif
     sharpness: float
     brightness: float
+    hdr: str = ""
+
+
+class Upright(NamedTuple):
+    """A photo upright in sRGB, its metadata, and `Picture.hdr`."""
+
+    image: Image.Image
+    exif: Exif
+    hdr: str
 
 
 @dataclass(frozen=True)
@@ -87,11 +100,13 @@ def import_photos(
         excluded: folders whose pictures are not photos. The parent of `work` is always excluded.
 
     Raises:
-        UserError: no photos, a video that cannot be decoded, or fewer than three usable pictures.
+        UserError: no photos, a video that cannot be decoded, fewer than three usable pictures, or
+            no decoder for HEIC.
     """
     video = is_video(source)
     if video:
-        files, base, notes = extract_frames(source, work / "frames", progress), work / "frames", ()
+        frames = extract_frames(source, work / "frames", MAX_SIDE, progress)
+        files, base, notes = frames.files, work / "frames", frames.notes
     else:
         found = find_photos(source, (work.parent, *excluded))
         files, base, notes = found.files, found.folder, found.notes
@@ -102,18 +117,36 @@ def import_photos(
         picture = _read_cached(path, folder / name)
         if picture is None:
             try:
-                image, exif = open_upright(path)
+                upright = open_upright(path)
+            except MissingDecoder:
+                raise
             except UserError as error:
                 unusable[_printable(path.relative_to(base))] = str(error)
             else:
-                picture = _write_picture(path, base, folder / name, image, exif)
+                picture = _write_picture(path, base, folder / name, upright)
         if picture is not None:
             pictures.append(picture)
         progress(index + 1, len(files))
     if len(pictures) < MIN_PHOTOS:
         why = f"; unusable: {next(iter(unusable.values()))}" if unusable else ""
         raise too_few_photos(source, len(pictures), why)
+    notes = (*notes, *_hdr_notes(pictures))
     return PhotoImport(folder, tuple(pictures), unusable, video, notes)
+
+
+def _hdr_notes(pictures: Sequence[Picture]) -> Iterator[str]:
+    counts = Counter(picture.hdr for picture in pictures)
+    for transfer in ("HLG", "PQ"):
+        if counts[transfer]:
+            yield (
+                f"{counts[transfer]} of {len(pictures)} photos are HDR ({transfer}); they are"
+                " tone-mapped to sRGB."
+            )
+    if counts[GAIN_MAP]:
+        yield (
+            f"{counts[GAIN_MAP]} of {len(pictures)} photos have an HDR gain map, which is not"
+            " used; their SDR pictures are."
+        )
 
 
 def _printable(path: Path) -> str:
@@ -140,29 +173,30 @@ def _read_cached(path: Path, out: Path) -> Picture | None:
     """Return the picture that an earlier run made of the same, unchanged photo; None if none."""
     try:
         record = read_json(out.with_suffix(".json"))
-        if record.pop("stamp") != [*_stamp(path), out.stat().st_size]:
+        if record.pop("stamp") != _stamp(path, out):
             return None
         return picture_from_json(record)
     except (UserError, OSError, ValueError, KeyError, TypeError):
         return None  # missing, incomplete or of an unknown version: convert the photo again
 
 
-def _write_picture(path: Path, base: Path, out: Path, image: Image.Image, exif: Exif) -> Picture:
+def _write_picture(path: Path, base: Path, out: Path, upright: Upright) -> Picture:
     """Write a picture and its JSON record to the work folder."""
+    image, exif, hdr = upright
     with atomic_path(out) as temporary:
         image.save(temporary, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
     grey = small_grey(image)
     source = _printable(path.relative_to(base))
     brightness = float(grey.mean() / 255)
-    picture = Picture(out.name, source, *image.size, exif, sharpness(grey), brightness)
-    stamp = [*_stamp(path), out.stat().st_size]
-    write_json(out.with_suffix(".json"), {**asdict(picture), "stamp": stamp})
+    picture = Picture(out.name, source, *image.size, exif, sharpness(grey), brightness, hdr)
+    write_json(out.with_suffix(".json"), {**asdict(picture), "stamp": _stamp(path, out)})
     return picture
 
 
-def _stamp(path: Path) -> list[int]:
-    """Return size and modification time of a file, to detect changes."""
-    return [path.stat().st_size, path.stat().st_mtime_ns]
+def _stamp(path: Path, out: Path) -> list[int]:
+    """Return what changes if a photo, its picture or the conversion does."""
+    photo = path.stat()
+    return [CONVERSION, photo.st_size, photo.st_mtime_ns, out.stat().st_size]
 
 
 def picture_from_json(data: dict) -> Picture:
@@ -176,43 +210,56 @@ def picture_from_json(data: dict) -> Picture:
     return Picture(**{**data, "exif": Exif(**exif)})
 
 
-def open_upright(path: Path) -> tuple[Image.Image, Exif]:
+def open_upright(path: Path) -> Upright:
     """Return a photo upright, in sRGB, with at most `MAX_SIDE` pixels per side; and its EXIF.
 
     Raises:
         UserError: the file is empty, damaged, not a picture, or too large to decode.
+        MissingDecoder: the file is HEIC and its decoder is not installed.
     """
     name = _printable(Path(path.name))
-    if path.suffix.lower() in (".heic", ".heif"):
-        _register_heif(name)
-    limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, MAX_PIXELS
     try:
         if path.stat().st_size == 0:
             raise UserError(f"{name} is empty")
-        # Open the file here: Pillow corrupts rotated TIFFs that it memory-maps by name.
-        with path.open("rb") as file, Image.open(file) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise UserError(
-                    f"{name} has {image.width}x{image.height} pixels, above the limit of"
-                    f" {MAX_PIXELS / 1e6:g} megapixels; make it smaller"
-                )
-            exif, profile = read_exif(image), image.info.get("icc_profile")
-            image.draft("RGB", (MAX_SIDE, MAX_SIDE))  # decodes a JPEG at a reduced size
-            image.load()
+        with open_image(path, name) as image:
+            exif, profile, hdr = read_exif(image), image.info.get("icc_profile"), hdr_of(image)
+            gain_map = has_gain_map(image)
+            if hdr is not None:
+                small, profile = hdr_to_srgb(image, hdr, MAX_SIDE), None
+            else:
+                image.draft("RGB", (MAX_SIDE, MAX_SIDE))  # decodes a JPEG at a reduced size
+                image.load()
+                small = _reduced(image)
             # A TIFF decoder rotates the picture itself and removes the tag.
             pending = image.getexif().get(ExifTags.Base.Orientation, 1) == exif.orientation
             transpose = EXIF_TRANSPOSES.get(exif.orientation) if pending else None
-            # Reduce the size first: each full copy of 200 megapixels takes 600 MB.
-            small = image if image.mode in ("RGB", "L") else Image.fromarray(to_rgb(image))
-            small.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS, reducing_gap=3.0)
             upright = small if transpose is None else small.transpose(transpose)
-            return _to_srgb(upright.convert("RGB"), profile), exif
+            upright = profile_to_srgb(upright.convert("RGB"), profile)
+            return Upright(upright, exif, hdr.transfer if hdr else GAIN_MAP if gain_map else "")
     except UserError:
         raise
     except Exception as error:  # decoders raise any exception for damaged files
         raise UserError(f"{name} {_cause(error)}") from error
-    finally:
-        Image.MAX_IMAGE_PIXELS = limit
+
+
+def _reduced(image: Image.Image) -> Image.Image:
+    """Return a decoded image as RGB or grey, reduced to `MAX_SIDE`; alpha is dropped.
+
+    No second copy of the full size is made for common modes: one of 400 megapixels takes 1.6 GB.
+    """
+    if image.mode in ("RGB", "L"):
+        return _thumbnail(image)
+    if image.mode.startswith("I") or image.mode == "F":
+        return _thumbnail(Image.fromarray(wide_grey_to_8_bits(image)))
+    if image.mode in ALPHA_MODES or "transparency" in image.info:
+        image = image if image.mode == "RGBA" else image.convert("RGBA")
+        return Image.merge("RGB", [_thumbnail(image.getchannel(band)) for band in "RGB"])
+    return _thumbnail(image.convert("RGB"))
+
+
+def _thumbnail(image: Image.Image) -> Image.Image:
+    image.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS, reducing_gap=3.0)
+    return image
 
 
 def _cause(error: Exception) -> str:
@@ -225,134 +272,6 @@ def _cause(error: Exception) -> str:
         return "may not be read; change its permissions"
     if isinstance(error, IsADirectoryError):
         return "is a folder with the name of a picture"
-    if isinstance(error, Image.DecompressionBombError):
-        return f"exceeds {MAX_PIXELS / 1e6:g} megapixels; make it smaller"
     if isinstance(error, MemoryError):
         return "needs more memory to decode than available; make it smaller"
     return "is damaged or cut off"
-
-
-def _to_srgb(image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert from the ICC profile's colour space (a phone's Display P3) to sRGB."""
-    if not profile:
-        return image
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        converted = ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"))
-        return converted or image
-    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
-        return image  # the profile is damaged or not for RGB (grey, CMYK)
-
-
-def _register_heif(name: str) -> None:
-    try:
-        import pi_heif
-    except ImportError as error:
-        raise UserError(
-            f'{name} is a HEIC file; run `pip install "climatenerf[capture]"` to read it'
-        ) from error
-    pi_heif.register_heif_opener()
-
-
-def small_grey(image: Image.Image) -> UInt8[np.ndarray, "h w"]:
-    """Return grey values at a width of 640 pixels, so that statistics are comparable."""
-    height = max(8, round(640 * image.height / image.width))
-    return np.asarray(image.convert("L").resize((640, height), Image.Resampling.BILINEAR))
-
-
-def sharpness(grey: UInt8[np.ndarray, "h w"]) -> float:
-    """Return the variance of the 4-neighbour Laplacian, without the border pixels."""
-    g = grey.astype(np.float32)
-    neighbours = g[:-2, 1:-1] + g[2:, 1:-1] + g[1:-1, :-2] + g[1:-1, 2:]
-    return float((neighbours - 4 * g[1:-1, 1:-1]).var())
-
-
-def extract_frames(video: Path, folder: Path, progress: Callable[[int, int], None]) -> list[Path]:
-    """Extract the sharpest frame of each of `VIDEO_FRAMES` intervals as numbered JPEG files.
-
-    Args:
-        video: the video file.
-        folder: folder for the frames; complete frames of an earlier run are reused.
-        progress: callback with (done, total).
-
-    Raises:
-        UserError: ffmpeg is missing or cannot decode the video, or the disk is full.
-    """
-    record_path = folder / "done.json"
-    stamp = _stamp(video)
-    with contextlib.suppress(UserError, KeyError):
-        frames, record = sorted(folder.glob("[0-9]*.jpg")), read_json(record_path)
-        if record["stamp"] == stamp and record["frames"] == len(frames):
-            return frames
-    try:
-        import imageio_ffmpeg
-
-        ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
-        count, seconds = imageio_ffmpeg.count_frames_and_secs(str(video))
-    except (ImportError, RuntimeError, OSError) as error:
-        raise UserError(
-            f"{video} cannot be decoded ({str(error).strip().splitlines()[-1]});"
-            " convert it to MP4 (H.264), or give photos instead"
-        ) from error
-    shutil.rmtree(folder, ignore_errors=True)
-    make_folder(folder)
-    if not count or not seconds or seconds <= 0:
-        raise UserError(f"{video} contains no frames; record it again, or give photos instead")
-    sampled = min(count, VIDEO_FRAMES * CANDIDATES_PER_INTERVAL)
-    # All frames of a short video are candidates: a higher rate would duplicate some.
-    rate = [] if sampled == count else [f"fps={sampled / seconds:.6f}"]
-    scale = ",".join([*rate, f"scale='min({MAX_SIDE},iw)':-2"])
-    command = [ffmpeg, "-y", "-loglevel", "error", "-nostdin", "-i", str(video), "-vf", scale]
-    command += ["-fps_mode", "passthrough", "-q:v", "2", str(folder / "candidate_%05d.jpg")]
-    message = _run_ffmpeg(command, folder, lambda: progress(_count(folder), 2 * sampled))
-    candidates = sorted(folder.glob("candidate_*.jpg"))
-    if not candidates:
-        raise UserError(
-            f"{video} cannot be decoded ({message}); convert it to MP4 (H.264), or give photos"
-            " instead"
-        )
-    frames = []
-    intervals = min(VIDEO_FRAMES, len(candidates))
-    for interval in np.array_split(np.array(candidates), intervals):
-        sharpest = max(interval, key=lambda path: sharpness(small_grey(Image.open(path))))
-        target = folder / f"{len(frames):04d}.jpg"
-        sharpest.rename(target)
-        frames.append(target)
-        progress(sampled + len(frames), sampled + intervals)
-    for path in folder.glob("candidate_*.jpg"):
-        path.unlink()
-    write_json(record_path, {"stamp": stamp, "frames": len(frames)})
-    return frames
-
-
-def _run_ffmpeg(command: list[str], folder: Path, on_wait: Callable[[], None]) -> str:
-    """Run ffmpeg and return the last line of its messages.
-
-    Args:
-        command: program and arguments.
-        folder: folder of the frames and, meanwhile, of the log.
-        on_wait: called about twice a second.
-
-    Raises:
-        UserError: the disk is full.
-    """
-    log = folder / "ffmpeg.log"
-    with log.open("wb") as file:
-        process = subprocess.Popen(command, stderr=file)
-    try:
-        while process.poll() is None:
-            on_wait()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(0.5)
-    finally:
-        process.kill()
-        process.wait()
-    messages = log.read_text(errors="replace").strip()
-    log.unlink()
-    if "No space left" in messages or (process.returncode and shutil.disk_usage(folder).free < 1e6):
-        raise explain(OSError(errno.ENOSPC, ""), folder)
-    return messages.splitlines()[-1] if messages else "no frame was decoded"
-
-
-def _count(folder: Path) -> int:
-    return sum(1 for _ in folder.glob("candidate_*.jpg"))

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import is_passed_over, visible
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.sfm.scene_folder import SIDECAR_KINDS, is_scene, walk_once
 
-PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".tif", ".tiff", ".webp", ".bmp"}
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp"}
 MIN_PHOTOS = 3
 
@@ -46,7 +47,7 @@ def find_photos(source: Path, excluded: Collection[Path]) -> Photos:
         source = source / "images"
     found = photos_in(source, excluded)
     if not found.files:
-        videos = sorted(p for p in source.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+        videos = sorted(p for p in visible(source.iterdir()) if p.suffix.lower() in VIDEO_SUFFIXES)
         remedy = f"the video itself, such as {videos[0]}" if videos else "the folder with photos"
         details = " ".join(("", *found.notes))
         raise UserError(
@@ -99,7 +100,7 @@ def photos_in(folder: Path, excluded: Collection[Path]) -> Photos:
     scenes: list[Path] = []
     sidecars: list[Path] = []
     for here, folders, names in walk_once(folder):
-        candidates = [here / name for name in folders if not name.startswith(".")]
+        candidates = [here / name for name in folders if not is_passed_over(name)]
         candidates = [path for path in candidates if path.resolve() not in excluded_folders]
         scenes += [path for path in candidates if is_scene(path)]
         if "images" in folders:
@@ -111,7 +112,7 @@ def photos_in(folder: Path, excluded: Collection[Path]) -> Photos:
 
 
 def _is_photo(name: str) -> bool:
-    return not name.startswith(".") and Path(name).suffix.lower() in PHOTO_SUFFIXES
+    return not is_passed_over(name) and Path(name).suffix.lower() in PHOTO_SUFFIXES
 
 
 def _notes(folder: Path, scenes: list[Path], sidecars: list[Path]) -> Iterator[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.core.storage import explain, make_folder
 from climatenerf.scene import Camera, Scene, read_scene, save_scene
 from climatenerf.scene.alignment.georeference import (
@@ -128,7 +129,7 @@ def check_settings(settings: CaptureSettings) -> None:
     if not settings.photos.exists():
         raise UserError(f"{settings.photos} does not exist; give a folder of photos or a video")
     for kind, folder in settings.sidecars.items():
-        if not (folder.is_dir() and any(folder.iterdir())):
+        if not (folder.is_dir() and any(visible(folder.iterdir()))):
             raise UserError(
                 f"--{kind} {folder} is missing or empty; give the folder with the {kind} files"
             )

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import is_system_file
 from climatenerf.core.storage import explain, make_folder, read_json, write_json
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import FILE_NAME
@@ -24,7 +25,6 @@ ENTRIES = (
     "images", "sparse", *SIDECAR_KINDS, FILE_NAME, "points.ply", "points_seen.npz", "report.md",
     "report.png", "mark.html",
 )  # fmt: skip
-IGNORED_NAMES = {".DS_Store", "Thumbs.db", "desktop.ini"}  # files that file managers create
 
 # Path in the scene folder -> valid digests of capture's file: one, or two while a new scene
 # replaces an old one.
@@ -74,7 +74,7 @@ def check_output(out: Path, given: Collection[str]) -> list[str]:
     user_files = []
     for path in _files(out):
         key = _key(path, out)
-        if path.name in IGNORED_NAMES or _digest(path) in record.get(key, ()):
+        if is_system_file(path.name) or _digest(path) in record.get(key, ()):
             continue
         kind = key.split("/")[0]
         if kind in given:

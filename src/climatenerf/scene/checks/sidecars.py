@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import is_passed_over
 from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.image_files import PHOTO_SUFFIXES, open_image
 from climatenerf.scene.images import SATURATED, load_depth, load_labels, load_mask
 from climatenerf.scene.scene import Scene, View
 
@@ -24,7 +25,6 @@ UNIT_TOLERANCE = 1.25  # of the scale; that of an assumed camera height is known
 MAX_SKY_POINTS = 0.5  # share of points on the sky; distant trees and wires make some
 MIN_HIDDEN_POINTS = 0.8  # share of points hidden by masks that are inverted
 SKY = 10  # Cityscapes train id
-_PHOTOS = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif"}
 
 
 def sidecar_findings(scene: Scene) -> list[Finding]:
@@ -161,9 +161,9 @@ def _saturated(path: Path | None) -> bool:
     if path is None or path.suffix.lower() != ".png":
         return False
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             extrema = image.getextrema()
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError, EOFError, UserError):
         return False  # reading it reports the error
     return isinstance(extrema[-1], int | float) and extrema[-1] == SATURATED
 
@@ -261,7 +261,7 @@ def unused_findings(scene: Scene, posed: Sequence[View]) -> list[Finding]:
         )
     for kind in ("labels", "masks", "depth"):
         folder = scene.root / kind
-        files = [path for path in _photos(folder, {*_PHOTOS, ".npy", ".npz"})]
+        files = [path for path in _photos(folder, {*PHOTO_SUFFIXES, ".npy", ".npz"})]
         extra = [path.name for path in files if str(path) not in used]
         if not extra or len(extra) == len(files):  # none used: `sidecar-partial` reports that
             continue
@@ -272,15 +272,14 @@ def unused_findings(scene: Scene, posed: Sequence[View]) -> list[Finding]:
     return findings
 
 
-def _photos(folder: Path, suffixes: set[str] = _PHOTOS) -> list[Path]:
+def _photos(folder: Path, suffixes: Collection[str] = PHOTO_SUFFIXES) -> list[Path]:
     try:
         with os.scandir(folder) as entries:
             names = sorted(entry.name for entry in entries if entry.is_file())
     except OSError:
         return []
-    hidden = ("._", ".")
     return [
         folder / name
         for name in names
-        if Path(name).suffix.lower() in suffixes and not name.startswith(hidden)
+        if Path(name).suffix.lower() in suffixes and not is_passed_over(name)
     ]

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.core.rotations import rotation_matrices
 from climatenerf.core.text import decode, lines_of, read_text
 from climatenerf.scene.file_names import FileNames
@@ -170,7 +171,7 @@ def _suffix(folder: Path) -> str | None:
 def _subfolders(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
-    found = [p for p in folder.iterdir() if p.is_dir()]
+    found = [p for p in visible(folder.iterdir()) if p.is_dir()]
     return sorted(found, key=lambda p: (len(p.name), p.name))
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.scene.findings import Finding
 from climatenerf.scene.label_spaces import CITYSCAPES_IDS, TRAIN_IDS
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
@@ -201,4 +202,4 @@ def _label(root: Path, drive: str, name: str, frame: int) -> Path | None:
     if official.is_file():
         return official
     predicted = (root / "pspnet" / drive).glob(f"*/*_{frame:010}.png")
-    return min(predicted, default=None) if name == CAMERAS[0] else None
+    return min(visible(predicted), default=None) if name == CAMERAS[0] else None

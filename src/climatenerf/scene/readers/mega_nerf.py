@@ -22,6 +22,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.scene import View
 
@@ -48,7 +49,7 @@ def read_mega_nerf(root: Path) -> Capture:
     cameras: dict[Camera, int] = {}
     views = []
     for folder, split in SPLITS.items():
-        for path in sorted((root / folder / "metadata").glob("*.pt")):
+        for path in sorted(visible((root / folder / "metadata").glob("*.pt"))):
             data = _load(path)
             stem = root / folder / "rgbs" / path.stem
             found = [p for s in _SUFFIXES if (p := stem.with_name(stem.name + s)).is_file()]

@@ -15,19 +15,20 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
 from climatenerf.scene.findings import Finding
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.text import parse_numbers, text_lines
 from climatenerf.scene.scene import View
 
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _TEST_PREFIXES = ("1_", "2_")
 
 
 def is_tanks_temples(root: Path) -> bool:
     """Return whether `root` has poses in this layout."""
-    return any((root / "pose").glob("*.txt"))
+    return any(visible((root / "pose").glob("*.txt")))
 
 
 def read_tanks_temples(root: Path) -> Capture:
@@ -41,8 +42,10 @@ def read_tanks_temples(root: Path) -> Capture:
     folder = next((f for f in (root / "rgb", root / "images") if f.is_dir()), None)
     if folder is None:
         raise UserError(f"{root} has poses but neither rgb/ nor images/; add the images.")
-    files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix in _SUFFIXES}
-    poses = {p.stem: p for p in sorted((root / "pose").glob("*.txt"))}
+    files = {
+        p.stem: p for p in sorted(visible(folder.iterdir())) if p.suffix.lower() in PHOTO_SUFFIXES
+    }
+    poses = {p.stem: p for p in sorted(visible((root / "pose").glob("*.txt")))}
     posed = [files[stem] for stem in poses if stem in files]
     if not posed:
         raise UserError(

@@ -32,7 +32,7 @@ from climatenerf.scene.scene import MILLIMETRES, View
 
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
+_IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".heic", ".HEIC")
 _DEPTH_KEYS = ("depth_file_path", "depth_path")
 _DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 _READ_PATHS = {"file_path", "mask_path", "ply_file_path", *_DEPTH_KEYS}
