@@ -96,8 +96,8 @@ def test_the_command_that_resumes_a_run_repeats_its_flags():
     ("words", "expected"),
     [
         (["--loss", "foo=1"], "Names: distortion"),
-        (["--loss", "sky"], "--loss wants"),
-        (["--loss", "sky=-1"], "--loss wants"),
+        (["--loss", "sky"], "--loss needs"),
+        (["--loss", "sky=-1"], "--loss needs"),
         (["--loss", "normal_consistency=1", "--loss", "normals=0"], "needs predicted normals"),
     ],
 )

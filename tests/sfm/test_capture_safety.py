@@ -233,7 +233,7 @@ def test_unusable_marks_leave_a_finished_scene_unchanged(posed, capsys, picture,
 @pytest.mark.parametrize(
     ("text", "message"),
     [("DOOR", "a name and a length"), ("DOOR=2", "no unit"), ("DOOR=-2 m", "above 0"),
-     ("DOOR=2 kg", "a length"), ("", "a name and a length"), ("=2 m", "wants a name"),
+     ("DOOR=2 kg", "a length"), ("", "a name and a length"), ("=2 m", "needs a name"),
      ("DOOR=2 m", "run this once without --known-length")],
 )  # fmt: skip
 def test_known_lengths_are_checked_first(posed, capsys, text, message):

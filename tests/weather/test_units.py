@@ -58,7 +58,7 @@ def test_refused(text, kind):
     with pytest.raises(UserError) as error:
         units.parse_quantity(text, kind, "--some.flag")
     assert str(error.value).startswith(
-        f'--some.flag wants {kind.name} such as "{kind.example}"; got "{text}"'
+        f'--some.flag must be {kind.name} such as "{kind.example}"; got "{text}"'
     )
 
 
@@ -93,7 +93,7 @@ def test_a_wrong_flag_is_one_clear_message_and_status_2(capsys):
         tyro.cli(Arguments, args=["--flood.level", "3 kg"])
     assert stop.value.code == 2
     shown = capsys.readouterr().err
-    assert '--flood.level: wants a length such as "0.5 m"; got "3 kg"' in shown
+    assert '--flood.level: must be a length such as "0.5 m"; got "3 kg"' in shown
     assert "Traceback" not in shown
 
 
