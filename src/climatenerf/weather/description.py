@@ -216,10 +216,3 @@ def _interpolate(frames: Keyframes, time: float) -> Any:
     if isinstance(a, tuple):
         return tuple((1 - fraction) * x + fraction * y for x, y in zip(a, b, strict=True))
     return (1 - fraction) * a + fraction * b
-
-
-def to_toml(table: Mapping[str, Any]) -> str:
-    """Return the text of a weather file for the tables of `weather_to_table`."""
-    import tomli_w
-
-    return tomli_w.dumps(table)
