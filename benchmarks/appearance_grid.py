@@ -64,9 +64,7 @@ def main() -> None:
                 row |= {key: scores[key] for key in ("psnr", "psnr_cc", "ssim", "seconds")}
                 rows.append(row | {"psnr_mean_appearance": in_mean["psnr"]})
                 print(rows[-1], file=sys.stderr)
-    report(
-        "held-out quality by appearance decay, table size and shown appearance", rows, options.seed
-    )
+    report("held-out quality by appearance decay, table size and appearance", rows, options.seed)
 
 
 if __name__ == "__main__":

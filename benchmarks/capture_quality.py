@@ -95,8 +95,8 @@ def copies(given: Scene, folder: Path, seed: int) -> Path:
 
 def fit_scores(scene: Path, run: Path, options: argparse.Namespace) -> dict:
     """Fit a scene in `--fit-steps` steps; return its scores on held-out photos."""
-    words = ["--steps", str(options.fit_steps), "--minutes", "60", "--seed", str(options.seed)]
-    command("fit", str(scene), "-o", str(run), *words)
+    args = ["--steps", str(options.fit_steps), "--minutes", "60", "--seed", str(options.seed)]
+    command("fit", str(scene), "-o", str(run), *args)
     measured = json.loads((run / "metrics.json").read_text())
     return {key: measured[key] for key in ("psnr", "psnr_cc", "ssim", "steps", "seconds")}
 

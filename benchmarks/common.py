@@ -1,4 +1,4 @@
-"""Shared by the benchmark scripts: timing, memory, a description of the machine, JSON output."""
+"""Helpers of the benchmark scripts: timing, memory, a description of the machine, JSON output."""
 
 import importlib.metadata
 import json
@@ -53,32 +53,32 @@ def spread(values: list[float]) -> dict[str, float]:
     }
 
 
-def command(*words: str) -> str:
-    """Run `climatenerf WORDS` in a process of its own; return its standard output."""
-    return output(["-m", "climatenerf", *words])
+def command(*args: str) -> str:
+    """Run `climatenerf` with arguments in its own process; return its standard output."""
+    return output(["-m", "climatenerf", *args])
 
 
-def output(words: list[str], environment: dict[str, str] | None = None) -> str:
-    """Run Python with arguments in a process of its own; return its standard output."""
+def output(args: list[str], environment: dict[str, str] | None = None) -> str:
+    """Run Python with arguments in its own process; return its standard output."""
     done = subprocess.run(
-        [PYTHON, *words], stdout=subprocess.PIPE, text=True, check=True, env=environment
+        [PYTHON, *args], stdout=subprocess.PIPE, text=True, check=True, env=environment
     )
     return done.stdout
 
 
-def peak_bytes(words: list[str], environment: dict[str, str] | None = None) -> float:
-    """Run Python with arguments in a process of its own; return its peak resident memory.
+def peak_bytes(args: list[str], environment: dict[str, str] | None = None) -> float:
+    """Run Python with arguments in its own process; return its peak resident memory.
 
     Its output is shown only if it fails; then this process exits as well.
     """
     with tempfile.TemporaryFile("w+") as output:
         child = subprocess.Popen(
-            [PYTHON, *words], stdout=output, stderr=subprocess.STDOUT, env=environment
+            [PYTHON, *args], stdout=output, stderr=subprocess.STDOUT, env=environment
         )
         _, status, usage = os.wait4(child.pid, 0)
         if status:
             output.seek(0)
-            sys.exit(f"{output.read()}`python {' '.join(words)}` failed")
+            sys.exit(f"{output.read()}`python {' '.join(args)}` failed")
     # Linux counts in KiB, macOS in bytes.
     return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
@@ -100,7 +100,7 @@ def versions() -> dict[str, str]:
     return found | {p: importlib.metadata.version(p) for p in ("torch", "numpy", "numba")}
 
 
-MACHINE = machine()  # at import, since later the load includes the benchmark's own
+MACHINE = machine()  # at import; later the load includes the benchmark itself
 
 
 def report(question: str, results: object, seed: int | None = None) -> None:

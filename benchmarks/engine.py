@@ -10,8 +10,8 @@ sample passes every head (density, colour, classes, normals and the normals' tar
 excluded. `frame`: seconds per picture, as in `frame_time.py`. `time_to_psnr`: seconds from the
 start of a fit until the held-out photos of a capture reach some PSNR in the mean appearance of all
 photos. Reading photos and multi-view stereo are included, evaluation and compilation are not. The
-peer's times come from `peer_nerfacto.py`, run by the Python of its own environment, without reading
-photos. null means not reached within its minutes.
+peer's times come from `peer_nerfacto.py` in an environment of its own, and exclude reading photos.
+null: not reached within the time limit.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def eager_positions(rays, offsets: Tensor, t: Float[Tensor, "s"]) -> Float[Tenso
 
 
 def eager_encoded(u, table, resolutions, layers, shared=None, row=None) -> Tensor:
-    """On a GPU `network.encoded_mlp` has one kernel for both."""
+    """Encode and evaluate separately; on a GPU `network.encoded_mlp` is one kernel."""
     return reference.mlp(reference.hash_encode(u, table, resolutions), layers, shared, row)
 
 
@@ -123,8 +123,8 @@ def plain_pytorch() -> Iterator[None]:
         radiance=activations.plain_radiance,
         density_from_raw=activations.plain_density_from_raw,
     )
-    of_directions = mock.patch.object(directions, "harmonics", directions.spherical_harmonics)
-    with encodings, networks, marches, sums, outputs, of_directions:
+    harmonics = mock.patch.object(directions, "harmonics", directions.spherical_harmonics)
+    with encodings, networks, marches, sums, outputs, harmonics:
         yield
 
 
@@ -145,7 +145,7 @@ class RayBatch:
 def draw_batch(trainer: Trainer, samples: int) -> RayBatch:
     """Draw rays that have about `samples` samples in total."""
     field, rays = trainer.field, 512
-    for _ in range(50):  # rays differ, so that the target may not be reached
+    for _ in range(50):  # the number of samples varies per ray, so the target may be missed
         batch = trainer.pixels.draw(rays, trainer.generator)
         n = batch.rays_o.shape[0]
         near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
@@ -176,18 +176,18 @@ def loss_of(field: Field, at: RayBatch) -> Float[Tensor, ""]:
     loss = loss + 1e-2 * losses.distortion_loss(weights, t, dt, samples.offsets)
     loss = loss + 2e-4 * losses.opacity_entropy_loss(transmittance)
     density_normal = field.density_normal(at.q)
-    logits, apart = compositing.surface(
+    logits, distance = compositing.surface(
         weights.detach(), field.surface_raw(u), density_normal, samples.offsets
     )
     target = torch.arange(n) % len(SOLID)  # any classes: the cost does not depend on them
     loss = loss + 4e-2 * losses.class_loss(logits, target, torch.ones(n, dtype=torch.bool))
-    return loss + 4e-2 * apart.sum() / n
+    return loss + 4e-2 * distance.sum() / n
 
 
 def our_step(field: Field, at: RayBatch) -> Callable[[], None]:
     tables = [p for n, p in field.named_parameters() if n.endswith("_grid")]
-    others = [p for n, p in field.named_parameters() if not n.endswith("_grid")]
-    grids, nets = GridAdam(tables), torch.optim.Adam(others, lr=1e-6, fused=True)
+    weights = [p for n, p in field.named_parameters() if not n.endswith("_grid")]
+    grids, nets = GridAdam(tables), torch.optim.Adam(weights, lr=1e-6, fused=True)
     buffers = [table.grad_buffer for table in tables]
 
     def step() -> None:
@@ -224,27 +224,29 @@ def steps(trainer: Trainer, samples: int, twin_samples: int, repeats: int) -> di
 
     Measurements alternate, so that a change of the machine's load affects all of them.
     """
-    many = draw_batch(trainer, samples)
-    few = many if twin_samples == samples else draw_batch(trainer, twin_samples)
+    large = draw_batch(trainer, samples)
+    small = large if twin_samples == samples else draw_batch(trainer, twin_samples)
     jobs = {
-        "ours": our_step(trainer.field, many),
-        "eager": twin_step(trainer.field, few, False),
-        "compile": twin_step(trainer.field, few, True),
+        "ours": our_step(trainer.field, large),
+        "eager": twin_step(trainer.field, small, False),
+        "compile": twin_step(trainer.field, small, True),
     }
-    counts = {name: (many if name == "ours" else few).samples.t.shape[0] for name in jobs}
-    taken: dict[str, list[float]] = {name: [] for name in jobs}
+    counts = {name: (large if name == "ours" else small).samples.t.shape[0] for name in jobs}
+    measured: dict[str, list[float]] = {name: [] for name in jobs}
     failed: dict[str, str] = {}
-    for turn in range(repeats + 1):
+    for repeat in range(repeats + 1):
         for name in [each for each in jobs if each not in failed]:
             try:
-                jobs[name]()  # fills the caches, which hold the other's tables
+                jobs[name]()  # fill the caches, which contain the tables of the previous job
                 for _ in range(STEPS if name == "ours" else 1):
                     seconds = common.measure(jobs[name], 1, warm_up=0)["median"]
-                    if turn:  # the first turn compiles
-                        taken[name].append(seconds)
+                    if repeat:  # the first one compiles
+                        measured[name].append(seconds)
             except Exception as error:  # no C compiler, or an unsupported operation
                 failed[name] = f"{type(error).__name__}: {error}"[:300]
-    seconds = {name: common.spread(values) for name, values in taken.items() if name not in failed}
+    seconds = {
+        name: common.spread(values) for name, values in measured.items() if name not in failed
+    }
     rates = {name: counts[name] / each["median"] for name, each in seconds.items()}
     times = {
         f"times_{name}": rates["ours"] / rates[name]
@@ -271,7 +273,7 @@ def time_to_psnr(
     prepared = time.perf_counter() - start
     curve: list[dict[str, float]] = []
 
-    def look(report: Report) -> None:
+    def record(report: Report) -> None:
         if report.seconds >= every * (len(curve) + 1) or report.progress >= 1:
             found = evaluate(trainer.field, scene, downscale, lambda done, total: None, False)
             curve.append(
@@ -284,7 +286,7 @@ def time_to_psnr(
             )
 
     compile_kernels(trainer)
-    trainer.run(look)
+    trainer.run(record)
     last = curve[-1]
     found = {"prepared_s": prepared, "samples_per_s": last["samples"] / trainer.seconds}
     return {**reached(curve, goals), **found, "curve": curve}
@@ -303,9 +305,9 @@ def reached(
 def peer_time_to_psnr(python: str, capture: Path, minutes: float, rays: int, seed: int) -> dict:
     """Run `peer_nerfacto.py` with another interpreter; return its times and curve."""
     script = Path(__file__).with_name("peer_nerfacto.py")
-    words = [capture, "--minutes", minutes, "--rays", rays, "--seed", seed]
+    args = [capture, "--minutes", minutes, "--rays", rays, "--seed", seed]
     done = subprocess.run(
-        [python, str(script), *map(str, words)], stdout=subprocess.PIPE, text=True, check=True
+        [python, str(script), *map(str, args)], stdout=subprocess.PIPE, text=True, check=True
     )
     found = json.loads(done.stdout.splitlines()[-1])
     return {**reached(found["curve"]), **found}
@@ -335,11 +337,11 @@ def main() -> None:
     trainer.field = load_field(options.run).requires_grad_()
     found: dict[str, object] = {"run": options.run.name, "capture": scene.root.name}
     found["step"] = steps(trainer, options.samples, options.twin_samples, options.repeats)
-    shown = frames(options.run, options.size, options.path, options.repeats, options.seed)
+    measured = frames(options.run, options.size, options.path, options.repeats, options.seed)
     found["frame"] = {
-        f"{name}_s": row["seconds"]["median"] for name, row in shown["frames"].items()
+        f"{name}_s": row["seconds"]["median"] for name, row in measured["frames"].items()
     }
-    found["frames"] = shown
+    found["frames"] = measured
     if options.capture:
         settings = FitSettings(minutes=options.minutes, seed=options.seed)
         ours = time_to_psnr(options.capture, settings, options.downscale, options.every)

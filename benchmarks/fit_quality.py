@@ -45,11 +45,11 @@ def main() -> None:
             folder = Path(capture) if Path(capture).is_dir() else CAPTURES / capture
             for minutes in options.minutes:
                 run = (options.keep or Path(temporary)) / f"{folder.name}-{minutes:g}min"
-                words = ["fit", str(folder), "-o", str(run), "--minutes", str(minutes)]
-                words += ["--downscale", str(options.downscale), "--seed", str(options.seed)]
-                words += ["--holdout", options.holdout] if options.holdout else []
+                args = ["fit", str(folder), "-o", str(run), "--minutes", str(minutes)]
+                args += ["--downscale", str(options.downscale), "--seed", str(options.seed)]
+                args += ["--holdout", options.holdout] if options.holdout else []
                 start = time.perf_counter()
-                command(*words)
+                command(*args)
                 metrics = json.loads((run / "metrics.json").read_text())
                 row = {"capture": folder.name, "minutes": minutes, "downscale": options.downscale}
                 row |= {key: metrics[key] for key in KEYS}

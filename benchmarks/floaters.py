@@ -5,8 +5,8 @@ python benchmarks/floaters.py RUN
 The mass of floaters (`floater_mass` in reports) of the test views' pixels is divided by four
 criteria: the number of fitted photos that show the pixel's true surface point; whether a
 neighbouring pixel shows a nearer surface; distance; and the fraction of light that the pixel loses.
-Haze absorbs little in many pixels, a misplaced surface all light of a few. Depth that hardly any
-photo shows can only come from a prior. Needs `pip install ".[street]"`.
+Haze absorbs little light in many pixels, a misplaced surface all light of few pixels. The depth of
+a point that hardly any photo shows can only come from a prior. Needs `pip install ".[street]"`.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def depths_of_photos(scene: Scene) -> list[Float[np.ndarray, "h w"]]:
     return found
 
 
-def times_shown(
+def view_counts(
     x: Float[np.ndarray, "n 3"], scene: Scene, depths: list[Float[np.ndarray, "h w"]]
 ) -> Int[np.ndarray, "n"]:
     """Count the fitted photos that show each point (world m)."""
@@ -91,7 +91,7 @@ def main() -> None:
     )
     check_views(run.scene, run.reference)
     photos = depths_of_photos(run.scene)
-    absorbed, shown, edge, distance = [], [], [], []
+    absorbed, counts, edge, distance = [], [], [], []
     for truth in run.reference.truths:
         free = torch.from_numpy(geometry.free_space(truth).astype(np.float32).ravel())
         passed = (
@@ -99,11 +99,11 @@ def main() -> None:
         )
         solid = ~truth.sky
         absorbed.append(1 - passed[solid])
-        shown.append(times_shown(truth.points[solid], run.scene, photos))
+        counts.append(view_counts(truth.points[solid], run.scene, photos))
         edge.append(geometry.occluded_edges(truth)[solid])
         distance.append(truth.depth[solid])
-    absorbed, shown, edge, distance = (
-        np.concatenate(each) for each in (absorbed, shown, edge, distance)
+    absorbed, counts, edge, distance = (
+        np.concatenate(each) for each in (absorbed, counts, edge, distance)
     )
     everything = np.ones(len(absorbed), bool)
     common.report(
@@ -112,7 +112,7 @@ def main() -> None:
             "all": contribution(absorbed, everything),
             "edges": contribution(absorbed, edge),
             "photos": {
-                f"{low} to {high - 1}": contribution(absorbed, (shown >= low) & (shown < high))
+                f"{low} to {high - 1}": contribution(absorbed, (counts >= low) & (counts < high))
                 for low, high in zip(PHOTOS, (*PHOTOS[1:], len(photos) + 1), strict=True)
             },
             "metres": {

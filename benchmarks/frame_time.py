@@ -31,8 +31,8 @@ from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import World
 
 
-def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:
-    """Return the level above the datum (m) at which water covers about `wanted` of the frame."""
+def water_level(field, scene, path: CameraPath, coverage: float = 0.4) -> float:
+    """Return the level above the datum (m) at which water covers about `coverage` of the frame."""
     camera, c2w = path.cameras[0].resized(120, 68), path.c2w[0]
     _, layers = render_frame(World(field), camera, c2w)
     direction = camera.directions() @ c2w[:3, :3].T
@@ -40,14 +40,14 @@ def water_level(field, scene, path: CameraPath, wanted: float = 0.4) -> float:
     # A pixel is wet if the level is above its surface; sky below the horizon lies at 1000 km.
     height = eye + np.where(np.isfinite(layers["depth"]), layers["depth"], 1e6) * direction[..., 2]
     height = np.where(direction[..., 2] < 0, height, np.inf)
-    return float(min(np.quantile(height, wanted), eye - 0.05)) - scene.ground_z
+    return float(min(np.quantile(height, coverage), eye - 0.05)) - scene.ground_z
 
 
 WEATHERS = ("clean", "flood", "smog", "snow")
 
 
 def frames(
-    run: Path, size: str, view: str, repeats: int, seed: int, wanted: tuple[str, ...] = WEATHERS
+    run: Path, size: str, view: str, repeats: int, seed: int, names: tuple[str, ...] = WEATHERS
 ) -> dict[str, Any]:
     """Time the first frame of the camera path `view` in each weather."""
     field, scene = load_field(run), load_scene(run)
@@ -60,7 +60,7 @@ def frames(
         "snow": Weather(snow=Snow(depth=0.1), seed=seed),
     }
     rows: dict[str, dict] = {}
-    for name, weather in ((name, weathers[name]) for name in wanted):
+    for name, weather in ((name, weathers[name]) for name in names):
         start = time.perf_counter()
         session = RenderSession(field, scene, weather, path.c2w[:, :3, 3])
         prepared = time.perf_counter() - start
@@ -82,7 +82,7 @@ def frames(
     return {"run": run.name, "view": path.name, "size": size, "level_m": level, "frames": rows}
 
 
-def growth(run: Path, sizes: list[str], view: str, repeats: int) -> dict[str, Any]:
+def scaling(run: Path, sizes: list[str], view: str, repeats: int) -> dict[str, Any]:
     """Time a clean frame in several sizes; fit the exponent of the number of pixels."""
     field, scene = load_field(run), load_scene(run)
     world = World(field)
@@ -109,11 +109,11 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+")
     options = parser.parse_args()
     if options.sizes:
-        found = growth(options.run, options.sizes, options.path, options.repeats)
-        common.report("seconds a frame over its pixels", found)
+        found = scaling(options.run, options.sizes, options.path, options.repeats)
+        common.report("seconds per frame over its pixels", found)
         return
     found = frames(options.run, options.size, options.path, options.repeats, options.seed)
-    common.report("seconds a frame", found, options.seed)
+    common.report("seconds per frame", found, options.seed)
 
 
 if __name__ == "__main__":

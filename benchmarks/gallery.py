@@ -51,11 +51,11 @@ def weathers(run: Path, options: argparse.Namespace) -> Rows:
     flags["all"] = [*flood, *smog, *snow]
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
-        for label, words in flags.items():
+        for label, args in flags.items():
             out = Path(temporary) / label
             base = ["render", str(run), "-o", str(out), "--path", options.path]
             base += ["--frames", str(options.columns), "--size", options.size]
-            common.command(*base, "--supersample", str(options.supersample), *words)
+            common.command(*base, "--supersample", str(options.supersample), *args)
             frames = sorted((out / "frames").glob("*.png"))
             rows.append((label, [np.asarray(Image.open(path)) for path in frames]))
     return rows
@@ -74,10 +74,10 @@ def surfaces(run: Path, columns: int) -> Rows:
         options = FrameOptions(supersample=2, normals=True, labels=True)
         picture, layers = render_frame(world, small, scene.c2w_world(view), options)
         photo = Image.fromarray(load_image(view, scene)).resize((small.width, small.height))
-        shown = [np.asarray(photo), picture, depth_picture(layers["depth"])]
-        shown += [normal_picture(layers["normal"])]
-        shown += [PAINT[layers["label"].astype(np.uint8)]] if "label" in layers else []
-        for row, each in zip(rows, shown, strict=False):
+        pictures = [np.asarray(photo), picture, depth_picture(layers["depth"])]
+        pictures += [normal_picture(layers["normal"])]
+        pictures += [PAINT[layers["label"].astype(np.uint8)]] if "label" in layers else []
+        for row, each in zip(rows, pictures, strict=False):
             row[1].append(each)
     return [row for row in rows if row[1]]
 
@@ -89,9 +89,9 @@ def passers_by(run: Path, columns: int) -> Rows:
     masks = TransientMasks(len(views))
     weights = {key.removeprefix("masks."): value for key, value in state.items() if "masks." in key}
     masks.load_state_dict({key: torch.as_tensor(value) for key, value in weights.items()})
-    most = np.argsort(-masks.masked_fractions().numpy())[:12]
+    most_masked = np.argsort(-masks.masked_fractions().numpy())[:12]
     rows: Rows = [("photo", []), ("masked", []), ("field", [])]
-    for i in np.sort(most)[:: max(1, 12 // columns)][:columns]:
+    for i in np.sort(most_masked)[:: max(1, 12 // columns)][:columns]:
         view, photo = views[i], load_image(views[i], scene)
         y, x = ((np.arange(side) + 0.5) / side for side in photo.shape[:2])
         position = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2).astype(np.float32)

@@ -6,7 +6,7 @@ python benchmarks/gpu.py RUN --capture ../shared/data/fox
 every sample as in `engine.py`, and the same in eager PyTorch on the same device. `fit`: samples per
 second of a whole fit, and seconds until the held-out photos reach some PSNR; reading photos and
 multi-view stereo are included, evaluation and compilation are not. `waits`: how often a step of
-that fit synchronises with the device, counted by PyTorch, and at which lines. `frames`: seconds per
+that fit synchronises with the device, counted by PyTorch, and in which lines. `frames`: seconds per
 frame and frames per second of a view of RUN in each size, clean and with water on about 40 % of it,
 and samples per second of clean frames (samples that marching finds before a ray ends). `peak_gb` is
 each part's peak memory on the device. `--device cpu` measures the same on the CPU.
@@ -42,15 +42,15 @@ GOALS = (20, 22, 24, 25)  # dB
 WEATHERS = ("clean", "flood")
 
 
-def finished(job: Callable[[], None], device: str) -> Callable[[], None]:
+def synchronised(job: Callable[[], None], device: str) -> Callable[[], None]:
     """Return the job followed by a synchronisation with the device."""
 
-    def wait() -> None:
+    def run() -> None:
         job()
         if device == "cuda":
             torch.cuda.synchronize()
 
-    return wait
+    return run
 
 
 def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
@@ -60,14 +60,14 @@ def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict
     at = draw_batch(trainer, samples)
     size, found = at.samples.t.shape[0], {}
     makers = {"ours": our_step, "eager": lambda field, at: twin_step(field, at, False)}
-    for name, make in makers.items():  # one by one: the twin removes our optimiser's buffers
-        job = finished(make(trainer.field, at), device)
+    for name, make in makers.items():  # ours first: the twin removes its optimiser's buffers
+        job = synchronised(make(trainer.field, at), device)
         seconds = common.measure(job, repeats, warm_up=3)
         found[name] = {"samples_per_s": size / seconds["median"], "seconds": seconds}
     return {"samples": size, **found}
 
 
-def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> dict[str, Any]:
+def frames_per_s(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> dict[str, Any]:
     """Measure frames per second in each size and weather."""
     rows: dict[str, Any] = {}
     for size in sizes:
@@ -76,29 +76,31 @@ def shown(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> di
             name: {**found[name], "frames_per_s": 1 / found[name]["seconds"]["median"]}
             for name in WEATHERS
         }
-        of_clean = samples_of_frame(run, size, view)
-        rows[size]["clean"]["samples"] = of_clean
-        rows[size]["clean"]["samples_per_s"] = of_clean * rows[size]["clean"]["frames_per_s"]
+        count, clean = samples_of_frame(run, size, view), rows[size]["clean"]
+        clean["samples"] = count
+        clean["samples_per_s"] = count * clean["frames_per_s"]
     return rows
 
 
 def samples_of_frame(run: Path, size: str, view: str) -> int:
-    """Count the samples of a clean frame's rays until they end."""
+    """Count the samples of all rays of a clean frame."""
     field = load_field(run)
     path = camera_path(view, load_scene(run), 1, parse_size(size))
     rays_o, rays_d = camera_rays(path.cameras[0], path.c2w[0])
-    count, some = 0, rays_at_once(rays_o)
-    for o, d in zip(rays_o.split(some), rays_d.split(some), strict=True):
+    count, chunk = 0, rays_at_once(rays_o)
+    for o, d in zip(rays_o.split(chunk), rays_d.split(chunk), strict=True):
         near = torch.full((o.shape[0],), field.near)
         samples = field.march(o, d, near, torch.full_like(near, 1e9), RENDER_STEP)
         count += samples.t.shape[0]
     return count
 
 
-def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300) -> dict[str, Any]:
+def count_syncs(
+    capture: Path, settings: FitSettings, downscale: int, steps: int = 300
+) -> dict[str, Any]:
     """Count synchronisations with the device per step in the last third of a fit, by line."""
     trainer = begin(read_scene(capture), replace(settings, minutes=None, steps=steps), downscale)
-    met, ends = [], []
+    ends = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         torch.cuda.set_sync_debug_mode("warn")
@@ -107,10 +109,10 @@ def waits(capture: Path, settings: FitSettings, downscale: int, steps: int = 300
             trainer.run(lambda _: ends.append(len(caught)))
         finally:
             torch.cuda.set_sync_debug_mode("default")
-        met = [f"{Path(each.filename).name}:{each.lineno}" for each in caught]
+        lines = [f"{Path(each.filename).name}:{each.lineno}" for each in caught]
     last_third = ends[2 * len(ends) // 3]
-    lines = Counter(met[last_third:]).most_common(10)
-    return {"per_step": (ends[-1] - last_third) / (len(ends) / 3), "lines": dict(lines)}
+    common_lines = Counter(lines[last_third:]).most_common(10)
+    return {"per_step": (ends[-1] - last_third) / (len(ends) / 3), "lines": dict(common_lines)}
 
 
 def measured(part: Callable[[], Any], device: str) -> dict[str, Any]:
@@ -146,13 +148,15 @@ def main() -> None:
     device, seed = options.device, options.seed
     found: dict[str, Any] = {"run": options.run.name, "device": "CPU"}
     parts: dict[str, Callable[[], Any]] = {
-        "frames": lambda: shown(options.run, options.sizes, options.path, options.repeats, seed),
+        "frames": lambda: frames_per_s(
+            options.run, options.sizes, options.path, options.repeats, seed
+        ),
         "step": lambda: steps(options.run, options.samples, options.repeats, device, seed),
     }
     if options.capture:
         settings = replace(settings_of(options.preset, device), minutes=options.minutes, seed=seed)
         if device == "cuda":
-            parts["waits"] = lambda: waits(options.capture, settings, options.downscale)
+            parts["waits"] = lambda: count_syncs(options.capture, settings, options.downscale)
         parts["fit"] = lambda: time_to_psnr(
             options.capture, settings, options.downscale, options.every, GOALS
         )

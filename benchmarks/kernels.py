@@ -88,7 +88,7 @@ def backward(*outputs: torch.Tensor) -> None:
 
 
 def jobs(n: int, fast: bool) -> dict[str, Callable[[], object]]:
-    """Each operation on n samples, by the fast kernels or by their slow twins."""
+    """Return each operation on n samples, by the fast kernels or by their twins."""
     torch.manual_seed(0)
     size = SIZE
     field = Field(size, 10, torch.zeros(3).numpy(), 1.0)
@@ -169,14 +169,14 @@ def main() -> None:
     parser.add_argument("--twin-samples", type=int, default=2**13)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    few = min(options.twin_samples, options.samples)
-    fast, slow = jobs(options.samples, fast=True), jobs(few, fast=False)
+    twin_samples = min(options.twin_samples, options.samples)
+    fast, slow = jobs(options.samples, fast=True), jobs(twin_samples, fast=False)
     best = bounds(options.repeats, options.samples)
     rows: dict[str, dict] = {"machine": best}
     for name in fast:
         a = common.measure(fast[name], options.repeats)
         b = common.measure(slow[name], max(2, options.repeats // 2))
-        rate, twin = options.samples / a["median"] / 1e6, few / b["median"] / 1e6
+        rate, twin = options.samples / a["median"] / 1e6, twin_samples / b["median"] / 1e6
         rows[name] = {"Msamples/s": rate, "twin Msamples/s": twin, "times": rate / twin,
                       "seconds": a}  # fmt: skip
         if name in NEEDS:

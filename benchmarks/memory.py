@@ -57,8 +57,8 @@ def capture(folder: Path, photos: int, width: int, height: int, labels: bool) ->
 
 def peak(scene: Path, run: Path, steps: int) -> float:
     """Return the peak resident memory of a fit, bytes."""
-    words = ["-m", "climatenerf", "fit", str(scene), "-o", str(run)]
-    return common.peak_bytes([*words, "--minutes", "60", "--steps", str(steps), "--metric-input"])
+    args = ["-m", "climatenerf", "fit", str(scene), "-o", str(run)]
+    return common.peak_bytes([*args, "--minutes", "60", "--steps", str(steps), "--metric-input"])
 
 
 def main() -> None:

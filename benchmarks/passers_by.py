@@ -75,7 +75,7 @@ def masked(trainer: Trainer, image: int, shape: tuple[int, int]) -> Bool[np.ndar
 
 
 def main() -> None:
-    """Make the fits and print what each masked."""
+    """Make the fits and print the masked fractions."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--downscale", type=int, default=1)
@@ -87,11 +87,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for row in options.rows:
             scene = read_scene(REFERENCE / ("street" if row == "quiet" else "street-busy"))
-            shown = people(scene)
-            given = without_people(scene, Path(folder)) if row == "unnamed" else scene
-            trainer = fit(given, settings, options.downscale)
-            marked = [masked(trainer, i, each.shape) for i, each in enumerate(shown)]
-            person, mask = np.concatenate(shown), np.concatenate(marked)
+            persons = people(scene)
+            labelled = without_people(scene, Path(folder)) if row == "unnamed" else scene
+            trainer = fit(labelled, settings, options.downscale)
+            marked = [masked(trainer, i, each.shape) for i, each in enumerate(persons)]
+            person, mask = np.concatenate(persons), np.concatenate(marked)
             scores = evaluate(trainer.field, scene, options.downscale, lambda *_: None, False)
             found[row] = {
                 "people_pixels": float(person.mean()),

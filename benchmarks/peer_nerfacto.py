@@ -76,7 +76,7 @@ def existing_poses(capture: Path, folder: Path) -> Path:
 
 
 def fitted(poses: Path, options: argparse.Namespace) -> dict:
-    """Fit; return steps, seconds and the curve of PSNR."""
+    """Return steps, seconds and the curve of PSNR of a fit."""
     torch.manual_seed(options.seed)
     # LPIPS is not measured here, and its construction downloads network weights.
     lpip.LearnedPerceptualImagePatchSimilarity = lambda **_: torch.nn.Identity()
@@ -103,7 +103,7 @@ def fitted(poses: Path, options: argparse.Namespace) -> dict:
             optimizers=optimizers, grad_scaler=scaler, pipeline=pipeline, trainer=None
         )
     )
-    shown, truth = pipeline.datamanager.next_eval(0)
+    rays, truth = pipeline.datamanager.next_eval(0)
 
     seconds, step, curve = 0.0, 0, []
     while seconds < 60 * options.minutes:
@@ -122,7 +122,7 @@ def fitted(poses: Path, options: argparse.Namespace) -> dict:
         if seconds >= options.every * (len(curve) + 1):
             pipeline.eval()
             with torch.no_grad():
-                rgb = pipeline.model(shown)["rgb"].clamp(0, 1)
+                rgb = pipeline.model(rays)["rgb"].clamp(0, 1)
             pipeline.train()
             error = float((rgb - truth["image"][..., :3]).square().mean())
             curve.append({"seconds": seconds, "steps": step, "psnr": -10 * math.log10(error)})

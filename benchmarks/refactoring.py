@@ -49,9 +49,9 @@ def fit(tree: Path, street: Path, options: argparse.Namespace) -> dict[str, floa
     for steps in options.steps:
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
-            words = ["fit", str(street), "-o", str(run), "--steps", str(steps), "--seed", "0"]
-            words += ["--downscale", str(options.downscale)]
-            peaks.append(climatenerf(tree, words, options.threads))
+            args = ["fit", str(street), "-o", str(run), "--steps", str(steps), "--seed", "0"]
+            args += ["--downscale", str(options.downscale)]
+            peaks.append(climatenerf(tree, args, options.threads))
             seconds.append(json.loads((run / "metrics.json").read_text())["seconds"])
     return {
         "seconds": (seconds[1] - seconds[0]) / (options.steps[1] - options.steps[0]),
@@ -71,17 +71,17 @@ def frame(tree: Path, weather: str, options: argparse.Namespace) -> dict[str, fl
         `seconds` a frame, the median over the frames after the first, and `peak_mb`.
     """
     with tempfile.TemporaryDirectory() as folder:
-        words = ["render", str(options.run), "-o", folder, "--path", "training"]
-        words += ["--frames", str(options.frames), "--size", options.size, *WEATHERS[weather]]
-        peak = climatenerf(tree, words, options.threads)
+        args = ["render", str(options.run), "-o", folder, "--path", "training"]
+        args += ["--frames", str(options.frames), "--size", options.size, *WEATHERS[weather]]
+        peak = climatenerf(tree, args, options.threads)
         written = [path.stat().st_mtime_ns for path in sorted(Path(folder).glob("frames/*.png"))]
     gaps = [1e-9 * (b - a) for a, b in zip(written, written[1:], strict=False)]
     return {"seconds": statistics.median(gaps), "peak_mb": peak}
 
 
-def climatenerf(tree: Path, words: list[str], threads: int | None) -> float:
+def climatenerf(tree: Path, args: list[str], threads: int | None) -> float:
     """Run a verb of a checkout's command line; return its peak memory in 10^6 bytes."""
-    return common.peak_bytes(["-m", "climatenerf", *words], environment(tree, threads)) / 1e6
+    return common.peak_bytes(["-m", "climatenerf", *args], environment(tree, threads)) / 1e6
 
 
 def environment(tree: Path, threads: int | None) -> dict[str, str]:

@@ -74,7 +74,7 @@ def windows(random: np.random.Generator, pixels: TrainingPixels, points, count: 
         if plane_sweep._take_window(pictures, i, x, y, window):
             tile = plane_sweep._tile(pictures, i, x, y)
             steps = plane_sweep._steps(pictures, i, tile, x, y)
-            compared += steps * int((pictures.others[i, tile] >= 0).sum())
+            compared += steps * int((pictures.neighbours[i, tile] >= 0).sum())
     # Per pixel of a window: projection (15), interpolation (6), three sums. Refinement of the best
     # depths is not counted. All reads hit the core's own cache.
     return Job(

@@ -46,9 +46,9 @@ def compiling() -> dict[str, dict[str, float]]:
         jobs["render"] += ["--snow.depth", "10 cm", "--smog.visibility", "300 m"]
         environment = {**os.environ, "NUMBA_CACHE_DIR": f"{temporary}/kernels"}
         for state in ("without", "with"):
-            for name, words in jobs.items():
+            for name, args in jobs.items():
                 start = time.perf_counter()
-                command = [PYTHON, "-m", "climatenerf", *words]
+                command = [PYTHON, "-m", "climatenerf", *args]
                 subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
                 rows.setdefault(name, {})[state] = time.perf_counter() - start
             for folder in (run, out):
@@ -67,12 +67,12 @@ def main() -> None:
         report("seconds of the first run on a machine, and of the second", compiling())
         return
 
-    def run(words: list[str]) -> None:
-        subprocess.run([PYTHON, *words], stdout=subprocess.DEVNULL, check=True)
+    def run(args: list[str]) -> None:
+        subprocess.run([PYTHON, *args], stdout=subprocess.DEVNULL, check=True)
 
     rows = {
-        name: measure(lambda words=words: run(words), options.repeats)
-        for name, words in COMMANDS.items()
+        name: measure(lambda args=args: run(args), options.repeats)
+        for name, args in COMMANDS.items()
     }
     report("wall seconds of a fresh process", rows)
 

@@ -17,7 +17,7 @@ import climatenerf
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 700
 folder = Path(sys.argv[2] if len(sys.argv) > 2 else "runs/example")
-shutil.rmtree(folder, ignore_errors=True)  # `fit` overwrites no run
+shutil.rmtree(folder, ignore_errors=True)  # `fit` does not overwrite a run
 
 printed = set()
 
@@ -36,7 +36,7 @@ with as_file(files("climatenerf") / "assets" / "street") as street:
     )
     print(f"held-out photos: {climatenerf.evaluate(run)['psnr']:.1f} dB")
 
-# From here on only the run folder is needed. All values are SI: metres, seconds, radians.
+# The run folder is sufficient from here on. All values are SI: metres, seconds, radians.
 weather = climatenerf.Weather(flood=climatenerf.Flood(level=0.5, wind_speed=3.0))
 out = folder / "flood"
 movie = climatenerf.render_movie(

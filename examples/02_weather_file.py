@@ -1,4 +1,4 @@
-"""Weather from a file that changes over time: three moments of one view, side by side.
+"""Weather that changes over time, from a file: three moments of one view, side by side.
 
     python examples/02_weather_file.py [RUN] [WEATHER.toml]
 
@@ -18,10 +18,8 @@ folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/example")
 file = Path(sys.argv[2]) if len(sys.argv) > 2 else Path(__file__).parent / "weather.toml"
 
 out = folder / "weather"
-every_two_seconds = 0.5  # frames per second
-climatenerf.render_movie(
-    folder, out, file, path="still:0020", frames=3, fps=every_two_seconds, size=(192, 108)
-)
+fps = 0.5  # one frame every two seconds
+climatenerf.render_movie(folder, out, file, path="still:0020", frames=3, fps=fps, size=(192, 108))
 frames = json.loads((out / "movie.json").read_text())["frames"]
 for frame in frames:
     weather, measured = frame["weather"], frame["measured"]

@@ -2,8 +2,8 @@
 
     python examples/03_new_effect.py [RUN]
 
-Ash lies where snow would and has its own colour. `ASH` describes it: parameters with unit and
-range, two layers, one number for the sidecar. No file of the program knows it. In an installed
+Ash lies on the same surfaces as snow and has its own colour. `ASH` describes it: parameters with
+unit and range, two layers, one number for the sidecar. No other file refers to it. In an installed
 package the entry point `ash = "my_package:ASH"` of the group `climatenerf.effects` adds the flags
 --ash.depth and --ash.albedo. Needs the run of 01_fit_and_flood.py. Writes RUN/ash.
 """
@@ -21,17 +21,17 @@ from climatenerf import extend
 
 @dataclasses.dataclass(frozen=True)
 class Ash:
-    """Volcanic ash on upward surfaces."""
+    """Volcanic ash on upward-facing surfaces."""
 
     depth: Annotated[float | None, extend.quantity(extend.LENGTH, 0.0, 1.0, optional=True)] = None
     """Thickness on open level ground. none: no ash."""
     albedo: Annotated[float, extend.number(0.0, 1.0)] = 0.12
-    """fraction of the light that ash reflects."""
+    """Fraction of the light that ash reflects."""
 
 
 @dataclasses.dataclass(frozen=True)
 class AshLayer:
-    """Ash on a scene: the shape of snow, its own colour. The renderer calls it matter."""
+    """Ash on a scene, with the shape of snow and its own colour: matter of the renderer."""
 
     shape: "extend.BakedSnow"
     white: object  # radiance of a white sheet in the open: a tensor of 3
@@ -44,7 +44,7 @@ class AshLayer:
         return self.shape.march(rays_o, rays_d, t_min, t_max)
 
     def colour(self, x):
-        """Linear radiance: a slope sees a part of the sky."""
+        """Linear radiance under a uniform sky, of which a slope receives a fraction."""
         return self.albedo * (0.5 + 0.5 * self.normal(x)[:, 2:]) * self.white
 
     def normal(self, x):
@@ -73,7 +73,7 @@ class AshEntity:
         return dataclasses.replace(world, matters=(*world.matters, ash))
 
     def check(self, moments):
-        """Any ash fits any scene."""
+        """All parameters are valid in any scene."""
 
     def facts(self):
         """Nothing to report."""
@@ -81,11 +81,11 @@ class AshEntity:
 
 
 def prepare(preparation):
-    """Let ash fall, once for the scene."""
+    """Simulate the fall of ash, once for the scene."""
     white = preparation.irradiance() / math.pi
-    slides_off = math.radians(33)  # on a gentler slope than snow
+    max_slope = math.radians(33)  # less than that of snow
     depth = max(moment.ash.depth for moment in preparation.moments) or 0.01
-    fall = climatenerf.Snow(depth=depth, slope=slides_off)
+    fall = climatenerf.Snow(depth=depth, slope=max_slope)
     cameras = preparation.camera_positions
     field = extend.observed(preparation.field)
     return AshEntity(extend.bake_snow(field, fall, cameras, white.numpy()), white)
@@ -97,7 +97,7 @@ ASH = extend.Effect(
     enabled_by=("depth",),
     prepare=prepare,
     layers=(
-        extend.Layer("ash_thickness", "m", "ash upon the surface that is seen, else 0", 1e-4, 16),
+        extend.Layer("ash_thickness", "m", "thickness of visible ash, else 0", 1e-4, 16),
         extend.Layer("mask_ash", "1", "fraction of the pixel that shows ash", 1 / 255, 8),
     ),
     measures=(extend.Measure("ash_share", "mask_ash"),),

@@ -21,7 +21,7 @@ CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def captures() -> Path:
-    """Folder of real photo captures; they are not part of the project."""
+    """Folder of real photo captures, which are not part of the project."""
     if not CAPTURES.is_dir():
         pytest.skip("needs the real captures (folder ../shared/data beside the checkout)")
     return CAPTURES

@@ -1,4 +1,4 @@
-"""The functions of the library, on a small field with random contents."""
+"""The functions of the library, on a small random field."""
 
 import json
 
@@ -19,7 +19,7 @@ SIZE = (32, 18)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run of five photos on a line, all looking at the centre of the random field."""
+    """A run of five photos on a line that face the centre of the random field."""
     folder = tmp_path_factory.mktemp("api") / "run"
     folder.mkdir()
     views = []
@@ -39,7 +39,7 @@ def pictures(folder):
     return [np.asarray(Image.open(path)) for path in sorted((folder / "frames").glob("*.png"))]
 
 
-def test_a_run_knows_the_camera_of_a_photo(run):
+def test_a_run_has_the_camera_of_a_photo(run):
     camera, c2w = run.camera("0002", SIZE)
     assert (camera.width, camera.height) == SIZE
     assert np.allclose(c2w, run.scene.c2w_world(run.scene.views[2]))
@@ -85,7 +85,7 @@ def test_a_weather_file_and_an_appearance_change_the_frames(run, tmp_path):
 
 
 def test_invalid_arguments_are_refused_before_anything_is_written(run, tmp_path):
-    for options, words in (
+    for options, message in (
         ({"layers": ["colour"]}, "no layer 'colour'"),
         ({"layers": ["label"]}, "without class labels"),
         ({"part": (3, 2)}, "part 3 of 2 does not exist"),
@@ -95,7 +95,7 @@ def test_invalid_arguments_are_refused_before_anything_is_written(run, tmp_path)
         ({"weather": tmp_path / "absent.toml"}, "absent.toml"),
         ({"appearance": "nobody"}, "no training photo"),
     ):
-        with pytest.raises(UserError, match=words):
+        with pytest.raises(UserError, match=message):
             climatenerf.render_movie(run, tmp_path / "out", **options)
     with pytest.raises(UserError, match="no loss 'beauty'"):
         climatenerf.fit(run.scene, tmp_path / "out", losses={"beauty": 1.0})

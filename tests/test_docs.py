@@ -89,9 +89,9 @@ def test_commands_have_a_verb_and_its_options(page):
     for line in lines:
         if not line.startswith("climatenerf "):
             continue
-        _, verb, *words = shlex.split(line, comments=True)
+        _, verb, *args = shlex.split(line, comments=True)
         assert verb in VERBS, line
-        used = {word for word in words if word.startswith("--")}
+        used = {word for word in args if word.startswith("--")}
         assert used <= options_of(verb), f"{line}: {used - options_of(verb)}"
 
 

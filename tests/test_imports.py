@@ -1,4 +1,4 @@
-"""Help and input errors import no slow package."""
+"""Help and input errors do not import slow packages."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The names that a user of the library may rely on."""
+"""The public names of the library."""
 
 import ast
 import inspect
@@ -18,7 +18,7 @@ def public(names):
     return [name for name in names if not name.startswith("__")]
 
 
-def test_dir_lists_the_public_names_and_loads_nothing_heavy():
+def test_dir_lists_the_public_names_and_does_not_import_torch():
     code = (
         "import sys, climatenerf; from climatenerf import cli, core; names = dir(climatenerf);"
         "print(*names); climatenerf.Weather(flood=climatenerf.Flood(level=0.5));"
@@ -40,12 +40,12 @@ def test_each_public_name_is_documented(name):
         assert all(f"{each}:" in text for each in inspect.signature(found).parameters if each)
 
 
-def test_the_stub_for_type_checkers_names_the_same():
+def test_the_type_stub_lists_the_public_names():
     stub = ast.parse(Path(climatenerf.__file__).with_suffix(".pyi").read_text())
     names = [n.names[0].asname for n in stub.body if isinstance(n, ast.ImportFrom)]
     assert sorted(names) == sorted([*FUNCTIONS, *CLASSES, "extend"])
 
 
-def test_another_name_is_an_attribute_error():
+def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'flood'"):
         climatenerf.flood  # noqa: B018

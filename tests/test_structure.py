@@ -1,4 +1,4 @@
-"""Dependencies point one way: a part imports only what its row names, without exemption."""
+"""Dependencies point one way: a part imports only the parts of its row, without exemption."""
 
 import ast
 from pathlib import Path
@@ -32,8 +32,8 @@ MAY_IMPORT = {
 
 
 def part_of(module: str) -> str:
-    words = module.split(".")
-    return words[min(1, len(words) - 1)]
+    names = module.split(".")
+    return names[min(1, len(names) - 1)]
 
 
 def imports(path: Path) -> set[str]:
@@ -58,8 +58,8 @@ def test_dependencies_point_one_way():
     assert not wrong, wrong
 
 
-def test_no_part_imports_itself_through_another():
-    """The table above has no circle."""
+def test_dependencies_have_no_cycle():
+    """The table above has no cycle."""
     done: set[str] = set()
     while len(done) < len(MAY_IMPORT):
         free = [part for part, below in MAY_IMPORT.items() if part not in done and below <= done]

@@ -16,9 +16,9 @@ ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 
-def pip(*words):
+def pip(*args):
     done = subprocess.run(
-        [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, words)],
+        [sys.executable, "-m", "pip", "--disable-pip-version-check", *map(str, args)],
         capture_output=True,
         text=True,
     )
@@ -45,7 +45,7 @@ def test_the_version_is_printed_from_the_wheel_in_an_empty_environment(tmp_path)
     scripts = empty / ("Scripts" if sys.platform == "win32" else "bin")
     pip("--python", scripts / "python", "install", "--no-deps", "--no-index", wheel)
     environment = {"PATH": str(scripts), "PYTHONNOUSERSITE": "1"}
-    for words in (["climatenerf"], ["python", "-m", "climatenerf"]):
-        command = [str(scripts / words[0]), *words[1:], "--version"]
+    for args in (["climatenerf"], ["python", "-m", "climatenerf"]):
+        command = [str(scripts / args[0]), *args[1:], "--version"]
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         assert done.stdout == f"climatenerf {climatenerf.__version__}\n", done.stderr

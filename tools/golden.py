@@ -82,9 +82,9 @@ def golden(folder: Path, run: Path | None) -> dict[str, str]:
     return hashes
 
 
-def climatenerf(*words: str) -> None:
+def climatenerf(*args: str) -> None:
     """Run a verb of the command line on one thread."""
-    command = [sys.executable, "-m", "climatenerf", *words]
+    command = [sys.executable, "-m", "climatenerf", *args]
     subprocess.run(command, env=os.environ | ONE_THREAD, check=True, stdout=subprocess.DEVNULL)
 
 

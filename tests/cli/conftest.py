@@ -1,4 +1,4 @@
-"""A fitted run that the tests of the command line share."""
+"""A fitted run for all tests of the command line."""
 
 import functools
 
@@ -17,9 +17,9 @@ def run_folder(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("street") / "run"
     settings = functools.partial(FitSettings, samples_per_step=2**14, size=FEW_ROWS)
-    words = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
+    args = ["fit", str(STREET), "-o", str(folder), "--steps", "300", "--downscale", "6"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
-        assert cli.main(words) == 0
+        assert cli.main(args) == 0
     return folder

@@ -1,4 +1,4 @@
-"""The demo, in small: what it leaves, what it says, and what happens when it is stopped."""
+"""A small demo: its files, its output, and resuming after an interrupt."""
 
 import functools
 import json
@@ -25,16 +25,16 @@ def small(monkeypatch):
     monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))
 
 
-def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
+def test_the_demo_writes_four_movies_and_a_contact_sheet(tmp_path, capsys):
     out = tmp_path / "demo"
-    # The steps end the fit, however slow the machine is.
-    words = ["demo", "-o", str(out), "--frames", "2", "--size", "64x36", "--minutes", "60"]
-    assert cli.main(words) == 0
-    said = capsys.readouterr().out
-    assert "held-out PSNR" in said and str(out / "contact-sheet.jpg") in said
+    # The number of steps ends the fit, independent of the speed of the machine.
+    args = ["demo", "-o", str(out), "--frames", "2", "--size", "64x36", "--minutes", "60"]
+    assert cli.main(args) == 0
+    printed = capsys.readouterr().out
+    assert "held-out PSNR" in printed and str(out / "contact-sheet.jpg") in printed
     shows = {"flood": "water_share", "snow": "snow_share", "smog": "mean_transmittance"}
     for name in ("clean", *shows):
-        assert str(out / name / "movie.mp4") in said
+        assert str(out / name / "movie.mp4") in printed
         assert (out / name / "movie.mp4").stat().st_size > 500
         frames = json.loads((out / name / "movie.json").read_text())["frames"]
         assert len(frames) == 2
@@ -47,14 +47,14 @@ def test_four_movies_and_a_sheet_with_the_effect_in_each(tmp_path, capsys):
             assert (got["mean_transmittance"] < 0.95) == (name == "smog"), name
     assert Image.open(out / "contact-sheet.jpg").size[0] >= 2 * 64
     written = (out / "flood" / "movie.mp4").stat().st_mtime_ns
-    assert cli.main(words) == 0, "the same command resumes"
+    assert cli.main(args) == 0, "the same command resumes"
     assert "Continuing the run" in capsys.readouterr().err
     assert (out / "flood" / "movie.mp4").stat().st_mtime_ns == written, "nothing is rendered again"
-    (out / "run" / "optimiser.safetensors").unlink()  # as the documents allow
-    assert cli.main(words) == 0
+    (out / "run" / "optimiser.safetensors").unlink()  # documented values
+    assert cli.main(args) == 0
 
 
-def test_ctrl_c_while_fitting_names_the_way_to_resume(tmp_path, capsys, monkeypatch):
+def test_ctrl_c_during_the_fit_prints_how_to_resume(tmp_path, capsys, monkeypatch):
     from climatenerf.training.trainer import Trainer
 
     step = Trainer.step

@@ -17,9 +17,9 @@ from climatenerf.output.score_report import check_folder
 REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "street"
 
 
-def error_of(capsys, *words):
+def error_of(capsys, *args):
     capsys.readouterr()
-    assert cli.main([str(word) for word in words]) == 2
+    assert cli.main([str(arg) for arg in args]) == 2
     err = capsys.readouterr().err
     assert "Traceback" not in err
     return err
@@ -31,15 +31,15 @@ def test_evaluation_requires_a_reference(capsys, tmp_path):
 
 
 def test_an_ablation_requires_a_reference_set(capsys, tmp_path, monkeypatch):
-    words = ["evaluate", REFERENCE, "--ablation", "-o", tmp_path / "out"]
-    assert "above 0" in error_of(capsys, *words, "--minutes", "0")
-    assert "--reference" in error_of(capsys, *words, "--reference")
-    assert "no row 'sun'; choose from: plain NGP" in error_of(capsys, *words, "--rows", "sun")
+    args = ["evaluate", REFERENCE, "--ablation", "-o", tmp_path / "out"]
+    assert "above 0" in error_of(capsys, *args, "--minutes", "0")
+    assert "--reference" in error_of(capsys, *args, "--reference")
+    assert "no row 'sun'; choose from: plain NGP" in error_of(capsys, *args, "--rows", "sun")
     assert "--rows" in error_of(capsys, "evaluate", REFERENCE, "--rows", "full", "-o", tmp_path)
     street = REFERENCE.parents[1] / "src/climatenerf/assets/street"
     err = error_of(capsys, "evaluate", street, "--ablation", "-o", tmp_path / "out")
     assert "reference" in err and not (tmp_path / "out").exists()
-    err = error_of(capsys, *words[:-1], REFERENCE / "truth")
+    err = error_of(capsys, *args[:-1], REFERENCE / "truth")
     assert "lies in the reference set" in err
 
 
@@ -82,11 +82,11 @@ def run_folder(tmp_path_factory):
         PRESETS["cpu"], geometry_log2_rows=14, appearance_log2_rows=14, cascades=4
     )
     settings = functools.partial(FitSettings, samples_per_step=2**14, size=small)
-    words = ["fit", str(REFERENCE), "-o", str(folder), "--steps", "400", "--downscale", "4"]
+    args = ["fit", str(REFERENCE), "-o", str(folder), "--steps", "400", "--downscale", "4"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli_fit, "settings_of", lambda preset, device: settings(preset=preset))
         patch.setattr(run_module, "PREVIEW_WIDTH", 64)
-        assert cli.main(words) == 0
+        assert cli.main(args) == 0
     return folder
 
 
@@ -94,8 +94,8 @@ def run_folder(tmp_path_factory):
 def test_a_report_has_all_scores_and_pictures(run_folder, tmp_path, capsys):
     out = tmp_path / "report"
     names = ["smog-mid", "flood-low", "snow-deep"]
-    words = ["evaluate", str(run_folder), "--reference", "-o", str(out), "--views", "t04"]
-    assert cli.main([*words, "--weathers", *names]) == 0
+    args = ["evaluate", str(run_folder), "--reference", "-o", str(out), "--views", "t04"]
+    assert cli.main([*args, "--weathers", *names]) == 0
     table = capsys.readouterr().out
     assert "screen-reflection" in table and "report.md" in table
     report = json.loads((out / "report.json").read_text())
@@ -128,7 +128,7 @@ def test_a_report_has_all_scores_and_pictures(run_folder, tmp_path, capsys):
     assert warped["baselines"]["frame-noise"]["smog"]["next"] > 1.5 * warped["smog"]["next"]
     assert np.isfinite(report["completeness"]["mirror_psnr"])
     # The message names the unknown weather.
-    assert "flood-low" in error_of(capsys, *words, "--weathers", "flod-low")
+    assert "flood-low" in error_of(capsys, *args, "--weathers", "flod-low")
 
 
 @pytest.mark.slow

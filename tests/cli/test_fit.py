@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.command_line import FEW_ROWS, STREET, complaint
+from support.command_line import FEW_ROWS, STREET, error_message
 
 from climatenerf import cli
 from climatenerf.cli.fit import Fit, fit_settings, resuming
@@ -47,9 +47,9 @@ def test_fit_writes_a_run_folder(run_folder):
     assert list((run_folder / "previews").glob("*.jpg"))
 
 
-def test_fit_refuses_a_folder_that_holds_a_run(run_folder, capsys):
-    said = complaint(capsys, "fit", STREET, "-o", run_folder, "--steps", "1")
-    assert "--resume" in said
+def test_fit_refuses_a_folder_that_contains_a_run(run_folder, capsys):
+    message = error_message(capsys, "fit", STREET, "-o", run_folder, "--steps", "1")
+    assert "--resume" in message
 
 
 def contents(folder):
@@ -57,7 +57,7 @@ def contents(folder):
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("args", "expected"),
     [
         (["--camera-height", "3 m"], "keeps its scale"),
         (["--metric-input"], "keeps its scale"),
@@ -65,12 +65,12 @@ def contents(folder):
         (["--downscale", "6", "--holdout", "0"], "other photos"),
     ],
 )
-def test_a_resume_with_other_settings_is_refused(run_folder, capsys, monkeypatch, words, expected):
+def test_a_resume_with_other_settings_is_refused(run_folder, capsys, monkeypatch, args, expected):
     settings = FitSettings(size=FEW_ROWS)
     monkeypatch.setattr("climatenerf.cli.fit.settings_of", lambda preset, device: settings)
     before = contents(run_folder)
-    said = complaint(capsys, "fit", STREET, "-o", run_folder, "--resume", *words)
-    assert expected in said
+    message = error_message(capsys, "fit", STREET, "-o", run_folder, "--resume", *args)
+    assert expected in message
     assert contents(run_folder) == before
 
 
@@ -79,8 +79,8 @@ def test_a_run_of_another_preset_is_refused_before_labels_are_made(run_folder, c
         raise AssertionError("labels may take minutes to make")
 
     monkeypatch.setattr("climatenerf.cli.fit.with_perception", minutes)
-    said = complaint(capsys, "fit", STREET, "-o", run_folder, "--resume", "--preset", "gpu")
-    assert "with --preset cpu; resume it with the same" in said
+    message = error_message(capsys, "fit", STREET, "-o", run_folder, "--resume", "--preset", "gpu")
+    assert "with --preset cpu; resume it with the same" in message
 
 
 def test_the_command_that_resumes_a_run_repeats_its_flags():
@@ -93,16 +93,16 @@ def test_the_command_that_resumes_a_run_repeats_its_flags():
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("args", "expected"),
     [
         (["--loss", "foo=1"], "Names: distortion"),
-        (["--loss", "sky"], "--loss wants"),
-        (["--loss", "sky=-1"], "--loss wants"),
+        (["--loss", "sky"], "--loss needs"),
+        (["--loss", "sky=-1"], "--loss needs"),
         (["--loss", "normal_consistency=1", "--loss", "normals=0"], "needs predicted normals"),
     ],
 )
-def test_invalid_losses_are_refused(tmp_path, capsys, words, expected):
-    assert expected in complaint(capsys, "fit", STREET, "-o", tmp_path / "run", *words)
+def test_invalid_losses_are_refused(tmp_path, capsys, args, expected):
+    assert expected in error_message(capsys, "fit", STREET, "-o", tmp_path / "run", *args)
     assert not (tmp_path / "run").exists()
 
 
@@ -113,9 +113,9 @@ def test_loss_flags_override_the_preset():
     assert settings.preset == "paper" and settings.opaque_sky
     assert fit_settings(dataclasses.replace(fit, mono_depth="none")).losses.monocular_depth == 0
     earlier = dataclasses.replace(fit, loss=("sky=0", "flat=0.5"))
-    assert fit_settings(earlier) == settings, "earlier names of losses are taken as well"
-    words = resuming(fit)
-    assert "--loss sky=0 --loss planarity=0.5" in words and "--preset paper" in words
+    assert fit_settings(earlier) == settings, "earlier names of losses are accepted"
+    command = resuming(fit)
+    assert "--loss sky=0 --loss planarity=0.5" in command and "--preset paper" in command
     assert resuming(Fit(Path("a"), Path("b"), refine_poses=True)).endswith("--refine-poses")
 
 
@@ -125,8 +125,8 @@ def test_loss_flags_override_the_preset():
      ("DOOR=2 m", "mark.html")],
 )  # fmt: skip
 def test_invalid_known_lengths_are_refused(tmp_path, capsys, text, expected):
-    words = ["fit", STREET, "-o", tmp_path / "run", "--known-length", text]
-    assert expected in complaint(capsys, *words)
+    args = ["fit", STREET, "-o", tmp_path / "run", "--known-length", text]
+    assert expected in error_message(capsys, *args)
     assert not (tmp_path / "run").exists()
 
 
@@ -157,23 +157,23 @@ def test_a_known_length_sets_the_scale(tmp_path):
 def test_a_run_with_deleted_files_is_not_overwritten(run_folder, tmp_path, capsys, remaining):
     (tmp_path / "run").mkdir()
     shutil.copy(run_folder / remaining, tmp_path / "run" / remaining)
-    complaint(capsys, "fit", STREET, "-o", tmp_path / "run", "--steps", "1")
+    error_message(capsys, "fit", STREET, "-o", tmp_path / "run", "--steps", "1")
     assert [p.name for p in (tmp_path / "run").iterdir()] == [remaining]
 
 
-def test_a_capture_is_never_written_into(tmp_path, capsys):
+def test_fit_does_not_write_into_the_capture(tmp_path, capsys):
     scene = tmp_path / "scene"
     shutil.copytree(STREET, scene)
     before = contents(scene)
-    assert "capture itself" in complaint(capsys, "fit", scene, "-o", scene, "--steps", "1")
+    assert "capture itself" in error_message(capsys, "fit", scene, "-o", scene, "--steps", "1")
     shutil.copytree(scene, tmp_path / "other")
-    said = complaint(capsys, "fit", scene, "-o", tmp_path / "other", "--steps", "1")
-    assert "overwritten" in said
+    message = error_message(capsys, "fit", scene, "-o", tmp_path / "other", "--steps", "1")
+    assert "overwritten" in message
     assert contents(scene) == contents(tmp_path / "other") == before
 
 
 def capture(folder, count=6, **changes):
-    """A small transforms.json whose frames can be spoilt."""
+    """Write a small capture; `spoil` changes its transforms.json."""
     frames = []
     for i in range(count):
         path = folder / "images" / f"{i}.png"
@@ -195,36 +195,38 @@ def spoil_pose(data):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("spoil", "expected"),
     [
         (spoil_pose, "finite"),
         (lambda data: data.update(fl_x=0.0), "focal"),
         (lambda data: data.update(camera_model="PERISCOPE"), "PERISCOPE"),
     ],
 )
-def test_invalid_poses_and_cameras_are_refused(tmp_path, capsys, spoil, words):
+def test_invalid_poses_and_cameras_are_refused(tmp_path, capsys, spoil, expected):
     data = capture(tmp_path / "scene")
     spoil(data)
     (tmp_path / "scene" / "transforms.json").write_text(json.dumps(data))
-    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
-    assert words in said
+    message = error_message(
+        capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1"
+    )
+    assert expected in message
     assert not (tmp_path / "run").exists()
 
 
 def test_missing_folders_and_folders_without_pictures_are_refused(tmp_path, capsys):
-    said = complaint(capsys, "fit", tmp_path / "absent", "-o", tmp_path / "run")
-    assert "absent" in said and "does not exist" in said
+    message = error_message(capsys, "fit", tmp_path / "absent", "-o", tmp_path / "run")
+    assert "absent" in message and "does not exist" in message
     (tmp_path / "empty").mkdir()
-    said = complaint(capsys, "fit", tmp_path / "empty", "-o", tmp_path / "run")
-    assert "neither images nor poses" in said
+    message = error_message(capsys, "fit", tmp_path / "empty", "-o", tmp_path / "run")
+    assert "neither images nor poses" in message
 
 
 def test_missing_pictures_are_counted_and_too_few_are_an_error(tmp_path, capsys):
     capture(tmp_path / "scene")
     for i in (1, 2, 3, 4):
         (tmp_path / "scene" / "images" / f"{i}.png").unlink()
-    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run")
-    assert "2 of the 6" in said
+    message = error_message(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run")
+    assert "2 of the 6" in message
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.5])
@@ -233,13 +235,15 @@ def test_a_truncated_picture_is_refused(tmp_path, capsys, keep):
     path = tmp_path / "scene" / "images" / "3.png"
     data = path.read_bytes()
     path.write_bytes(data[: int(keep * len(data))])
-    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
-    assert "3.png" in said
+    message = error_message(
+        capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1"
+    )
+    assert "3.png" in message
     assert not (tmp_path / "run" / "field.safetensors").exists()
 
 
 @pytest.mark.parametrize(
-    "words",
+    "args",
     [
         ["--minutes", "0"],
         ["--minutes", "nan"],
@@ -252,9 +256,9 @@ def test_a_truncated_picture_is_refused(tmp_path, capsys, keep):
         ["--downscale", "99"],
     ],
 )
-def test_fit_options_out_of_range_are_refused(tmp_path, capsys, words):
+def test_fit_options_out_of_range_are_refused(tmp_path, capsys, args):
     capture(tmp_path / "scene")
-    complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", *words)
+    error_message(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", *args)
 
 
 def test_masks_that_leave_no_pixels_are_refused(tmp_path, capsys):
@@ -263,16 +267,20 @@ def test_masks_that_leave_no_pixels_are_refused(tmp_path, capsys):
     for i in range(6):
         path = tmp_path / "scene" / "masks" / f"{i}.png"
         Image.fromarray(np.zeros((24, 32), np.uint8)).save(path)
-    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
-    assert "masks" in said and not (tmp_path / "run").exists()
+    message = error_message(
+        capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1"
+    )
+    assert "masks" in message and not (tmp_path / "run").exists()
     mask = np.zeros((24, 32), np.uint8)
-    mask[12, 16] = 255  # a pixel of one photo is as good as nothing
+    mask[12, 16] = 255  # one pixel of one photo is too few
     Image.fromarray(mask).save(tmp_path / "scene" / "masks" / "3.png")
-    said = complaint(capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1")
-    assert "masks" in said and not (tmp_path / "run").exists()
+    message = error_message(
+        capsys, "fit", tmp_path / "scene", "-o", tmp_path / "run", "--steps", "1"
+    )
+    assert "masks" in message and not (tmp_path / "run").exists()
 
 
 def test_unknown_held_out_photos_are_refused(tmp_path, capsys):
     capture(tmp_path / "scene")
-    words = ["fit", tmp_path / "scene", "-o", tmp_path / "run", "--holdout", "nobody.png"]
-    assert "nobody.png" in complaint(capsys, *words)
+    args = ["fit", tmp_path / "scene", "-o", tmp_path / "run", "--holdout", "nobody.png"]
+    assert "nobody.png" in error_message(capsys, *args)

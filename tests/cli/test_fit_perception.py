@@ -1,4 +1,4 @@
-"""Where `fit` takes labels and relative depths from."""
+"""Sources of labels and relative depths for `fit`."""
 
 import numpy as np
 import pytest
@@ -24,22 +24,22 @@ def capture(tmp_path):
 
 @pytest.fixture
 def fitted(monkeypatch):
-    """The scenes that would have been fitted."""
+    """Record the scenes that would be fitted."""
     scenes = []
 
-    def stand_in(scene, options):
+    def record(scene, options):
         scenes.append(scene)
         return {"interrupted": True, "psnr": None, "steps": 1, "seconds": 1.0}
 
-    monkeypatch.setattr(fit, "fit_with_bars", stand_in)
+    monkeypatch.setattr(fit, "fit_with_bars", record)
     return scenes
 
 
-def fit_of(capture, *words):
-    return cli.main(["fit", str(capture), "-o", str(capture.parent / "run"), *map(str, words)])
+def fit_of(capture, *args):
+    return cli.main(["fit", str(capture), "-o", str(capture.parent / "run"), *map(str, args)])
 
 
-def test_sky_is_found_where_nothing_is_given(capture, fitted, capsys):
+def test_sky_is_labelled_without_given_labels(capture, fitted, capsys):
     assert fit_of(capture) == 0
     err = capsys.readouterr().err
     assert "--labels MODEL" in err and "labels: 100 %" in err
@@ -48,15 +48,15 @@ def test_sky_is_found_where_nothing_is_given(capture, fitted, capsys):
     assert len(list(fitted[0].views[0].label_path.parent.glob("*.png"))) == 9
 
 
-def test_none_ignores_the_labels_and_resuming_says_so(capture, fitted, capsys):
+def test_none_ignores_labels_and_is_part_of_the_resuming_command(capture, fitted, capsys):
     (capture / "labels").mkdir()
     Image.new("L", (32, 24), 0).save(capture / "labels" / "000.png")
     assert fit_of(capture) == fit_of(capture, "--labels", "none", "--mono-depth", "none") == 0
     assert fitted[0].views[0].label_path and not fitted[1].views[0].label_path
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert "--labels none" in said
-    words = [word for word in said.split(" -o ")[1].split()[1:] if word != "--resume"]
-    assert fit_of(capture, *words) == 0, "the words are understood"
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert "--labels none" in message
+    args = [word for word in message.split(" -o ")[1].split()[1:] if word != "--resume"]
+    assert fit_of(capture, *args) == 0, "the printed command is valid"
     assert not fitted[2].views[0].label_path
 
 
@@ -72,7 +72,7 @@ def test_unknown_models_are_refused_before_the_fit(capture, fitted, capsys):
     assert not fitted
 
 
-def test_networks_of_the_user_s(capture, fitted, tmp_path, capsys):
+def test_networks_of_the_user_make_labels_and_depth(capture, fitted, tmp_path, capsys):
     pytest.importorskip("transformers", reason="pip install .[perception]")
     from support import networks
 

@@ -16,7 +16,7 @@ from climatenerf.core.errors import UserError
 
 @dataclass
 class Options:
-    """Options of a verb made for the tests."""
+    """Options of a test verb."""
 
     scene: str
     minutes: float = 5.0
@@ -24,7 +24,7 @@ class Options:
 
 @pytest.fixture
 def verb(monkeypatch):
-    """Replaces ``fit`` by a verb whose ``run`` each test sets."""
+    """Replace ``fit`` by a verb whose ``run`` each test sets."""
     module = types.ModuleType("a_verb_for_tests")
     module.Options = Options  # type: ignore[attr-defined]
     module.run = lambda options: None  # type: ignore[attr-defined]
@@ -35,13 +35,13 @@ def verb(monkeypatch):
     return module
 
 
-def program(*words):
+def program(*args):
     return subprocess.run(
-        [sys.executable, "-m", "climatenerf", *words], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", "climatenerf", *args], capture_output=True, text=True, timeout=60
     )
 
 
-def test_help_lists_every_verb_and_imports_nothing_heavy():
+def test_help_lists_every_verb_and_does_not_import_torch():
     done = program("--help")
     assert done.returncode == 0 and done.stderr == ""
     for name, verb in cli.VERBS.items():
@@ -55,10 +55,10 @@ def test_help_lists_every_verb_and_imports_nothing_heavy():
 
 
 def test_a_closed_pipe_is_no_error():
-    words = [sys.executable, "-m", "climatenerf", "--help"]
+    args = [sys.executable, "-m", "climatenerf", "--help"]
     buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     pipe = subprocess.PIPE
-    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, env=buffered)
+    process = subprocess.Popen(args, stdout=pipe, stderr=pipe, env=buffered)
     assert process.stdout is not None and process.stderr is not None
     process.stdout.close()
     assert process.stderr.read() == b""
@@ -70,15 +70,15 @@ def test_missing_and_unknown_verbs_are_refused(capsys):
     assert cli.main([]) == 2
     assert "usage:" in capsys.readouterr().out
     assert cli.main(["rendr"]) == 2
-    complaint = "climatenerf: there is no verb 'rendr'; did you mean render?\n"
-    assert capsys.readouterr().err == complaint
+    error_message = "climatenerf: there is no verb 'rendr'; did you mean render?\n"
+    assert capsys.readouterr().err == error_message
     assert cli.main(["xyzzy"]) == 2
     assert (
         "use one of capture, check, fit, render, evaluate, export, demo" in capsys.readouterr().err
     )
 
 
-def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):
+def test_a_verb_receives_its_options_and_the_threading_defaults(verb, monkeypatch):
     seen = []
     verb.run = lambda options: seen.append((options, os.environ["NUMBA_THREADING_LAYER_PRIORITY"]))
     assert cli.main(["fit", "--scene", "a", "--minutes", "2"]) == 0
@@ -88,7 +88,7 @@ def test_verb_gets_its_options_and_the_threading_defaults(verb, monkeypatch):
     cli.main(["fit", "--scene", "a"])
     assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE", "the user's own choice stays"
     for name in cli.THREADING:
-        monkeypatch.setenv(name, "")  # so that monkeypatch takes them away again
+        monkeypatch.setenv(name, "")  # so that monkeypatch removes them again
 
 
 def failing(error):
@@ -99,18 +99,18 @@ def failing(error):
 
 
 @pytest.mark.parametrize(
-    "error, status, words",
+    "error, status, message",
     [
         (UserError("no photographs in /x; give another folder"), 2, "climatenerf: no photographs"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (OSError(errno.ENOSPC, "No space", "/x/a.png"), 2, "disk is full while writing /x/a.png"),
     ],
 )
-def test_expected_failures_are_one_line(verb, capsys, error, status, words):
+def test_expected_failures_are_one_line(verb, capsys, error, status, message):
     verb.run = failing(error)
     assert cli.main(["fit", "--scene", "a"]) == status
     err = capsys.readouterr().err
-    assert words in err and len(err.strip().splitlines()) == 1 and "Traceback" not in err
+    assert message in err and len(err.strip().splitlines()) == 1 and "Traceback" not in err
 
 
 IN_A_TERMINAL = """
@@ -150,7 +150,7 @@ def stopped_in_a_terminal(how):
     while True:
         try:
             more = os.read(ours, 4096)
-        except OSError:  # on Linux: the other side is closed
+        except OSError:  # Linux: the other side is closed
             break
         if b"READY" in more and b"READY" not in output:
             process.send_signal(how)
@@ -219,7 +219,7 @@ def test_help_of_a_verb_does_not_load_torch(verb):
         "except SystemExit as exit_status:\n    status = exit_status.code\n"
         "print('HEAVY', sorted({'torch', 'numba'} & set(sys.modules)), 'STATUS', status)"
     )
-    words = [sys.executable, "-c", code, verb, "--help"]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    args = [sys.executable, "-c", code, verb, "--help"]
+    done = subprocess.run(args, capture_output=True, text=True, timeout=60)
     assert done.stdout.rstrip().endswith("HEAVY [] STATUS 0"), done.stdout + done.stderr
     assert f"climatenerf {verb}" in done.stdout

@@ -78,10 +78,10 @@ def test_terminal_shows_a_bar_with_its_columns(monkeypatch, width):
     assert "preview saved [here]" in text
 
 
-def test_stages_have_a_bar_each_and_end_before_the_next(clock, capsys):
+def test_each_stage_has_a_bar_that_ends_before_the_next(clock, capsys):
     with progress.StageBars("flood: ") as bars:
         bars("light", 0.0)
-        bars("frames", 0.5)  # half of them were rendered before
+        bars("frames", 0.5)  # half of the frames exist
         clock.now += 20
         bars("frames", 0.75)
         bars("frames", 1.0)
@@ -92,7 +92,7 @@ def test_stages_have_a_bar_each_and_end_before_the_next(clock, capsys):
     ]
 
 
-def test_an_interrupted_stage_shows_how_far_it_was(clock, capsys):
+def test_an_interrupted_stage_shows_its_progress(clock, capsys):
     with pytest.raises(KeyboardInterrupt), progress.StageBars() as bars:
         bars("frames", 0.0)
         bars("frames", 0.25)

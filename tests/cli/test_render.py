@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from support.command_line import STREET, complaint, run_cli
+from support.command_line import STREET, error_message, run_cli
 
 from climatenerf import cli
 from climatenerf.core.storage import read_safetensors, write_safetensors
@@ -26,10 +26,10 @@ OURS = ["frames/0000.png", "movie.mp4", "movie.json", "depth/0000.npz", "preview
 
 
 def test_a_shorter_render_removes_the_frames_of_an_earlier_longer_one(run_folder, tmp_path):
-    words = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--layers", "depth"]
-    assert run_cli(*words, "--frames", "3") == 0
+    args = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--layers", "depth"]
+    assert run_cli(*args, "--frames", "3") == 0
     (tmp_path / "frames" / "mine.png").write_bytes(b"not a frame")
-    assert run_cli(*words, "--frames", "1", "--smog.visibility", "50 m") == 0
+    assert run_cli(*args, "--frames", "1", "--smog.visibility", "50 m") == 0
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["0000.png", "mine.png"]
     assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["0000.npz"]
     sidecar = json.loads((tmp_path / "movie.json").read_text())
@@ -37,15 +37,15 @@ def test_a_shorter_render_removes_the_frames_of_an_earlier_longer_one(run_folder
 
 
 def test_flags_of_an_absent_effect_give_a_warning(run_folder, tmp_path, capsys):
-    words = ["render", str(run_folder), *map(str, SMALL), "--frames", "1", "-o", str(tmp_path)]
-    assert cli.main([*words, "--flood.wind-speed", "4 m/s", "--snow.depth", "1 cm"]) == 0
+    args = ["render", str(run_folder), *map(str, SMALL), "--frames", "1", "-o", str(tmp_path)]
+    assert cli.main([*args, "--flood.wind-speed", "4 m/s", "--snow.depth", "1 cm"]) == 0
     err = capsys.readouterr().err
     assert "--flood.wind-speed changes nothing without --flood.level" in err
     assert "--snow" not in err
     film = tmp_path / "film.toml"
     film.write_text('[flood]\nlevel = { "0 s" = "1 cm", "1 s" = "2 cm" }\n')
     given = ["--weather", str(film), "--flood.wind-speed", "4 m/s"]
-    assert cli.main([*words[:-1], str(tmp_path / "film"), *given]) == 0
+    assert cli.main([*args[:-1], str(tmp_path / "film"), *given]) == 0
     assert "changes nothing" not in capsys.readouterr().err
 
 
@@ -54,22 +54,22 @@ def test_a_render_overwrites_no_foreign_file(run_folder, tmp_path, capsys, name)
     mine = tmp_path / "mine" / name
     mine.parent.mkdir(parents=True)
     mine.write_bytes(b'{"mine": 1}')
-    words = ["render", run_folder, "-o", tmp_path / "mine", "--layers", "depth", *SMALL]
-    words += ["--preview"]
-    assert mine.name in complaint(capsys, *words)
+    args = ["render", run_folder, "-o", tmp_path / "mine", "--layers", "depth", *SMALL]
+    args += ["--preview"]
+    assert mine.name in error_message(capsys, *args)
     assert mine.read_bytes() == b'{"mine": 1}'
     assert [p for p in (tmp_path / "mine").rglob("*") if p.is_file()] == [mine]
 
 
 def test_a_preview_changes_no_frame_and_is_removed(run_folder, tmp_path):
-    """Also where a killed render left a preview."""
+    """Also a preview that a killed render left."""
     (tmp_path / "early").mkdir()
     left_over = tmp_path / "early" / "preview.png"
     write_png(left_over, np.zeros((2, 2, 3), np.uint8), "killed")
-    words = ["render", str(run_folder), *map(str, SMALL)]
-    assert cli.main([*words, "-o", str(tmp_path / "early"), "--preview"]) == 0
+    args = ["render", str(run_folder), *map(str, SMALL)]
+    assert cli.main([*args, "-o", str(tmp_path / "early"), "--preview"]) == 0
     assert not left_over.exists()
-    assert cli.main([*words, "-o", str(tmp_path / "plain")]) == 0
+    assert cli.main([*args, "-o", str(tmp_path / "plain")]) == 0
     for index in range(2):
         frame = f"frames/{index:04d}.png"
         same = [read_rgb(tmp_path / folder / frame) for folder in ("early", "plain")]
@@ -77,17 +77,17 @@ def test_a_preview_changes_no_frame_and_is_removed(run_folder, tmp_path):
 
 
 def test_parts_in_any_order_are_joined_to_the_movie_of_one_render(run_folder, tmp_path, capsys):
-    words = ["render", run_folder, "--size", "48x27", "--frames", "5", "--layers", "depth"]
-    words += ["--flood.level", "0.3 m"]
-    assert run_cli(*words, "-o", tmp_path / "whole") == 0
-    parts = [*words, "-o", tmp_path / "parts"]
+    args = ["render", run_folder, "--size", "48x27", "--frames", "5", "--layers", "depth"]
+    args += ["--flood.level", "0.3 m"]
+    assert run_cli(*args, "-o", tmp_path / "whole") == 0
+    parts = [*args, "-o", tmp_path / "parts"]
     assert run_cli(*parts, "--part", "2/2") == 0
     out, err = capsys.readouterr()
     assert f"frames: {tmp_path / 'parts' / 'frames'}" in out and "2 of 5 frames are finished" in err
     made = sorted(p.name for p in (tmp_path / "parts" / "frames").iterdir())
     assert made == ["0001.png", "0003.png"]
-    said = complaint(capsys, *parts, "--join")
-    assert "3 of 5 frames" in said and "0000, 0002, 0004" in said
+    message = error_message(capsys, *parts, "--join")
+    assert "3 of 5 frames" in message and "0000, 0002, 0004" in message
     assert not (tmp_path / "parts" / "movie.json").exists()
     assert run_cli(*parts, "--part", "1/2") == run_cli(*parts, "--join") == 0
     for path in (tmp_path / "whole").rglob("*"):
@@ -100,9 +100,9 @@ def test_parts_in_any_order_are_joined_to_the_movie_of_one_render(run_folder, tm
 def test_processes_render_parts_of_a_run_and_one_is_killed(run_folder, tmp_path):
     flags = ["--size", "48x27", "--frames", "6", "--flood.level", "0.3 m", "--snow.depth", "9 cm"]
 
-    def start(out, *words):
+    def start(out, *args):
         command = [sys.executable, "-m", "climatenerf", "render", run_folder, "-o", tmp_path / out]
-        return subprocess.Popen([*map(str, command), *flags, *words], stderr=subprocess.DEVNULL)
+        return subprocess.Popen([*map(str, command), *flags, *args], stderr=subprocess.DEVNULL)
 
     assert start("whole").wait() == 0
     killed, other = start("parts", "--part", "1/2"), start("parts", "--part", "2/2")
@@ -119,12 +119,12 @@ def test_processes_render_parts_of_a_run_and_one_is_killed(run_folder, tmp_path)
 
 
 def test_a_part_with_other_flags_leaves_an_unfinished_render_alone(run_folder, tmp_path, capsys):
-    words = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--frames", "2"]
-    assert run_cli(*words, "--part", "1/2") == 0
+    args = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--frames", "2"]
+    assert run_cli(*args, "--part", "1/2") == 0
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
     for flags in (["--part", "2/2"], []):
-        said = complaint(capsys, *words, "--smog.visibility", "50 m", *flags)
-        assert "unfinished render with other settings" in said
+        message = error_message(capsys, *args, "--smog.visibility", "50 m", *flags)
+        assert "unfinished render with other settings" in message
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
 
 
@@ -132,16 +132,16 @@ def test_path_files_with_huge_frames_or_deep_nesting_are_refused(run_folder, tmp
     entry = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 45}
     path = {"render_width": 100000, "render_height": 100000, "fps": 5, "camera_path": [entry]}
     (tmp_path / "path.json").write_text(json.dumps(path))
-    words = ["render", run_folder, "-o", tmp_path / "out", "--path", tmp_path / "path.json"]
-    assert "too large" in complaint(capsys, *words)
+    args = ["render", run_folder, "-o", tmp_path / "out", "--path", tmp_path / "path.json"]
+    assert "too large" in error_message(capsys, *args)
     (tmp_path / "path.json").write_text("[" * 100_000)
-    assert "deeply" in complaint(capsys, *words)
+    assert "deeply" in error_message(capsys, *args)
 
 
 def test_the_sidecar_is_written_without_a_movie(run_folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "absent"))
-    said = complaint(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL)
-    assert "ffmpeg" in said
+    message = error_message(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL)
+    assert "ffmpeg" in message
     sidecar = json.loads((tmp_path / "out" / "movie.json").read_text())
     assert len(sidecar["frames"]) == 2 and sidecar["frames_wanted"] == 2
     assert "lowest_ground_z" in sidecar
@@ -149,9 +149,9 @@ def test_the_sidecar_is_written_without_a_movie(run_folder, tmp_path, capsys, mo
 
 
 def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypatch):
-    words = ["render", run_folder, "-o", tmp_path, *SMALL, "--layers", "all"]
-    words += ["--flood.level", "0.4 m", "--smog.visibility", "60 m", "--snow.depth", "15 cm"]
-    assert run_cli(*words) == 0
+    args = ["render", run_folder, "-o", tmp_path, *SMALL, "--layers", "all"]
+    args += ["--flood.level", "0.4 m", "--smog.visibility", "60 m", "--snow.depth", "15 cm"]
+    assert run_cli(*args) == 0
     assert f"movie: {tmp_path / 'movie.mp4'}" in capsys.readouterr().out
     assert (tmp_path / "movie.mp4").stat().st_size > 500
     frames = [np.asarray(Image.open(p)) for p in sorted((tmp_path / "frames").glob("*.png"))]
@@ -166,7 +166,7 @@ def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypa
     assert len(sidecar["frames"]) == 2 and sidecar["appearance_of_training_view"] is None
     expected_layers = set(layer_table()) - {
         "label"
-    }  # the embedded street's labels know the sky alone
+    }  # labels of the embedded street contain the sky only
     for frame in sidecar["frames"]:
         assert (frame["camera"]["width"], frame["camera"]["height"]) == (96, 54)
         assert np.array(frame["c2w_world"]).shape == (4, 4)
@@ -182,7 +182,7 @@ def test_render_with_all_weathers_at_once(run_folder, tmp_path, capsys, monkeypa
         for mask in ("mask_water", "mask_snow", "mask_smog", "transmittance"):
             assert layers[mask].min() >= -1e-5 and layers[mask].max() <= 1 + 1e-5
         assert layers["mask_water"].mean() > 0.02 and layers["mask_smog"].mean() > 0.05
-        # Smog in closed form: the transmittance is that of the depth beside it.
+        # The transmittance layer is the closed form of the depth layer.
         seen = np.isfinite(layers["depth"])
         expected = np.exp(-2.996 / 60 * layers["depth"][seen])
         assert np.allclose(layers["transmittance"][seen], expected, atol=2e-3)
@@ -200,8 +200,8 @@ def test_render_without_weather_along_a_drawn_path(run_folder, tmp_path):
     }
     (tmp_path / "camera_path.json").write_text(json.dumps(path))
     out = tmp_path / "out"
-    words = ["render", run_folder, "-o", out, "--path", tmp_path / "camera_path.json"]
-    assert run_cli(*words) == 0
+    args = ["render", run_folder, "-o", out, "--path", tmp_path / "camera_path.json"]
+    assert run_cli(*args) == 0
     sidecar = json.loads((out / "movie.json").read_text())
     assert sidecar["fps"] == 5 and len(sidecar["frames"]) == 2
     assert np.allclose(sidecar["frames"][0]["c2w_input"], c2w, atol=1e-5)
@@ -214,16 +214,16 @@ def test_flags_override_a_weather_file(run_folder, tmp_path, monkeypatch):
     weather = tmp_path / "weather.toml"
     weather.write_text('seed = 7\n[smog]\nvisibility = "80 m"\n[flood]\nlevel = "0.3 m"\n')
     out = tmp_path / "out"
-    words = ["render", run_folder, "-o", out, "--weather", weather, "--frames", "1"]
-    words += ["--size", "64x36", "--smog.visibility", "20 m"]
-    assert run_cli(*words) == 0
+    args = ["render", run_folder, "-o", out, "--weather", weather, "--frames", "1"]
+    args += ["--size", "64x36", "--smog.visibility", "20 m"]
+    assert run_cli(*args) == 0
     weather = json.loads((out / "movie.json").read_text())["weather"]
     assert weather["seed"] == 7 and weather["flood"]["level"] == "0.3 m"
     assert weather["smog"]["visibility"] == "20 m", "flags win, whoever called main"
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("args", "expected"),
     [
         (["--flood.level", "90 m"], "above the whole scene"),
         (["--size", "wide"], "--size"),
@@ -247,10 +247,10 @@ def test_flags_override_a_weather_file(run_folder, tmp_path, monkeypatch):
     ],
 )
 def test_invalid_options_are_refused_and_write_nothing(
-    run_folder, tmp_path, capsys, words, expected
+    run_folder, tmp_path, capsys, args, expected
 ):
-    said = complaint(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL, *words)
-    assert expected in said
+    message = error_message(capsys, "render", run_folder, "-o", tmp_path / "out", *SMALL, *args)
+    assert expected in message
     assert not (tmp_path / "out").exists(), "nothing is begun"
 
 
@@ -273,8 +273,8 @@ def test_frames_have_the_appearance_of_the_given_photo(run_folder, tmp_path):
     frames, appearances = [], []
     for name in ("mean", train[2].name, train[3].name):
         out = tmp_path / name
-        words = ["--path", "still", "--frames", "1", "--size", "64x36", "--appearance", name]
-        assert run_cli("render", run, "-o", out, *words) == 0
+        args = ["--path", "still", "--frames", "1", "--size", "64x36", "--appearance", name]
+        assert run_cli("render", run, "-o", out, *args) == 0
         frames.append(np.asarray(Image.open(out / "frames" / "0000.png")).astype(int))
         sidecar = json.loads((out / "movie.json").read_text())
         appearances.append(sidecar["appearance_of_training_view"])
@@ -285,7 +285,7 @@ def test_frames_have_the_appearance_of_the_given_photo(run_folder, tmp_path):
 
 @pytest.mark.parametrize("value", ["10 kg", "half a metre", "0.5"])
 def test_a_level_of_the_wrong_dimension_is_refused(run_folder, tmp_path, capsys, value):
-    """The parser of options prints the error, with status 2."""
+    """The option parser prints the error and exits with status 2."""
     capsys.readouterr()
     assert run_cli("render", run_folder, "-o", tmp_path / "out", "--flood.level", value) == 2
     err = "".join(capsys.readouterr())
@@ -293,11 +293,11 @@ def test_a_level_of_the_wrong_dimension_is_refused(run_folder, tmp_path, capsys,
     assert not (tmp_path / "out").exists()
 
 
-def test_folders_that_hold_no_run_are_refused(tmp_path, capsys):
-    said = complaint(capsys, "render", tmp_path, "-o", tmp_path / "out")
-    assert "climatenerf fit" in said
-    complaint(capsys, "render", tmp_path / "absent", "-o", tmp_path / "out")
-    complaint(capsys, "render", STREET, "-o", tmp_path / "out")
+def test_folders_without_a_run_are_refused(tmp_path, capsys):
+    message = error_message(capsys, "render", tmp_path, "-o", tmp_path / "out")
+    assert "climatenerf fit" in message
+    error_message(capsys, "render", tmp_path / "absent", "-o", tmp_path / "out")
+    error_message(capsys, "render", STREET, "-o", tmp_path / "out")
 
 
 def test_a_run_of_a_newer_schema_is_refused(run_folder, tmp_path, capsys):
@@ -306,17 +306,17 @@ def test_a_run_of_a_newer_schema_is_refused(run_folder, tmp_path, capsys):
     arrays, metadata = read_safetensors(path)
     about = {**json.loads(metadata["climatenerf"]), "schema_version": 99}
     write_safetensors(path, arrays, {"climatenerf": json.dumps(about)})
-    said = complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
-    assert "newer" in said and "99" in said
+    message = error_message(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
+    assert "newer" in message and "99" in message
     shutil.copy(run_folder / "field.safetensors", path)
     config = tmp_path / "run" / "config.json"
     config.write_text(json.dumps({**json.loads(config.read_text()), "schema_version": 98}))
-    said = complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
-    assert "newer" in said and "98" in said
+    message = error_message(capsys, "render", tmp_path / "run", "-o", tmp_path / "out", *SMALL)
+    assert "newer" in message and "98" in message
 
 
 def test_a_damaged_run_is_refused(run_folder, tmp_path, capsys):
     shutil.copytree(run_folder, tmp_path / "run")
     path = tmp_path / "run" / "field.safetensors"
     path.write_bytes(path.read_bytes()[:5000])
-    assert "damaged" in complaint(capsys, "render", tmp_path / "run", "-o", tmp_path / "out")
+    assert "damaged" in error_message(capsys, "render", tmp_path / "run", "-o", tmp_path / "out")

@@ -10,7 +10,7 @@ def mask():
 
 
 def neighbourhood(mask, pixels):
-    """All masks shifted by up to so many rows and columns, False beyond the border."""
+    """Stack the mask shifted by up to `pixels` rows and columns; False beyond the border."""
     padded = np.pad(mask, pixels)
     h, w = mask.shape
     size = 2 * pixels + 1
@@ -35,10 +35,10 @@ def test_depth_inside_counts_erosions():
     assert counted.max() > 3 and (depth_inside(mask) == counted).all()
 
 
-def test_connection_runs_along_rows_and_columns_only():
+def test_connectivity_is_along_rows_and_columns_only():
     allowed = np.array([[1, 1, 0, 0], [0, 1, 0, 1], [0, 0, 1, 1]], bool)
     seeds = np.zeros_like(allowed)
-    seeds[0, 0] = seeds[0, 2] = True  # the second is not allowed itself
+    seeds[0, 0] = seeds[0, 2] = True  # the second seed is not allowed
     expected = np.array([[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], bool)
     assert (connected_to(seeds, allowed) == expected).all()
     assert not connected_to(np.zeros_like(allowed), allowed).any()

@@ -5,26 +5,26 @@ from climatenerf.core.rotations import quaternions, rotation_matrices
 
 
 @pytest.fixture
-def turns():
+def rotations():
     rng = np.random.default_rng(1)
-    turns = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(50)]
-    turns = [t * np.sign(np.linalg.det(t)) for t in turns]
+    random = [np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(50)]
+    random = [r * np.sign(np.linalg.det(r)) for r in random]
     half_turns = [np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1], [1.0, 1, 1])]
-    return np.array(turns + half_turns)
+    return np.array(random + half_turns)
 
 
-def test_quaternions_of_any_rotation(turns):
-    q = quaternions(turns)
+def test_quaternions_reproduce_any_rotation(rotations):
+    q = quaternions(rotations)
     assert (q[:, 0] >= 0).all()
-    for (w, x, y, z), turn in zip(q, turns, strict=True):
+    for (w, x, y, z), rotation in zip(q, rotations, strict=True):
         v = np.array([x, y, z])
         k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        back = np.eye(3) * (w * w - v @ v) + 2 * np.outer(v, v) + 2 * w * k
-        np.testing.assert_allclose(back, turn, atol=1e-12)
+        matrix = np.eye(3) * (w * w - v @ v) + 2 * np.outer(v, v) + 2 * w * k
+        np.testing.assert_allclose(matrix, rotation, atol=1e-12)
 
 
-def test_rotation_matrices_undo_it_at_any_length(turns):
-    q = quaternions(turns)
-    np.testing.assert_allclose(rotation_matrices(-3.0 * q), turns, atol=1e-12)
-    np.testing.assert_allclose(rotation_matrices(q[0]), turns[0], atol=1e-12)
-    assert quaternions(turns[0]).shape == (4,)
+def test_rotation_matrices_invert_quaternions_of_any_length(rotations):
+    q = quaternions(rotations)
+    np.testing.assert_allclose(rotation_matrices(-3.0 * q), rotations, atol=1e-12)
+    np.testing.assert_allclose(rotation_matrices(q[0]), rotations[0], atol=1e-12)
+    assert quaternions(rotations[0]).shape == (4,)

@@ -34,7 +34,7 @@ def test_json_round_trip_of_supported_types(tmp_path):
     assert file_names(tmp_path / "deep") == ["a.json"]
 
 
-def test_failure_or_interrupt_keeps_the_old_file_and_leaves_no_other(tmp_path):
+def test_a_failure_or_interrupt_keeps_the_old_file_and_leaves_no_temporary_file(tmp_path):
     path = tmp_path / "a.json"
     storage.write_json(path, {"old": 1})
     with pytest.raises(KeyboardInterrupt), storage.atomic_path(path) as temporary:

@@ -18,8 +18,8 @@ from climatenerf.render.volume import render_view
 CAMERA = Camera(32, 24, 25.0, 25.0, 16.0, 12.0)
 
 
-def rewritten(run, change):
-    """Changes what the file says about itself."""
+def rewrite(run, change):
+    """Change the metadata or arrays of a field file."""
     arrays, metadata = read_safetensors(run / FILE_NAME)
     about = json.loads(metadata["climatenerf"])
     change(about, arrays)
@@ -66,7 +66,7 @@ def test_a_field_of_the_first_version_loads_without_normals_and_classes(tmp_path
         for name in [name for name in arrays if name.startswith(("surface_", "learned"))]:
             del arrays[name]
 
-    rewritten(tmp_path, earlier)
+    rewrite(tmp_path, earlier)
     loaded = load_field(tmp_path)
     x, d = points(field, 50), directions(50)
     assert torch.equal(loaded.density(x), field.density(x))
@@ -84,30 +84,30 @@ def test_a_field_of_the_second_version_keeps_its_pruning_threshold(tmp_path):
         about["schema_version"] = 2
         about["thin"] = about.pop("pruning_threshold")
 
-    rewritten(tmp_path, earlier)
+    rewrite(tmp_path, earlier)
     assert load_field(tmp_path).pruning_threshold == 0.04
 
 
-def test_a_folder_without_a_field(tmp_path):
+def test_a_folder_without_a_field_is_refused(tmp_path):
     with pytest.raises(UserError, match="climatenerf fit"):
         load_field(tmp_path)
     with pytest.raises(UserError, match="climatenerf fit"):
         load_field(tmp_path / "absent")
 
 
-def test_a_newer_schema_is_refused_and_says_so(tmp_path):
+def test_a_newer_schema_is_refused(tmp_path):
     save_field(random_field(), tmp_path)
-    rewritten(tmp_path, lambda about, _: about.update(schema_version=SCHEMA_VERSION + 1))
+    rewrite(tmp_path, lambda about, _: about.update(schema_version=SCHEMA_VERSION + 1))
     with pytest.raises(UserError, match="newer") as caught:
         load_field(tmp_path)
     assert str(tmp_path) in str(caught.value)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.0001, 0.3, 0.999])
-def test_a_truncated_file(tmp_path, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.0001, 0.3, 0.999])
+def test_a_truncated_file_is_reported_as_damaged(tmp_path, fraction):
     save_field(random_field(), tmp_path)
     data = (tmp_path / FILE_NAME).read_bytes()
-    (tmp_path / FILE_NAME).write_bytes(data[: int(share * len(data))])
+    (tmp_path / FILE_NAME).write_bytes(data[: int(fraction * len(data))])
     with pytest.raises(UserError, match="damaged") as caught:
         load_field(tmp_path)
     assert FILE_NAME in str(caught.value)
@@ -134,14 +134,14 @@ def without(name):
         lambda about, arrays: arrays["centre"].fill(np.nan),
     ],
 )
-def test_a_damaged_file_is_one_clear_sentence(tmp_path, change):
+def test_damaged_content_is_a_user_error(tmp_path, change):
     save_field(random_field(), tmp_path)
-    rewritten(tmp_path, change)
+    rewrite(tmp_path, change)
     with pytest.raises(UserError, match="damaged"):
         load_field(tmp_path)
 
 
-def test_a_file_of_another_program(tmp_path):
+def test_a_file_of_another_format_is_refused(tmp_path):
     write_safetensors(tmp_path / FILE_NAME, {"a": np.zeros(3, np.float32)}, {})
     with pytest.raises(UserError, match="damaged"):
         load_field(tmp_path)
@@ -150,7 +150,7 @@ def test_a_file_of_another_program(tmp_path):
         load_field(tmp_path)
 
 
-def test_a_full_disk_leaves_the_old_field(tmp_path, monkeypatch):
+def test_a_full_disk_keeps_the_earlier_field(tmp_path, monkeypatch):
     save_field(random_field(0), tmp_path)
     before = (tmp_path / FILE_NAME).read_bytes()
 
@@ -164,7 +164,7 @@ def test_a_full_disk_leaves_the_old_field(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == [FILE_NAME]
 
 
-def test_sizes_survive(tmp_path):
+def test_the_field_size_is_saved(tmp_path):
     save_field(random_field(), tmp_path)
     _, metadata = read_safetensors(tmp_path / FILE_NAME)
     about = json.loads(metadata["climatenerf"])

@@ -10,7 +10,7 @@ def ends(n, t_max=1e9):
     return torch.zeros(n), torch.full((n,), t_max)
 
 
-def test_density_is_zero_where_unoccupied_and_the_networks_elsewhere():
+def test_density_is_zero_in_empty_cells_and_the_network_output_elsewhere():
     field = random_field()
     x = points(field, 4000)
     occupied = field.occupancy.occupied_at(field.to_grid(x)).bool()
@@ -18,7 +18,7 @@ def test_density_is_zero_where_unoccupied_and_the_networks_elsewhere():
     assert 0.1 < occupied.float().mean() < 0.5
     assert (density[~occupied] == 0).all()
     expected = field.grid_density(field.to_grid(x[occupied])) / field.unit
-    # Other neighbours in a vector may be rounded in another order.
+    # The position of a point within a SIMD vector affects its rounding.
     assert torch.allclose(density[occupied], expected, rtol=1e-5) and (density[occupied] > 0).all()
     lower, upper = field.bounds
     outside = torch.stack([upper + 0.01, lower - 0.01, field.centre + torch.tensor([0, 0, 11.0])])
@@ -27,14 +27,14 @@ def test_density_is_zero_where_unoccupied_and_the_networks_elsewhere():
     assert (field.density(torch.stack([upper - 0.01, lower + 0.01])) > 0).all()
 
 
-def test_density_with_gradient_is_the_density_that_marching_sees():
+def test_density_with_gradient_equals_the_density_of_marching():
     field = random_field()
     q = field.to_grid(points(field, 3000, spread=4.0))
     with_gradient = field.density_with_gradient(reference.contract(q))
     assert torch.allclose(with_gradient, field.grid_density(q), rtol=5e-3)
 
 
-def test_density_has_gradients_to_geometry_alone():
+def test_density_has_gradients_to_geometry_parameters_only():
     field = random_field().requires_grad_(True)
     field.density_with_gradient(torch.rand(100, 3)).sum().backward()
     moved = {n for n, p in field.named_parameters() if p.grad is not None and p.grad.any()}
@@ -42,12 +42,12 @@ def test_density_has_gradients_to_geometry_alone():
 
 
 def dense(field):
-    """The field with 150 times the density: marching leaves out samples thinner than 1e-3."""
+    """The field with 150 times the density, so that marching prunes few samples."""
     field.geometry_net[3].add_(5.0)
     return field
 
 
-def test_marching_gives_the_density_along_the_ray():
+def test_samples_have_the_density_at_their_positions():
     field = dense(random_field())
     n = 300
     o, d = points(field, n, spread=0.5), directions(n)
@@ -56,7 +56,7 @@ def test_marching_gives_the_density_along_the_ray():
     assert samples.t.numel() > 3000
     x = o[ray] + samples.t[:, None] * d[ray]
     same = torch.isclose(samples.sigma, field.density(x), rtol=5e-3)
-    # On a cell's very face rounding may take either side.
+    # Rounding can move a point on a cell face into the neighbouring cell.
     assert same.float().mean() > 0.999
     inside = samples.offsets[1:] > samples.offsets[:-1]
     assert inside.any()
@@ -67,8 +67,8 @@ def test_marching_gives_the_density_along_the_ray():
     assert (samples.dt > 0).all()
 
 
-def test_marching_integrates_the_density():
-    """Optical depth along rays against a plain sum over many small steps."""
+def test_optical_depth_of_samples_is_the_integral_of_density():
+    """Compare optical depths along rays with sums over many small steps."""
     field = dense(random_field())
     n, reach, count = 50, 6.0, 6000
     o, d = points(field, n, spread=0.3), directions(n)
@@ -77,11 +77,11 @@ def test_marching_integrates_the_density():
     t = (torch.arange(count) + 0.5) / count * reach
     x = o[:, None] + t[:, None] * d[:, None]
     plain = field.density(x.view(-1, 3)).view(n, count).sum(1) * reach / count
-    # The step that reaches past a cell's face makes up to a step of difference each time.
+    # A step that crosses a cell face causes an error of at most one step.
     assert torch.allclose(depth, plain, rtol=0.05, atol=0.05 * float(plain.mean()))
 
 
-def test_marching_keeps_to_the_lengths_asked_for():
+def test_marching_respects_the_limits_of_each_ray():
     field = dense(random_field(full=True))
     n = 100
     o, d = points(field, n, spread=0.3), directions(n)
@@ -94,15 +94,15 @@ def test_marching_keeps_to_the_lengths_asked_for():
     assert none.t.numel() == 0 and none.offsets.shape == (n + 1,)
 
 
-def test_rays_do_not_depend_on_their_company():
+def test_samples_of_a_ray_do_not_depend_on_other_rays():
     field = random_field()
     o, d = points(field, 500, spread=0.5), directions(500)
-    all_of_them = field.march(o, d, *ends(500))
+    together = field.march(o, d, *ends(500))
     for r in (0, 77, 499):
         one = field.march(o[r : r + 1], d[r : r + 1], *ends(1))
-        part = slice(int(all_of_them.offsets[r]), int(all_of_them.offsets[r + 1]))
+        part = slice(int(together.offsets[r]), int(together.offsets[r + 1]))
         for name in ("t", "dt", "sigma"):
-            assert torch.equal(getattr(one, name), getattr(all_of_them, name)[part])
+            assert torch.equal(getattr(one, name), getattr(together, name)[part])
 
 
 def test_sample_positions_are_contracted_points():
@@ -152,61 +152,62 @@ def test_changing_the_appearance_leaves_density_bit_identical():
     assert (field.colour(x, d) - colour).abs().max() > 0.01
 
 
-def test_marching_leaves_out_what_is_thin_and_nothing_else():
+def test_marching_prunes_exactly_the_samples_below_the_threshold():
     field = dense(random_field(full=True))
     n = 200
     o, d = points(field, n, spread=0.5), directions(n)
     everything = field.march(o, d, *ends(n), stop=1e-38)
     tau = everything.sigma * everything.dt
     field.pruning_threshold = float(tau.median())
-    some = field.march(o, d, *ends(n), stop=1e-38)
-    least, most = (
+    pruned = field.march(o, d, *ends(n), stop=1e-38)
+    minimum, maximum = (
         int((tau > factor * field.pruning_threshold).sum()) for factor in (1 + 1e-5, 1 - 1e-5)
     )
-    assert 0.3 * len(tau) < least <= some.t.numel() <= most
-    assert (some.sigma * some.dt).min() > (1 - 1e-5) * field.pruning_threshold
+    assert 0.3 * len(tau) < minimum <= pruned.t.numel() <= maximum
+    assert (pruned.sigma * pruned.dt).min() > (1 - 1e-5) * field.pruning_threshold
 
 
-def test_rays_of_snow_and_sun_meet_what_cameras_do():
-    """Beside matter steps are short, and each of them is thin."""
+def test_rays_that_start_inside_matter_are_absorbed_like_camera_rays():
+    """Rays that start inside matter have short steps, each below the threshold."""
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_net[2].zero_()
-        field.geometry_net[3].fill_(2.3)  # 10 a grid unit
+        field.geometry_net[3].fill_(2.3)  # 10 per grid unit
     field.pruning_threshold = 0.1
     o, d = field.centre[None], torch.tensor([[0.0, 0.0, 1.0]])
-    left = {}
-    for name, own, start in (
+    transmittance = {}
+    for name, view, start in (
         ("camera", field, 5 * field.unit),  # from five units away
-        ("beside", field, 0.0),
+        ("inside", field, 0.0),
         ("snow", field.observed_only(), 0.0),
     ):
         begin = torch.full((1,), start)
-        samples = own.march(o - start * d, d, begin, begin + field.unit)
-        weights, rest = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
-        left[name] = float(rest)
-    assert left["camera"] < 1e-3 and left["snow"] < 1e-3 and left["beside"] == 1
-    assert field.pruning_threshold == 0.1, "the field itself is as it was"
+        samples = view.march(o - start * d, d, begin, begin + field.unit)
+        _, remaining = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+        transmittance[name] = float(remaining)
+    assert transmittance["camera"] < 1e-3 and transmittance["snow"] < 1e-3
+    assert transmittance["inside"] == 1
+    assert field.pruning_threshold == 0.1, "the field itself is unchanged"
 
 
-def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
+def test_observed_only_shares_parameters_and_empties_unseen_cells():
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_net[3].add_(4.0)  # dense enough for rays to end within the core
     o, d = points(field, 400, spread=0.2), directions(400)
     towards = d * torch.tensor([1.0, 1.0, 0.2])
     field.sampler.mark_seen(o, torch.nn.functional.normalize(towards, dim=-1))
-    trusted = field.observed_only()
-    for (name, mine), (_, shared) in zip(
-        field.named_parameters(), trusted.named_parameters(), strict=True
+    observed = field.observed_only()
+    for (name, original), (_, shared) in zip(
+        field.named_parameters(), observed.named_parameters(), strict=True
     ):
-        assert mine is shared, name
-    assert field.occupancy.occupied.all(), "the field itself is as it was"
+        assert original is shared, name
+    assert field.occupancy.occupied.all(), "the field itself is unchanged"
     seen = field.occupancy.seen.bool()
-    kept = trusted.occupancy.occupied.bool()
+    kept = observed.occupancy.occupied.bool()
     assert seen.any() and kept[seen].all()
     assert 0 < kept.sum() < kept.numel()
-    # Everything kept is seen or touches what is seen.
+    # A cell stays occupied if it is seen or adjacent to a seen cell.
     grown = torch.zeros_like(kept)
     for cascade, i, j, k in seen.nonzero().tolist():
         ranges = [slice(max(0, c - 1), c + 2) for c in (i, j, k)]
@@ -215,15 +216,15 @@ def test_trusted_shares_parameters_and_drops_only_what_was_not_seen():
     x = points(field, 3000)
     cells, inside = field.occupancy.cell_index(field.to_grid(x))
     there = kept.view(-1)[cells] & inside
-    density = trusted.density(x)
+    density = observed.density(x)
     assert torch.equal(density[there], field.density(x)[there])
     assert (density[~there] == 0).all()
     with torch.no_grad():
         field.geometry_net[3].add_(1.0)
-    assert (trusted.density(x)[there] > density[there]).all()
+    assert (observed.density(x)[there] > density[there]).all()
 
 
-def test_a_seen_cell_is_one_that_a_ray_ends_in():
+def test_mark_seen_marks_the_cells_in_which_rays_end():
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_net[3].add_(4.0)  # opaque everywhere: rays end at once
@@ -235,7 +236,7 @@ def test_a_seen_cell_is_one_that_a_ray_ends_in():
     assert ((centre - field.to_grid(o)).norm(dim=-1) < 0.6).all()
 
 
-def test_bounds_hold_the_outermost_cascade():
+def test_bounds_enclose_the_outermost_cascade():
     field = random_field()
     lower, upper = field.bounds
     half = 2.5 * 4
@@ -243,14 +244,14 @@ def test_bounds_hold_the_outermost_cascade():
     assert np.allclose(lower.numpy(), np.array([1.0, -2.0, 0.5]) - half)
 
 
-def test_accumulated_colour_of_an_opaque_field_is_a_mean_of_its_colours():
+def test_composited_colour_of_an_opaque_field_is_a_mean_of_sample_colours():
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_net[3].add_(6.0)
     o, d = points(field, 100, spread=0.2), directions(100)
     samples = field.march(o, d, *ends(100), stop=1e-5)
-    weights, left = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
-    assert (left < 1e-3).all()
+    weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    assert (transmittance < 1e-3).all()
     ray = samples.ray_index()
     colour = field.colour(o[ray] + samples.t[:, None] * d[ray], d, ray)
     seen = compositing.accumulate(weights, colour, samples.offsets)
@@ -261,7 +262,7 @@ def test_accumulated_colour_of_an_opaque_field_is_a_mean_of_its_colours():
     assert (seen >= low * (1 - 1e-2)).all() and (seen <= high * (1 + 1e-5)).all()
 
 
-def test_a_display_value_is_a_softplus_and_black_is_no_trap():
+def test_display_values_are_a_softplus_with_a_gradient_at_black():
     x = torch.linspace(-6, 3, 200, requires_grad=True)
     y = _Brightness.apply(x)
     plain = x.detach().clone().requires_grad_()
@@ -272,4 +273,4 @@ def test_a_display_value_is_a_softplus_and_black_is_no_trap():
     (slope,) = torch.autograd.grad(softplus.sum(), plain)
     assert torch.allclose(down[x > -0.4], slope[x > -0.4]) and (down[x < -0.6] == 0).all()
     assert (up <= -0.9 * slope).all() and (up < 0).all()
-    assert up.max() < -1e-3  # brighter is always in reach
+    assert up.max() < -1e-3  # a brighter target always gives a gradient

@@ -4,7 +4,7 @@ import pytest
 from climatenerf.field.normalisation import find_extent, focus_point
 
 
-def looking(eye, target):
+def pose_towards(eye, target):
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1.0])
@@ -17,7 +17,7 @@ def looking(eye, target):
 def ring(radius=4.0, middle=(3.0, -1.0, 1.0), count=20):
     turn = np.arange(count) / count * 2 * np.pi
     eyes = np.stack([np.cos(turn), np.sin(turn), 0.3 + 0 * turn], -1) * radius + middle
-    return np.stack([looking(eye, middle) for eye in eyes])
+    return np.stack([pose_towards(eye, middle) for eye in eyes])
 
 
 def cloud(middle=(3.0, -1.0, 1.0), size=1.0, count=3000):
@@ -25,12 +25,12 @@ def cloud(middle=(3.0, -1.0, 1.0), size=1.0, count=3000):
 
 
 def drive(count=30):
-    """Cameras 2 m apart on a line, all looking along it."""
-    return np.stack([looking(np.array([0, 2.0 * i, 1.6]), [0, 2.0 * i + 1, 1.6])
+    """Cameras 2 m apart on a line, all facing along it."""
+    return np.stack([pose_towards(np.array([0, 2.0 * i, 1.6]), [0, 2.0 * i + 1, 1.6])
                      for i in range(count)])  # fmt: skip
 
 
-def test_cameras_around_a_thing():
+def test_the_extent_of_a_ring_is_centred_on_its_object():
     extent = find_extent(ring(), cloud())
     assert np.linalg.norm(np.array(extent.centre) - (3, -1, 1)) < 1.0
     eyes = ring()[:, :3, 3]
@@ -40,7 +40,7 @@ def test_cameras_around_a_thing():
     assert 0 < extent.near < max(nearest, 0.01 * extent.unit)
 
 
-def test_a_drive_is_held_whole():
+def test_the_extent_of_a_drive_contains_all_cameras():
     points = np.random.default_rng(1).uniform([-8, 0, 0], [8, 70, 5], (4000, 3))
     extent = find_extent(drive(), points)
     away = np.linalg.norm(drive()[:, :3, 3] - extent.centre, axis=1) / extent.unit
@@ -48,7 +48,7 @@ def test_a_drive_is_held_whole():
 
 
 @pytest.mark.parametrize("points", [True, False])
-def test_it_moves_and_scales_with_the_scene(points):
+def test_the_extent_is_equivariant_to_translation_and_scale(points):
     poses, matter = ring(), cloud() if points else None
     a = find_extent(poses, matter)
     scaled = poses.copy()
@@ -58,30 +58,30 @@ def test_it_moves_and_scales_with_the_scene(points):
     assert np.isclose(b.unit, 7 * a.unit) and np.isclose(b.near, 7 * a.near)
 
 
-def test_far_background_points_do_not_blow_it_up():
+def test_distant_points_do_not_enlarge_the_extent():
     background = np.random.default_rng(2).normal(0, 400, (600, 3))
     with_sky = find_extent(ring(), np.concatenate([cloud(), background]))
     assert with_sky.unit < 2 * find_extent(ring(), cloud()).unit
 
 
-def test_without_points_the_common_point_of_interest_stands_in():
+def test_without_points_the_centre_is_the_common_point_of_interest():
     extent = find_extent(ring(), None)
     assert np.allclose(extent.centre, (3, -1, 1), atol=0.3)
     assert extent.near == pytest.approx(0.1 * extent.unit)
-    assert find_extent(ring(), cloud(count=20)) == extent, "too few points to trust"
+    assert find_extent(ring(), cloud(count=20)) == extent, "too few points are ignored"
 
 
-def test_parallel_axes_focus_ahead_of_the_cameras():
+def test_the_focus_of_parallel_axes_lies_ahead_of_the_cameras():
     poses = drive()
     point = focus_point(poses)
     assert np.isfinite(point).all()
     assert point[1] > poses[:, 1, 3].mean()
     outward = ring()
-    outward[:, :3, 2] *= -1  # a panorama: nothing is looked at by all
+    outward[:, :3, 2] *= -1  # a panorama: no common point of interest
     assert np.isfinite(focus_point(outward)).all()
 
 
-def test_cameras_in_one_place_give_a_finite_extent():
+def test_cameras_at_one_position_give_a_finite_extent():
     extent = find_extent(np.repeat(ring()[:1], 5, axis=0), None)
     assert np.isfinite([*extent.centre, extent.unit, extent.near]).all()
     assert extent.unit > 0 and extent.near > 0

@@ -18,7 +18,7 @@ def updated(times=1, fraction=1.0, density_at=ball, occupancy=None):
 
 
 def inside_ball(occupancy, radius):
-    """Cells that lie wholly nearer than `radius`, and cells wholly farther."""
+    """Cells entirely inside the ball of `radius`, and cells entirely outside."""
     cells = torch.arange(occupancy.density.numel())
     centre, size = occupancy.cell_centres(cells)
     half = size * 3**0.5 / 2
@@ -26,13 +26,13 @@ def inside_ball(occupancy, radius):
     return distance + half < radius, distance - half > radius
 
 
-def test_cells_and_their_centres_agree_with_the_field():
+def test_cell_centres_invert_cell_indices():
     field = random_field()
     occupancy = field.occupancy
     cells = torch.arange(occupancy.density.numel())
     centre, size = occupancy.cell_centres(cells)
     cascade = cells // occupancy.side**3
-    # A cascade's middle belongs to the next finer one.
+    # The middle of a cascade belongs to the next finer cascade.
     own = (centre.abs().amax(-1) > 2.0 ** (cascade - 1)) | (cascade == 0)
     offset = (torch.rand(centre.shape) - 0.5) * 0.99 * size[:, None]
     for q in (centre, centre + offset):
@@ -46,17 +46,17 @@ def test_cells_and_their_centres_agree_with_the_field():
     assert inside.tolist() == [False, False, True]
 
 
-def test_marching_finds_matter_in_exactly_the_cell_that_is_occupied():
+def test_marching_gives_samples_in_occupied_cells_only():
     field = random_field()
     with torch.no_grad():
-        field.geometry_net[3].add_(6.0)  # samples thinner than 1e-3 are dropped
+        field.geometry_net[3].add_(6.0)  # samples below 1e-3 are pruned
     occupancy = field.occupancy
     cells = torch.arange(occupancy.density.numel())
     centre, size = occupancy.cell_centres(cells)
     cascade = cells // occupancy.side**3
     own = (centre.abs().amax(-1) > 2.0 ** (cascade - 1)) | (cascade == 0)
-    some = cells[own][torch.randperm(int(own.sum()))[:40]]
-    for cell in some.tolist():
+    selected = cells[own][torch.randperm(int(own.sum()))[:40]]
+    for cell in selected.tolist():
         occupancy.occupied.zero_().view(-1)[cell] = 1
         middle = field.centre + field.unit * centre[cell]
         d = torch.nn.functional.normalize(torch.randn(1, 3), dim=-1)
@@ -67,7 +67,7 @@ def test_marching_finds_matter_in_exactly_the_cell_that_is_occupied():
         assert ((q - centre[cell]).abs() < 0.5 * size[cell] + 1e-5).all()
 
 
-def test_one_look_at_every_cell_finds_all_matter_and_clears_empty_space():
+def test_a_full_update_occupies_matter_and_clears_empty_space():
     occupancy = updated()
     within, beyond = inside_ball(occupancy, 0.5)
     assert within.any() and beyond.any()
@@ -75,14 +75,14 @@ def test_one_look_at_every_cell_finds_all_matter_and_clears_empty_space():
     assert occupied[within].all() and not occupied[beyond].any()
 
 
-def test_later_looks_at_a_share_of_cells_keep_what_is_there():
+def test_partial_updates_keep_matter_occupied():
     occupancy = updated(times=60, fraction=0.06, occupancy=updated())
     within, beyond = inside_ball(occupancy, 0.5)
     occupied = occupancy.occupied.view(-1).bool()
     assert occupied[within].all() and not occupied[beyond].any()
 
 
-def test_matter_that_has_gone_is_forgotten_and_new_matter_found():
+def test_updates_follow_a_changed_density():
     occupancy = updated()
     occupancy = updated(300, 0.2, lambda q: ball(q - 0.5, 0.3), occupancy)
     cells = torch.arange(occupancy.density.numel())
@@ -92,7 +92,7 @@ def test_matter_that_has_gone_is_forgotten_and_new_matter_found():
     assert not occupied[(centre + 0.3).norm(dim=-1) < 0.2].any()
 
 
-def test_threshold_is_the_light_absorbed_by_crossing_a_cell():
+def test_the_threshold_is_an_optical_depth_across_a_cell():
     size = 2.0 / 16
     for depth, expected in ((MAX_THRESHOLD * 0.9, 0), (MAX_THRESHOLD * 1.1, 1)):
         # One dense corner in each cascade lifts the mean above the fixed threshold.
@@ -106,13 +106,13 @@ def test_threshold_is_the_light_absorbed_by_crossing_a_cell():
         assert (occupancy.occupied.view(-1)[: 16**3][thin] == expected).all()
 
 
-def test_a_field_that_is_thin_everywhere_does_not_become_empty():
-    share = updated(density_at=lambda q: torch.rand(q.shape[0]) * 1e-3).occupied.float().mean()
-    assert 0.3 < share < 0.7
+def test_a_field_of_low_density_does_not_become_empty():
+    occupancy = updated(density_at=lambda q: torch.rand(q.shape[0]) * 1e-3)
+    assert 0.3 < occupancy.occupied.float().mean() < 0.7
 
 
 @pytest.mark.parametrize("density", [200.0, 0.02])
-def test_refining_keeps_matter_and_halves_the_cells(density):
+def test_refining_halves_the_cells_and_keeps_their_state(density):
     occupancy = updated(density_at=lambda q: ball(q, 0.6, density))
     before = occupancy.occupied.clone()
     cells, densities = before.bool(), occupancy.density.clone()
@@ -125,7 +125,7 @@ def test_refining_keeps_matter_and_halves_the_cells(density):
         assert torch.equal(occupancy.density[:, x::2, y::2, z::2], densities)
 
 
-def test_neighbours_lie_one_cell_away_at_most_and_in_the_same_cascade():
+def test_neighbours_are_adjacent_cells_of_the_same_cascade():
     occupancy = Occupancy(cascades=3, side=8)
     cells = torch.arange(occupancy.density.numel())
     found = occupancy._neighbours(cells, torch.Generator().manual_seed(0))
@@ -136,8 +136,8 @@ def test_neighbours_lie_one_cell_away_at_most_and_in_the_same_cascade():
     assert steps.abs().max() == 1 and (steps != 0).any(-1).float().mean() > 0.8
 
 
-def test_holes_beside_matter_close_sooner_than_by_looking_anywhere():
-    """A slab with a hole in what is known of it: partial updates find the missing cells."""
+def test_partial_updates_prefer_cells_beside_matter():
+    """Partial updates find missing cells of a slab faster than uniform sampling."""
 
     def slab(q):
         return 500.0 * (q[:, 2].abs() < 0.125)
@@ -154,11 +154,11 @@ def test_holes_beside_matter_close_sooner_than_by_looking_anywhere():
         for _ in range(25):
             holed.update(slab, 0.02, 0.95, generator)
         closed.append(holed.occupied.view(-1)[hole].float().mean())
-    # Half of 2 % of all cells, looked at anywhere 25 times, would find 22 % of them.
+    # 25 uniform updates of half of 2 % of all cells would find 22 % of them.
     assert torch.stack(closed).mean() > 0.26, closed
 
 
-def test_density_met_by_rays_is_remembered():
+def test_densities_of_ray_samples_are_recorded():
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_net[3].add_(6.0)
@@ -166,29 +166,29 @@ def test_density_met_by_rays_is_remembered():
     o = field.centre.expand(200, 3).contiguous()
     d = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
     samples = field.march(o, d, torch.zeros(200), torch.full((200,), 1e9))
-    which = samples.t > 1.0
-    field.sampler.record_density(o, d, samples, which.nonzero()[:, 0])
+    selected = samples.t > 1.0
+    field.sampler.record_density(o, d, samples, selected.nonzero()[:, 0])
     ray = samples.ray_index()
     cells, _ = field.occupancy.cell_index(field.to_grid(o[ray] + samples.t[:, None] * d[ray]))
-    known = field.occupancy.density.view(-1)
-    assert (known[cells[which]] >= samples.sigma[which] * field.unit * 0.999).all()
-    untouched = torch.ones(known.shape[0], dtype=torch.bool)
-    untouched[cells[which]] = False
-    assert (known[untouched] == 0).all()
+    recorded = field.occupancy.density.view(-1)
+    assert (recorded[cells[selected]] >= samples.sigma[selected] * field.unit * 0.999).all()
+    untouched = torch.ones(recorded.shape[0], dtype=torch.bool)
+    untouched[cells[selected]] = False
+    assert (recorded[untouched] == 0).all()
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5])
-def test_known_cells_found_at_once_are_occupied_ones_from_everywhere(share):
+@pytest.mark.parametrize("fraction", [0.02, 0.5])
+def test_a_fixed_number_of_occupied_cells_is_selected_from_all_cascades(fraction):
     occupancy = Occupancy(2, 16)
     generator = torch.Generator().manual_seed(0)
-    occupancy.occupied = (torch.rand(2, 16, 16, 16, generator=generator) < share).to(torch.uint8)
+    occupancy.occupied = (torch.rand(2, 16, 16, 16, generator=generator) < fraction).to(torch.uint8)
     drawn = occupancy._stratified(4000, generator)
     found = occupancy._occupied_of_static(drawn, 1000)
     exact = occupancy._occupied_of(drawn, 1000)
-    held = occupancy.occupied.view(-1)
+    occupied = occupancy.occupied.view(-1)
     assert found.shape == (1000,) and torch.isin(found, drawn).all()
-    assert (held[found] > 0).float().mean() > (0.99 if share == 0.5 else 0.05)
-    if share == 0.5:  # some are left out, and not those at the end
+    assert (occupied[found] > 0).float().mean() > (0.99 if fraction == 0.5 else 0.05)
+    if fraction == 0.5:  # omitted cells are not only those at the end
         assert abs(found.float().mean() / exact.float().mean() - 1) < 0.1
     else:
         assert set(exact.tolist()) <= set(found.tolist())

@@ -5,12 +5,12 @@ from climatenerf.field.spherical_harmonics import spherical_harmonics
 
 
 def test_harmonics_are_orthonormal_over_the_sphere():
-    """Gauss-Legendre in z and evenly in azimuth: exact for products of degree 6."""
+    """Gauss-Legendre nodes in z, uniform nodes in azimuth: exact for products of degree 6."""
     z, weight = np.polynomial.legendre.leggauss(8)
-    turn = np.arange(16) / 16 * 2 * np.pi
-    z, turn = (a.ravel() for a in np.meshgrid(z, turn, indexing="ij"))
-    flat = np.sqrt(1 - z**2)
-    d = torch.tensor(np.stack([flat * np.cos(turn), flat * np.sin(turn), z], -1))
+    azimuth = np.arange(16) / 16 * 2 * np.pi
+    z, azimuth = (a.ravel() for a in np.meshgrid(z, azimuth, indexing="ij"))
+    radius = np.sqrt(1 - z**2)
+    d = torch.tensor(np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1))
     area = torch.tensor(np.repeat(weight, 16) * 2 * np.pi / 16)
     y = spherical_harmonics(d)
     assert y.shape == (128, 16)

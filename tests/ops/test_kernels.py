@@ -1,4 +1,4 @@
-"""Every fast kernel against its twin in `ops/reference.py`, values and gradients."""
+"""Values and gradients of each CPU kernel against its twin in `ops/reference.py`."""
 
 import numpy as np
 import pytest
@@ -14,9 +14,9 @@ def generator():
     return torch.Generator().manual_seed(3)
 
 
-def packed(generator, rays=40, most=12):
-    """Offsets of rays with 0 to `most` samples, some empty."""
-    counts = torch.randint(0, most, (rays,), generator=generator)
+def packed(generator, rays=40, limit=12):
+    """Offsets of rays with fewer than `limit` samples each; at least one ray is empty."""
+    counts = torch.randint(0, limit, (rays,), generator=generator)
     counts[3] = 0
     return torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
 
@@ -26,11 +26,11 @@ def grid(generator, levels=4, log2_rows=9):
     return table, torch.tensor([4, 9, 21, 50])[:levels]
 
 
-@pytest.mark.parametrize("far", [False, True])
-def test_hash_encoding_and_its_gradient_match_the_twin(generator, far):
-    """With `far`, tables are so large that rows are asked for ahead, hashed and not."""
-    table, resolutions = grid(generator, log2_rows=18 if far else 9)
-    if far:
+@pytest.mark.parametrize("large", [False, True])
+def test_hash_encoding_and_its_gradient_match_the_twin(generator, large):
+    """Rows of `large` tables, dense and hashed, are prefetched."""
+    table, resolutions = grid(generator, log2_rows=18 if large else 9)
+    if large:
         resolutions = torch.tensor([9, 60, 90, 200])
         sides = (9, 60, 90, 200)
         assert [simd.exceeds_cache(table.numpy(), s) for s in sides] == [False, True, True, True]
@@ -48,7 +48,7 @@ def test_hash_encoding_and_its_gradient_match_the_twin(generator, far):
 
 
 def test_gradient_to_positions_matches_the_twin(generator):
-    """Also at cell faces, where the kernel and the twin take the same side."""
+    """At cell faces the kernel and the twin use the same side."""
     table, resolutions = grid(generator)
     u = torch.rand(700, 3, generator=generator) * 0.999
     u[0], u[1] = 0.0, 0.5
@@ -58,12 +58,12 @@ def test_gradient_to_positions_matches_the_twin(generator):
     (out * upstream).sum().backward()
     (reference.hash_encode(slow, table.double(), resolutions) * upstream.double()).sum().backward()
     assert fast.grad is not None and slow.grad is not None
-    apart = (fast.grad.double() - slow.grad).abs()
-    # A point within rounding of a face may fall on either side of it.
-    assert apart.quantile(0.99) < 1e-2 and apart[1].max() < 1e-2, apart.max()
+    error = (fast.grad.double() - slow.grad).abs()
+    # Rounding can move a point near a cell face into either cell.
+    assert error.quantile(0.99) < 1e-2 and error[1].max() < 1e-2, error.max()
 
 
-def test_the_twins_have_right_gradients(generator):
+def test_gradients_of_the_twins_pass_gradcheck(generator):
     table, resolutions = grid(generator, levels=2, log2_rows=4)
     u = (torch.rand(5, 3, generator=generator) * 0.9).double()
     assert torch.autograd.gradcheck(
@@ -83,11 +83,11 @@ def test_the_twins_have_right_gradients(generator):
 
 
 def test_a_trilinear_function_is_reproduced_on_dense_levels():
-    """On a level that fits its table, interpolating a linear function of the corners is exact."""
+    """A level that fits its table has no collisions, so a linear function is exact."""
     side = 5
     corners = torch.stack(
         torch.meshgrid(*[torch.arange(side + 1.0)] * 3, indexing="ij"), dim=-1
-    ).permute(2, 1, 0, 3)  # rows run x fastest
+    ).permute(2, 1, 0, 3)  # x varies fastest in a table
     table = torch.zeros(1, 512, 2)
     table[0, : (side + 1) ** 3, 0] = (corners @ torch.tensor([1.0, 2.0, 3.0])).flatten()
     u = torch.rand(50, 3) * 0.99
@@ -117,7 +117,7 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
 
 
 @pytest.mark.parametrize(
-    ("side", "skips", "share", "thin"),
+    ("side", "skips", "fraction", "threshold"),
     [
         (8, (1,), 0.3, 1e-3),
         (8, (1,), 0.3, 0.05),
@@ -126,12 +126,12 @@ def test_density_matches_the_twin_inside_and_outside_the_core(generator):
         (32, (8, 4, 1), 0.0, 1e-3),
     ],
 )
-def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, thin):
+def test_marching_matches_the_twin(generator, monkeypatch, side, skips, fraction, threshold):
     table, resolutions = grid(generator)
     layers, plain = random_network(generator, 8, 16)
-    occupied = (torch.rand(3, side, side, side, generator=generator) < share).to(torch.uint8)
+    occupied = (torch.rand(3, side, side, side, generator=generator) < fraction).to(torch.uint8)
     skip = skips[0]
-    occupied[0, -skip:] = 1  # the finest cells at one side, whatever the share
+    occupied[0, -skip:] = 1  # cells at one side of the finest cascade
     blocks = occupied.unfold(1, skip, skip).unfold(2, skip, skip).unfold(3, skip, skip)
     cells = marching.cells_of(occupied)
     assert torch.equal(cells[1], blocks.amax((-3, -2, -1)))
@@ -143,8 +143,8 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, t
     jitter = torch.rand(n, generator=generator)
     near, far = torch.full((n,), 0.05), torch.full((n,), 1e9)
     far[2] = 0.5
-    steps = (0.05, 0.02, thin)
-    monkeypatch.setattr(marching, "CPU_RAYS", 32)  # in two parts
+    steps = (0.05, 0.02, threshold)
+    monkeypatch.setattr(marching, "CPU_RAYS", 32)  # two parts
     offsets, found = marching.march(
         (o, d),
         torch.stack([near, far, jitter], dim=-1),
@@ -154,7 +154,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, t
         (table, resolutions, *plain),
     )
     counts, packed_samples = offsets.diff().numpy(), found.numpy()
-    agree = 0
+    equal = 0
     for r in range(n):
         twin = reference.march(
             o[r],
@@ -170,13 +170,13 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, share, t
         same = counts[r] == len(twin) and np.allclose(
             own, np.array(twin).reshape(-1, 3).T, rtol=2e-2
         )
-        agree += same
-    # Where a step ends on a cell's face, rounding may put it on either side.
-    assert agree >= n - 3
+        equal += same
+    # Rounding can move a step that ends on a cell face into either cell.
+    assert equal >= n - 3
     assert counts.sum() > 30
 
 
-def test_a_ray_ends_where_it_is_opaque_and_cells_that_are_empty_give_no_samples(generator):
+def test_rays_end_when_opaque_and_skip_empty_cells(generator):
     table, resolutions = grid(generator)
     _, (w1, b1, w2, _) = random_network(generator, 8, 16)
     net = (table, resolutions, w1, b1, w2, torch.full((1,), 6.0))  # dense everywhere
@@ -202,20 +202,20 @@ def test_weights_and_their_gradient_match_the_twin(generator):
     fast, slow = tau.clone().requires_grad_(), tau.double().requires_grad_()
     up_w = torch.randn(n, generator=generator)
     up_t = torch.randn(offsets.shape[0] - 1, generator=generator)
-    w, left = compositing.render_weights(fast, offsets)
-    w2, left2 = reference.render_weights(slow, offsets)
+    w, transmittance = compositing.render_weights(fast, offsets)
+    w2, transmittance2 = reference.render_weights(slow, offsets)
     assert torch.allclose(w.double(), w2, atol=1e-6)
-    assert torch.allclose(left.double(), left2, atol=1e-6)
-    ((w * up_w).sum() + (left * up_t).sum()).backward()
-    ((w2 * up_w.double()).sum() + (left2 * up_t.double()).sum()).backward()
+    assert torch.allclose(transmittance.double(), transmittance2, atol=1e-6)
+    ((w * up_w).sum() + (transmittance * up_t).sum()).backward()
+    ((w2 * up_w.double()).sum() + (transmittance2 * up_t.double()).sum()).backward()
     assert torch.allclose(fast.grad.double(), slow.grad, atol=1e-5)
 
 
-def test_weights_and_what_is_left_sum_to_one(generator):
+def test_weights_and_transmittance_sum_to_one(generator):
     offsets = packed(generator)
     tau = torch.rand(int(offsets[-1]), generator=generator) * 3
-    w, left = compositing.render_weights(tau, offsets)
-    total = compositing.accumulate(w, torch.ones(len(w), 1), offsets)[:, 0] + left
+    w, transmittance = compositing.render_weights(tau, offsets)
+    total = compositing.accumulate(w, torch.ones(len(w), 1), offsets)[:, 0] + transmittance
     assert torch.allclose(total, torch.ones_like(total), atol=1e-6)
 
 
@@ -234,29 +234,31 @@ def test_accumulation_matches_the_twin(generator):
         assert torch.allclose(x.grad.double(), y.grad, atol=1e-5)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_what_rays_see_of_the_surface_head_matches_the_twin(generator, known):
+@pytest.mark.parametrize("with_target", [True, False])
+def test_compositing_of_the_surface_head_matches_the_twin(generator, with_target):
     offsets = packed(generator)
     n, rays = int(offsets[-1]), offsets.shape[0] - 1
     w, raw = torch.rand(n, generator=generator), torch.randn(n, 9, generator=generator)
-    raw[0, :3], raw[1, :3] = 0.0, torch.tensor([1e-7, 0.0, 0.0])  # without a direction
+    raw[0, :3], raw[1, :3] = 0.0, torch.tensor([1e-7, 0.0, 0.0])  # no direction
     target = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
-    raw[2, :3] = 5 * target[2]  # on it
-    up, up_apart = torch.randn(rays, 6, generator=generator), torch.rand(rays, generator=generator)
+    raw[2, :3] = 5 * target[2]  # parallel
+    up = torch.randn(rays, 6, generator=generator)
+    up_distance = torch.rand(rays, generator=generator)
     found = []
     for run, dtype in ((compositing.surface, torch.float32), (reference.surface, torch.float64)):
-        for turned in (False, True):  # as networks leave it, and as it is
-            own = raw.T.contiguous().T if turned else raw
-            own = leaf(own, dtype)
-            goal = target.to(dtype) if known else None
-            logits, apart = run(w.to(dtype), own, goal, offsets)
-            ((logits * up.to(dtype)).sum() + (apart * up_apart.to(dtype)).sum()).backward()
-            assert torch.isfinite(own.grad).all()
-            found.append([logits.detach(), apart.detach(), own.grad[2:], own.grad[:2] * 1e-6])
+        for transposed in (False, True):  # the memory layout of networks, and the contiguous one
+            values = raw.T.contiguous().T if transposed else raw
+            values = leaf(values, dtype)
+            goal = target.to(dtype) if with_target else None
+            logits, distance = run(w.to(dtype), values, goal, offsets)
+            ((logits * up.to(dtype)).sum() + (distance * up_distance.to(dtype)).sum()).backward()
+            grad = values.grad
+            assert torch.isfinite(grad).all()
+            found.append([logits.detach(), distance.detach(), grad[2:], grad[:2] * 1e-6])
     for fast in found[:2]:
         for a, b in zip(fast, found[2], strict=True):
             assert (a.double() - b).abs().max() < 1e-5 * max(1.0, float(b.abs().max()))
-    assert (float(found[0][1].max()) > 0) == known
+    assert (float(found[0][1].max()) > 0) == with_target
 
 
 def test_distortion_matches_the_double_sum(generator):
@@ -281,11 +283,13 @@ def leaf(tensor, dtype):
     return tensor.clone().to(dtype).requires_grad_()
 
 
-KINDS = ["one hidden layer", "shared", "shared, mixed up", "two layers", "two layers, shared"]
+KINDS = ["one hidden layer", "shared", "shared, shuffled", "two layers", "two layers, shared"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("widths", [(16, 32, 1), (13, 22, 7)])  # whole sweeps of rows, and rests
+@pytest.mark.parametrize(
+    "widths", [(16, 32, 1), (13, 22, 7)]
+)  # multiples of a block, and remainders
 def test_network_matches_the_twin_and_autograd(generator, kind, widths):
     n, rays = 9000, 2000  # more than two chunks
     inputs, hidden, outputs = widths
@@ -298,7 +302,7 @@ def test_network_matches_the_twin_and_autograd(generator, kind, widths):
     shared = torch.randn(rays, hidden, generator=generator)
     row = torch.randint(0, rays, (n,), generator=generator)
     row[100:3000] = 7  # a ray longer than a chunk
-    if kind != "shared, mixed up":
+    if kind != "shared, shuffled":
         row = row.sort()[0]
     up = torch.randn(n, outputs, generator=generator)
     grads = []
@@ -315,7 +319,7 @@ def test_network_matches_the_twin_and_autograd(generator, kind, widths):
         assert (fast.double() - slow).abs().max() < 1e-5 * slow.abs().max()
 
 
-def test_a_network_on_what_needs_no_gradient_learns_the_same(generator):
+def test_layer_gradients_do_not_depend_on_input_gradients(generator):
     layers, _ = random_network(generator, 8, 16)
     x = torch.randn(300, 8, generator=generator)
     found = []
@@ -327,23 +331,23 @@ def test_a_network_on_what_needs_no_gradient_learns_the_same(generator):
         assert torch.equal(a, b)
 
 
-def test_gradients_of_no_light_count_as_none(generator):
-    """Numbers that 32 bits do not hold in full are slow on some processors; faint ones count."""
+def test_denormal_gradients_are_flushed_to_zero(generator):
+    """Denormal numbers are slow on some processors; small normal ones are kept."""
     layers, _ = random_network(generator, 8, 16)
     x = torch.randn(300, 8, generator=generator)
-    for size, counts in ((1e-39, False), (1e-31, False), (1e-25, True)):
+    for size, kept in ((1e-39, False), (1e-31, False), (1e-25, True)):
         own = [tuple(leaf(p, torch.float32) for p in pair) for pair in layers]
         (size * network.mlp(x, own)).sum().backward()
-        assert bool(own[0][0].grad.any()) == counts, size
+        assert bool(own[0][0].grad.any()) == kept, size
 
 
-def test_encodings_do_not_depend_on_how_many_threads_share_them(generator):
+def test_encodings_do_not_depend_on_the_number_of_threads(generator):
     table, resolutions = grid(generator)
     u = torch.rand(1000, 3, generator=generator).numpy()
     levels = table.shape[0]
     up = torch.randn(2 * levels, 1000, generator=generator).numpy()
     found = []
-    for threads in (1, 3, 99):  # fewer and more than levels
+    for threads in (1, 3, 99):  # fewer than levels, and more
         out, grads = np.empty_like(up), np.zeros(table.shape, np.float32)
         cpu._hash_encode(u, table.numpy(), resolutions.numpy(), out, threads)
         cpu._hash_encode_backward(u, up, resolutions.numpy(), grads, threads)
@@ -353,7 +357,7 @@ def test_encodings_do_not_depend_on_how_many_threads_share_them(generator):
     assert np.abs(found[0][1]).sum() > 0
 
 
-def test_a_network_of_nothing_gives_nothing():
+def test_a_network_of_no_samples_has_empty_output():
     layers = [(torch.ones(4, 8), torch.ones(8)), (torch.ones(8, 2), torch.ones(2))]
     x = torch.ones(0, 4, requires_grad=True)
     out = network.mlp(x, layers, torch.ones(3, 8), torch.zeros(0, dtype=torch.long))

@@ -14,7 +14,7 @@ SPACING = 0.05
 
 
 def dense_lattice(fill: np.ndarray, height: np.ndarray, shade: np.ndarray) -> Lattice:
-    """One cascade that holds dense arrays of vertices; their sides are multiples of 8."""
+    """A lattice of one cascade with dense arrays of vertices; their sides are multiples of 8."""
     bricks = np.array(fill.shape) // BRICK
     padded = [np.pad(a, ((1, 2), (1, 2), (1, 2))) for a in (fill, height, shade)]
     parts = [[], [], []]
@@ -45,12 +45,12 @@ def random_lattice():
     fill = (rng.integers(0, 256, size) * (rng.random(size) < 0.5)).astype(np.uint8)
     height = rng.integers(-2000, 2000, size).astype(np.int16)
     shade = rng.integers(0, 256, size).astype(np.uint8)
-    # Points over several bricks (one brick of margin in x and y, the balls' reach in z).
+    # Points over several bricks (one brick of margin in x and y, the radius of the balls in z).
     points = rng.uniform([8, 8, 3], [15.9, 23.9, 12], (300, 3)) * SPACING + [-0.3, 0.2, 0.1]
     return fill, height, shade, points.astype(np.float32)
 
 
-def test_kernel_values():
+def test_the_kernel_has_known_values():
     r = torch.tensor([0.0, 0.5, 1.0, 1.5, 1.6], dtype=torch.float64) * 0.2
     constant = 315 / (64 * math.pi * 1.5**7)
     expected = [constant * 2.25**3, constant * 8.0, constant * 1.25**3, 0.0, 0.0]
@@ -58,7 +58,7 @@ def test_kernel_values():
     assert expected[0] == pytest.approx(1.044, abs=1e-3)
 
 
-def test_twin_gradcheck():
+def test_gradients_of_the_twin_pass_gradcheck():
     torch.manual_seed(0)
     fractions = torch.rand(6, 6, 6, dtype=torch.float64)
     values = torch.rand(6, 6, 6, 2, dtype=torch.float64)
@@ -91,7 +91,7 @@ def test_sums_and_gradients_equal_the_twin(random_lattice):
     assert rest[:, 1] == pytest.approx(means[:, 1].detach().numpy(), abs=1e-4)
 
 
-def test_continuous_across_cells_and_bricks(random_lattice):
+def test_sums_are_smooth_across_cells_and_bricks(random_lattice):
     fill, height, shade, _ = random_lattice
     lattice = dense_lattice(fill, height, shade)
     steps, step = 4000, 1e-4  # a line of 0.4 m through eight cells and two bricks
@@ -99,17 +99,17 @@ def test_continuous_across_cells_and_bricks(random_lattice):
     line = np.array([0.11, 0.63, 0.32]) + np.arange(steps)[:, None] * step * direction
     sums, gradients, _ = metaballs.evaluate(line.astype(np.float32), lattice)
     along = gradients @ direction
-    # C0: no step larger than the slope explains. C1: the slope's own steps stay small, and the
-    # slope is the derivative of the sum.
+    # C0: no step exceeds the slope times the distance. C1: steps of the slope are small, and it is
+    # the derivative of the sum.
     assert np.abs(along).max() > 1.0
     assert np.abs(np.diff(sums)).max() < 1.1 * np.abs(along).max() * step + 1e-5
     assert np.abs(np.diff(along)).max() < 0.02 * np.abs(along).max()
-    far = 20
-    slope = (sums[far:] - sums[:-far]) / (far * step)
-    assert slope == pytest.approx(along[far // 2 : -far // 2], abs=0.05)
+    lag = 20
+    slope = (sums[lag:] - sums[:-lag]) / (lag * step)
+    assert slope == pytest.approx(along[lag // 2 : -lag // 2], abs=0.05)
 
 
-def test_no_sum_is_steeper_than_the_march_assumes():
+def test_slopes_stay_below_the_bound_of_the_march():
     rng = np.random.default_rng(1)
     size = (3 * BRICK, 3 * BRICK, 3 * BRICK)
     blank = np.zeros(size, np.int16)
@@ -119,8 +119,8 @@ def test_no_sum_is_steeper_than_the_march_assumes():
         if normal is None:
             fill = rng.random(size) < 0.5
         else:
-            place = np.stack(np.meshgrid(*[np.arange(n) - 11.3 for n in size], indexing="ij"), -1)
-            fill = place @ np.array(normal) > 0
+            vertex = np.stack(np.meshgrid(*[np.arange(n) - 11.3 for n in size], indexing="ij"), -1)
+            fill = vertex @ np.array(normal) > 0
         lattice = dense_lattice(255 * fill.astype(np.uint8), blank, blank.astype(np.uint8))
         gradients = metaballs.evaluate(points, lattice)[1]
         steepest = max(steepest, float(np.linalg.norm(gradients, axis=1).max()) * SPACING)
@@ -128,7 +128,7 @@ def test_no_sum_is_steeper_than_the_march_assumes():
 
 
 def half_space(level: float) -> Lattice:
-    """Filled below `level` (spacings over the corner), prefiltered with a ramp."""
+    """A lattice filled below `level` (in spacings above the corner), prefiltered with a ramp."""
     size = (4 * BRICK, 4 * BRICK, 3 * BRICK)
     z = np.broadcast_to(np.arange(size[2]), size)
     fill = np.round(255 * np.clip(level - z + 0.5, 0, 1)).astype(np.uint8)
@@ -156,7 +156,7 @@ def test_march_finds_the_surface():
     for r in range(200):
         part = slice(offsets[r], offsets[r + 1])
         depth = np.concatenate([[0], np.cumsum(sigma[part] * dt[part])])
-        assert 6.9 < depth[-1] < 12  # opaque, and not much further
+        assert 6.9 < depth[-1] < 12  # opaque, and ends soon after
         assert np.all(np.diff(t[part]) > 0)
         weights = np.exp(-depth[:-1]) - np.exp(-depth[1:])
         where = np.sum(weights * t[part]) / weights.sum()
@@ -165,7 +165,7 @@ def test_march_finds_the_surface():
     assert np.diff(offsets).max() <= 16
 
 
-def test_march_respects_its_limits_and_misses_nothing():
+def test_march_respects_its_limits_and_skips_empty_space():
     lattice = half_space(12.0)
     down = [[0.0, 0.0, -1.0]]
     origin = [[0.4, 0.9, 2.0]]
@@ -179,12 +179,12 @@ def test_march_respects_its_limits_and_misses_nothing():
     assert march(lattice, [[50.0, 50.0, 2.0]], down)[0][-1] == 0
 
 
-def test_reach_and_radius_belong_together():
+def test_the_support_is_one_and_a_half_radii():
     assert abs(SUPPORT - 1.5 * RADIUS) < 1e-12
 
 
 def test_cells_without_snow_have_low_sums():
-    """And those that may have some are told apart from them on every axis."""
+    """The bits of cells that can contain snow are correct on every axis."""
     rng = np.random.default_rng(3)
     size = (3 * BRICK, 4 * BRICK, 2 * BRICK)
     blobs = rng.random((6, 8, 4)) < 0.1
@@ -198,9 +198,9 @@ def test_cells_without_snow_have_low_sums():
     x, y, m = (cell % BRICK).T
     near = (lattice.near[brick, x, y] >> m & 1).astype(bool)
     assert (sums[~near] < metaballs.LOW).all() and sums[near].max() > 0.9
-    # By the vertices themselves.
+    # Compare with the vertices.
     around = np.pad(fill >= metaballs.LOW * 255, 2)
     for i in range(200):
-        a, b, c = cell[i] + 1  # one below the cell's own, in the padded array
+        a, b, c = cell[i] + 1  # one vertex below the cell, in the padded array
         assert near[i] == around[a : a + 4, b : b + 4, c : c + 4].any()
     assert 100 < (~near).sum() < 3900

@@ -1,4 +1,4 @@
-"""Vector instructions against plain NumPy, and the density's slope against autograd."""
+"""SIMD intrinsics against NumPy, and density slopes against autograd."""
 
 import copy
 import hashlib
@@ -39,18 +39,18 @@ def density_network(features, w1, b1, w2, b2, out):
     simd.network(features, w1, b1, w2, b2, out)
 
 
-def test_kernels_are_compiled_anew_when_their_instructions_change():
-    """Numba looks at a kernel's own file alone; its text has to change with that of `simd.py`."""
-    own, balls = (Path(each.__file__).read_bytes() for each in (simd, simd_metaballs))
+def test_kernels_contain_the_digest_of_the_simd_modules():
+    """Numba's cache depends on the kernel's own file only, so the file contains a digest."""
+    base, balls = (Path(each.__file__).read_bytes() for each in (simd, simd_metaballs))
     for module in (cpu_encoding, cpu_marching, cpu_network, cpu_optimiser, metaballs):
-        text = own + balls if module is metaballs else own
+        text = base + balls if module is metaballs else base
         digest = hashlib.sha256(text).hexdigest()[:12]
         assert digest == module.SIMD_DIGEST, f'write "{digest}" into {Path(module.__file__).name}'
 
 
 @pytest.mark.parametrize(("m", "k", "vectors"), [(64, 24, 8), (3, 7, 3), (1, 32, 1), (5, 1, 2)])
-def test_products_of_blocks(m, k, vectors):
-    """Whatever is left of rows and vectors after whole registers is computed, and no more."""
+def test_block_products_match_numpy(m, k, vectors):
+    """Remainders of rows and vectors are computed, and nothing beyond them is written."""
     random = np.random.default_rng(0)
     weight = random.standard_normal((m, k)).astype(np.float32)
     rows = random.standard_normal((k + 1, (vectors + 1) * LANES)).astype(np.float32)
@@ -67,7 +67,7 @@ def test_products_of_blocks(m, k, vectors):
 
 
 @pytest.mark.parametrize("hidden", [32, 6])
-def test_the_density_network(hidden):
+def test_the_density_network_matches_numpy(hidden):
     random = np.random.default_rng(1)
     features = random.standard_normal((10, LANES)).astype(np.float32)
     w1 = random.standard_normal((hidden, 10)).astype(np.float32)
@@ -78,8 +78,8 @@ def test_the_density_network(hidden):
     assert np.allclose(out, expected, atol=1e-4)
 
 
-def test_slopes_of_the_density_match_autograd():
-    """Inside the core, in the shell and at the middle; as many points as do not fill the lanes."""
+def test_density_slopes_match_autograd():
+    """Inside the core, in the shell and at the middle; the last vector is not full."""
     generator = torch.Generator().manual_seed(2)
     table = torch.rand(4, 512, 2, generator=generator) - 0.5
     resolutions = torch.tensor([4, 7, 16, 40])
@@ -91,14 +91,14 @@ def test_slopes_of_the_density_match_autograd():
     found = marching.density_slopes(q, (table, resolutions, w1, b1, w2, b2))
     layers = [(w1.double(), b1.double()), (w2.double(), b2.double())]
     expected = reference.density_slopes(q.double(), table.double(), resolutions, layers)
-    off = (found - expected).norm(dim=-1) / expected.norm(dim=-1).clamp_min(1e-3)
-    # Where a hidden unit or a cell's face is met within rounding, either side is right.
-    assert (off > 1e-3).sum() <= 2, off.topk(4)
+    error = (found - expected).norm(dim=-1) / expected.norm(dim=-1).clamp_min(1e-3)
+    # At a kink (a hidden unit at zero, a cell face) rounding selects the side.
+    assert (error > 1e-3).sum() <= 2, error.topk(4)
     assert torch.isfinite(found).all()
 
 
-def test_many_points_are_encoded_as_few_are():
-    """In several blocks, the last one short, and none at all."""
+def test_encoding_does_not_depend_on_the_number_of_points():
+    """Several blocks, the last one shorter, and no points."""
     generator = torch.Generator().manual_seed(5)
     table = torch.rand(3, 512, 2, generator=generator) - 0.5
     resolutions = torch.tensor([4, 16, 40])
@@ -109,14 +109,14 @@ def test_many_points_are_encoded_as_few_are():
     assert encoding.hash_encode(u[:0], table, resolutions).shape == (0, 6)
 
 
-def test_places_that_are_no_numbers_stay_in_the_table():
-    """They would be read two billion rows on: features that mean nothing, but no crash."""
+def test_nan_positions_do_not_read_outside_the_table():
+    """The result is undefined, but the index is clamped: reading beyond the table would crash."""
     table, resolutions = torch.ones(2, 512, 2), torch.tensor([4, 40])
     u = torch.full((20, 3), torch.nan)
     assert encoding.hash_encode(u, table, resolutions).shape == (20, 4)
 
 
-def test_slopes_in_double_precision_and_of_nothing():
+def test_density_slopes_in_double_precision_and_of_no_points():
     generator = torch.Generator().manual_seed(6)
     table, resolutions = torch.rand(2, 512, 2, generator=generator), torch.tensor([4, 16])
     w1, w2 = (torch.randn(shape, generator=generator) for shape in ((4, 8), (8, 1)))
@@ -130,7 +130,7 @@ def test_slopes_in_double_precision_and_of_nothing():
 
 
 @pytest.mark.parametrize("side", [32, 8, 6])
-def test_every_cell_has_its_bit(side):
+def test_each_cell_is_one_bit_of_a_word(side):
     generator = torch.Generator().manual_seed(3)
     occupied = (torch.rand(2, side, side, side, generator=generator) < 0.3).to(torch.uint8)
     words, blocks = marching.cells_of(occupied)
@@ -141,8 +141,8 @@ def test_every_cell_has_its_bit(side):
     assert blocks.shape[1] == (side // 8 if side == 32 else side)
 
 
-def test_cells_are_packed_anew_when_they_change():
-    """Written in place, replaced, and in a copy that goes its own way."""
+def test_cells_are_repacked_when_they_change():
+    """Cells written in place, replaced, and changed in a copy."""
     occupancy = Occupancy(cascades=2, side=32)
     assert (occupancy.cells()[0] == -1).all()
     same = occupancy.cells()
@@ -152,7 +152,7 @@ def test_cells_are_packed_anew_when_they_change():
     occupancy.occupied = torch.ones_like(occupancy.occupied)
     assert (occupancy.cells()[0] == -1).all()
     twin = copy.deepcopy(occupancy)
-    assert twin.packed is None, "its changes are counted from another start"
+    assert twin.packed is None, "a copy has a version counter of its own"
     twin.occupied.zero_()
     assert (twin.cells()[0] == 0).all() and (occupancy.cells()[0] == -1).all()
     with torch.inference_mode():
@@ -160,31 +160,31 @@ def test_cells_are_packed_anew_when_they_change():
         assert (occupancy.cells()[0] == 0).all()
 
 
-def test_adam_leaves_alone_what_has_no_gradient():
-    """Against PyTorch's own, over lanes that are empty, full and cut off at the end."""
+def test_adam_skips_entries_without_gradient():
+    """Compare with PyTorch's Adam, with vectors of no, some and only non-zero gradients."""
     n = 4096 + 3 * LANES + 5
-    own, gradients = torch.randn(n), torch.randn(2, n)
+    values, gradients = torch.randn(n), torch.randn(2, n)
     gradients[:, LANES : 2 * LANES] = 0.0
     gradients[:, ::3] = 0.0
-    gradients[1, 1::3] = 0.0  # moved by the first step, left alone by the second
+    gradients[1, 1::3] = 0.0  # changed by the first step only
     first, second = torch.zeros(n), torch.zeros(n)
-    other = torch.nn.Parameter(own.clone())
+    other = torch.nn.Parameter(values.clone())
     adam = torch.optim.Adam([other], lr=0.1, betas=(0.9, 0.99), eps=1e-15)
     for step, gradient in enumerate(gradients, start=1):
-        before = own.clone(), first.clone(), second.clone()
+        before = values.clone(), first.clone(), second.clone()
         other.grad = gradient.clone()
         adam.step()
         moved = gradient != 0
-        optimiser.adam(own, gradient.clone(), (first, second), 0.1, (0.9, 0.99), 1e-15, step)
-        assert torch.allclose(own[moved], other[moved], atol=1e-6) and moved.sum() > n // 4
-        for now, then in zip((own, first, second), before, strict=True):
+        optimiser.adam(values, gradient.clone(), (first, second), 0.1, (0.9, 0.99), 1e-15, step)
+        assert torch.allclose(values[moved], other[moved], atol=1e-6) and moved.sum() > n // 4
+        for now, then in zip((values, first, second), before, strict=True):
             assert torch.equal(now[~moved], then[~moved])
     cleared = gradients[0].clone()
-    optimiser.adam(own, cleared, (first, second), 0.1, (0.9, 0.99), 1e-15, 3)
+    optimiser.adam(values, cleared, (first, second), 0.1, (0.9, 0.99), 1e-15, 3)
     assert (cleared == 0).all()
 
 
-def test_lengths_and_their_gradients():
+def test_lengths_and_unit_vectors_have_finite_gradients():
     v = torch.randn(20, 3, dtype=torch.float64, requires_grad=True)
     assert torch.allclose(length(v), v.norm(dim=-1))
     assert torch.allclose(unit(v), torch.nn.functional.normalize(v, dim=-1))
@@ -211,21 +211,21 @@ print(next(width for width in ("zmm", "ymm", "xmm") if width in text))
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="x86 processors' names")
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names of x86 processors")
 @pytest.mark.parametrize(("processor", "widest"), [("haswell", "ymm"), ("x86-64", "xmm")])
-def test_processors_with_shorter_vectors_compute_the_same(processor, widest, tmp_path):
-    """AVX2, and what every such processor has: all kernels against their twins, compiled for it."""
+def test_kernels_match_the_twins_on_processors_with_shorter_vectors(processor, widest, tmp_path):
+    """Compile all kernels for AVX2 and for the x86-64 baseline, and compare with the twins."""
     environment = {
         **os.environ,
         "NUMBA_CPU_NAME": processor,
         "NUMBA_CPU_FEATURES": "",
         "NUMBA_CACHE_DIR": str(tmp_path),
     }
-    told = {"env": environment, "capture_output": True, "text": True}
-    done = subprocess.run([sys.executable, "-c", WIDTH], **told)
+    options = {"env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", WIDTH], **options)
     assert done.stdout.strip() == widest, done.stderr[-2000:]
     names = ("test_kernels.py", "test_simd.py", "test_metaballs.py")
     files = [str(Path(__file__).with_name(name)) for name in names]
-    words = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files]
-    done = subprocess.run(words, **told)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *files]
+    done = subprocess.run(command, **options)
     assert done.returncode == 0, done.stdout[-3000:]

@@ -45,7 +45,7 @@ def other_path(job, **changes):
 def test_a_frame_key_depends_on_everything_that_a_frame_depends_on(monkeypatch):
     job = make_job(3)
     moved, zoomed = job.path.c2w.copy(), dataclasses.replace(job.path.cameras[0], fx=21.0)
-    moved[2, 1, 3] = 0.5  # another frame's camera: snow is finest around all of them
+    moved[2, 1, 3] = 0.5  # the lattice of snow depends on all cameras
     later = KeyframedWeather(Weather(snow=Snow(depth=0.1)), {"snow.depth": ((0, 0.1), (9, 0.2))})
     others = [
         dataclasses.replace(job, run="another run"),
@@ -77,7 +77,7 @@ def test_a_frame_key_is_the_same_in_another_process_and_after_roundings():
     assert job.key == rounded.key == done.stdout.strip(), done.stderr
 
 
-def test_the_hash_of_a_run_follows_its_field_and_scene(tmp_path):
+def test_the_hash_of_a_run_depends_on_its_field_and_scene(tmp_path):
     (tmp_path / "field.safetensors").write_bytes(b"a")
     with pytest.raises(UserError, match="scene.json"):
         jobs.hash_of_run(tmp_path)
@@ -103,8 +103,9 @@ def test_parts_hold_every_nth_frame():
 
 
 def test_a_render_writes_frames_layers_movie_and_sidecar(tmp_path):
-    job, said = make_job(3), []
-    assert render(job, tmp_path, progress=lambda *step: said.append(step)) == tmp_path / "movie.mp4"
+    job, reports = make_job(3), []
+    movie = render(job, tmp_path, progress=lambda *step: reports.append(step))
+    assert movie == tmp_path / "movie.mp4"
     sidecar = json.loads((tmp_path / "movie.json").read_text())
     assert [frame["file"] for frame in sidecar["frames"]] == [
         f"frames/000{i}.png" for i in range(3)
@@ -119,8 +120,8 @@ def test_a_render_writes_frames_layers_movie_and_sidecar(tmp_path):
     depth = np.load(tmp_path / "depth" / "0001.npz")["depth"]
     assert np.array_equal(depth, expected.layers["depth"])
     assert sidecar["frames"][1]["measured"] == jobs.measured(expected.layers)
-    fractions = [fraction for what, fraction in said if what == "frames"]
-    assert fractions == [0, 1 / 3, 2 / 3, 1] and said[-1] == ("movie", 1.0)
+    fractions = [fraction for what, fraction in reports if what == "frames"]
+    assert fractions == [0, 1 / 3, 2 / 3, 1] and reports[-1] == ("movie", 1.0)
 
 
 def test_the_same_call_on_a_finished_render_writes_nothing(tmp_path):
@@ -194,7 +195,7 @@ def test_a_stopped_render_leaves_a_sidecar_of_its_frames_and_resumes(tmp_path):
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-def test_a_preview_shows_the_frame_at_work_and_is_removed(tmp_path):
+def test_a_preview_shows_the_current_frame_and_is_removed(tmp_path):
     job, seen = make_job(2), []
 
     def source():
@@ -249,7 +250,7 @@ def test_a_slow_process_does_not_write_into_the_render_that_followed(tmp_path):
 
     def source():
         def frame(index, preview):
-            if index == 1:  # two others finish this render, and the next one, while it works
+            if index == 1:  # other processes finish this render and the next one meanwhile
                 render(slow, tmp_path)
                 render(following, tmp_path)
             return noise_of(slow)(index, preview)
@@ -264,7 +265,7 @@ def test_a_slow_process_does_not_write_into_the_render_that_followed(tmp_path):
     assert after == expected
 
 
-def test_a_render_of_a_version_without_records_is_replaced(tmp_path):
+def test_a_render_of_an_earlier_version_without_records_is_replaced(tmp_path):
     job = make_job(2)
     (tmp_path / "frames").mkdir()
     names = [f"frames/{index:04d}.png" for index in range(3)]
@@ -278,7 +279,7 @@ def test_a_render_of_a_version_without_records_is_replaced(tmp_path):
     assert len((tmp_path / "movie.mp4").read_bytes()) > 500
 
 
-def test_files_of_others_are_refused_before_anything_is_written(tmp_path):
+def test_foreign_files_are_refused_before_anything_is_written(tmp_path):
     job = make_job(2)
     for name in ("frames/0001.png", "movie.json", "movie.mp4", "depth/0001.npz", "normal/0007.exr"):
         out = tmp_path / name.replace("/", "-")
@@ -293,7 +294,7 @@ def test_files_of_others_are_refused_before_anything_is_written(tmp_path):
 
 
 class Crash(BaseException):
-    """Ends a process at one point, as a kill does; the code under test has no word for it."""
+    """Simulates a kill; not an Exception, so that the code under test does not catch it."""
 
 
 def crash_at(monkeypatch, step):
@@ -301,11 +302,11 @@ def crash_at(monkeypatch, step):
     count = [0]
 
     def counted(function):
-        def call(*words, **options):
+        def call(*args, **options):
             count[0] += 1
             if count[0] == step:
                 raise Crash
-            return function(*words, **options)
+            return function(*args, **options)
 
         return call
 
@@ -338,15 +339,15 @@ def test_a_crash_at_any_point_loses_nothing(tmp_path, replacing):
     assert step > (12 if replacing else 8)
 
 
-def test_processes_on_one_folder_leave_what_one_process_leaves(tmp_path):
-    """Two parts at once, one killed at random and begun again, then joined twice at once."""
+def test_several_processes_write_the_same_files_as_one(tmp_path):
+    """Two concurrent parts, one killed at random and restarted, then two concurrent joins."""
     frames, spawn = 20, multiprocessing.get_context("spawn")
     render(make_job(frames), tmp_path / "expected")
     expected = files_of(tmp_path / "expected")
     rng = random.Random(0)
 
-    def start(target, *words):
-        process = spawn.Process(target=target, args=words)
+    def start(target, *args):
+        process = spawn.Process(target=target, args=args)
         process.start()
         return process
 

@@ -73,7 +73,7 @@ def test_wrong_layers_are_refused(tmp_path):
             layers.save_layers(tmp_path, "0", bad)
 
 
-def test_exr_without_the_package_is_one_sentence(tmp_path, monkeypatch):
+def test_exr_without_its_package_is_a_user_error(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(UserError, match=r"pip install climatenerf\[exr\]"):
         layers.save_layers(tmp_path, "0", {"depth": np.ones((H, W))}, ("exr",))

@@ -72,8 +72,8 @@ def test_frames_are_saved_without_ffmpeg(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "program", ["import sys; sys.exit('Unknown encoder libx264')", "import time; time.sleep(0.1)"]
 )
-def test_ffmpeg_that_fails_is_one_sentence(tmp_path, monkeypatch, program):
-    # The first acts like an ffmpeg that exits at once, the second like one that writes nothing.
+def test_a_failing_ffmpeg_is_a_user_error(tmp_path, monkeypatch, program):
+    # The first stands for an ffmpeg that exits at once, the second for one without output.
     fake = tmp_path / "ffmpeg"
     fake.write_text(f"#!{sys.executable}\n{program}\n")
     fake.chmod(0o755)

@@ -247,7 +247,7 @@ def test_nerfstudio_path_without_dataparser_is_in_the_input_frame(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes, words",
+    "changes, message",
     [
         ({"camera_type": "fisheye"}, "only perspective"),
         ({"camera_path": []}, "no frames"),
@@ -259,9 +259,9 @@ def test_nerfstudio_path_without_dataparser_is_in_the_input_frame(tmp_path):
         ({"render_width": "wide"}, "0x270"),
     ],
 )
-def test_damaged_nerfstudio_paths_are_refused(tmp_path, changes, words):
+def test_damaged_nerfstudio_paths_are_refused(tmp_path, changes, message):
     path = nerfstudio_file(tmp_path, [np.eye(4)], **changes)
-    with pytest.raises(UserError, match=words):
+    with pytest.raises(UserError, match=message):
         camera_path(str(path), scene_of(ring(3)), 1)
 
 

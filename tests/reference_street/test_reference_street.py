@@ -112,8 +112,8 @@ def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path):
     inner = (slice(80, -80), slice(80, -80))  # without the damped border
     slope_y, slope_x = np.gradient(z, water.STEP)
     analytic = -normal[..., :2] / normal[..., 2:]
-    wanted = np.stack([slope_x, slope_y], -1)
-    error = np.sqrt(((analytic - wanted)[inner] ** 2).mean())
+    expected = np.stack([slope_x, slope_y], -1)
+    error = np.sqrt(((analytic - expected)[inner] ** 2).mean())
     assert error < 0.25 * np.sqrt((analytic[inner] ** 2).mean()), "differences smooth short waves"
     waves = make_waves(
         Flood(level=0.0, wind_speed=water.WIND, wave_scale=water.WAVE_SCALE), water.SEED

@@ -1,6 +1,6 @@
-"""Smog, flood, snow, layers and the session with fields that are no hash grids.
+"""Smog, flood, snow, layers and the session with other fields than hash grids.
 
-The renderer asks `field.protocol` alone: an analytic field, and one of 42 Gaussians.
+The renderer depends on `field.protocol` only: an analytic field, and one of 42 Gaussians.
 """
 
 import ast
@@ -50,7 +50,7 @@ def session(field, tmp_path, **sections):
 
 
 @pytest.mark.parametrize("kind", FIELDS)
-def test_all_weathers_and_layers_at_once(kind, tmp_path):
+def test_all_weathers_and_layers_are_rendered_together(kind, tmp_path):
     weather = {
         "smog": Smog(visibility=60.0),
         "flood": Flood(level=0.05, wind_speed=0.0),
@@ -61,16 +61,16 @@ def test_all_weathers_and_layers_at_once(kind, tmp_path):
     assert set(EVERY) <= frame.layers.keys() and frame.picture.shape == (27, 48, 3)
     assert all(np.isfinite(v).all() for name, v in frame.layers.items() if name != "depth")
     assert frame.layers["mask_water"].max() > 0.9, "the ground at z = 0 is flooded"
-    assert frame.layers["mask_snow"].max() > 0.5, "what rises above the water is snowed"
+    assert frame.layers["mask_snow"].max() > 0.5, "surfaces above the water carry snow"
     assert 0 < frame.layers["mask_smog"].min() < frame.layers["mask_smog"].max() <= 1
 
 
 @pytest.mark.parametrize("kind", FIELDS)
-def test_snow_has_its_depth_on_the_ground(kind, tmp_path):
+def test_snow_on_the_ground_has_the_requested_depth(kind, tmp_path):
     frame = session(FIELDS[kind](), tmp_path, snow=Snow(depth=0.2)).frame(CAMERA, C2W)
     snowy = frame.layers["mask_snow"] > 0.9
     assert snowy.mean() > 0.3
-    # Ground of Gaussians is soft: its surface lies where half of the light is gone.
+    # Ground of Gaussians is blurred: its surface is where the transmittance is 1/2.
     assert np.median(frame.layers["snow_thickness"][snowy]) == pytest.approx(0.2, rel=0.2)
 
 
@@ -87,33 +87,33 @@ def test_smog_equals_the_sum_over_samples(kind, tmp_path):
     expected = torch.empty(len(o), 3)
     sigma = sigma_from_visibility(20.0)
     for r in range(len(o)):
-        own = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
-        tau = (samples.sigma * samples.dt)[own]
+        part = slice(int(samples.offsets[r]), int(samples.offsets[r + 1]))
+        tau = (samples.sigma * samples.dt)[part]
         before = torch.exp(-torch.cat([torch.zeros(1), tau.cumsum(0)]))
         weights = before[:-1] - before[1:]
-        x = o[r] + samples.t[own, None] * d[r]
-        ids = None if samples.ids is None else samples.ids[own]
+        x = o[r] + samples.t[part, None] * d[r]
+        ids = None if samples.ids is None else samples.ids[part]
         colour = field.colour(x, d[r].expand_as(x), ids=ids)
-        passed = torch.exp(-sigma * samples.t[own])[:, None]
+        passed = torch.exp(-sigma * samples.t[part])[:, None]
         lit = passed * colour + (1 - passed)
         expected[r] = (weights[:, None] * lit).sum(0) + before[-1]
     assert (frame.linear.reshape(-1, 3) - expected).abs().max() < 2e-3
 
 
-def test_gaussians_composite_as_brute_force_along_the_ray():
-    """One sample a Gaussian against fine steps through the sum of their densities, far apart."""
+def test_compositing_of_gaussians_equals_dense_sampling():
+    """One sample per Gaussian against fine steps through the sum of their densities."""
     field = plain_with_stones()
     o, d, _, _ = traced_rays(CAMERA, C2W)
     _, transmittance, _ = composited(field, o, d, torch.zeros(len(o)))
     steps = torch.linspace(0, 20, 8001)
     for r in range(0, len(o), 97):
         sigma = field.density(o[r] + steps[:, None] * d[r])
-        thick = float(torch.trapezoid(sigma, steps))
-        if thick < 5:
-            assert float(transmittance[r]) == pytest.approx(math.exp(-thick), abs=2e-3)
+        depth = float(torch.trapezoid(sigma, steps))
+        if depth < 5:
+            assert float(transmittance[r]) == pytest.approx(math.exp(-depth), abs=2e-3)
 
 
-def test_a_field_without_density_cannot_be_flooded(tmp_path):
+def test_flooding_a_field_without_density_is_refused(tmp_path):
     field = AnalyticField([HalfSpace()], capabilities=frozenset())
     with pytest.raises(UserError, match="'flood' needs a field with density") as error:
         session(field, tmp_path, flood=Flood(level=0.1))
@@ -121,7 +121,7 @@ def test_a_field_without_density_cannot_be_flooded(tmp_path):
     assert session(field, tmp_path, smog=Smog(visibility=9.0)).world(0.0).media
 
 
-def test_no_part_above_the_field_asks_for_its_class():
+def test_no_part_above_the_field_imports_the_hash_field():
     root = Path(climatenerf.__file__).parent
     for part in ("weather", "render", "output"):
         for path in (root / part).rglob("*.py"):

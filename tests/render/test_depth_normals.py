@@ -23,7 +23,7 @@ def degrees(a, b):
 
 @pytest.mark.parametrize("noise", [0.0, 3e-3])
 @pytest.mark.parametrize("slant", [0.0, 40.0, 65.0])
-def test_planes_at_any_slant_also_when_the_depth_is_noisy(slant, noise):
+def test_normals_of_slanted_planes_with_and_without_depth_noise(slant, noise):
     d = CAMERA.directions()
     s = np.radians(slant)
     normal = np.array([0.0, np.sin(s), -np.cos(s)])
@@ -31,11 +31,11 @@ def test_planes_at_any_slant_also_when_the_depth_is_noisy(slant, noise):
     depth = depth * (1 + noise * np.random.default_rng(0).normal(size=depth.shape))
     found = plane_normals(EYE, d, depth, ANGLE)
     assert np.linalg.norm(found, axis=-1) == pytest.approx(1, abs=1e-5)
-    apart = degrees(found, normal)[5:-5, 5:-5]
-    assert (apart.max() < 0.1) if noise == 0 else (np.median(apart) < 8)
+    error = degrees(found, normal)[5:-5, 5:-5]
+    assert (error.max() < 0.1) if noise == 0 else (np.median(error) < 8)
 
 
-def test_an_edge_stays_sharp_and_the_sky_has_none():
+def test_normals_are_sharp_at_edges_and_zero_in_the_sky():
     d = CAMERA.directions()
     near = depth_to(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 3.0]), d)
     s = np.radians(50)
@@ -50,7 +50,7 @@ def test_an_edge_stays_sharp_and_the_sky_has_none():
     assert degrees(found[10:, 30:], tilted).max() < 1
 
 
-def test_a_pixel_without_neighbours_faces_the_eye():
+def test_a_pixel_without_neighbours_faces_the_camera():
     d = CAMERA.directions()
     depth = np.full((60, 80), np.inf)
     depth[20, 30] = 4.0
@@ -62,7 +62,7 @@ def test_a_pixel_without_neighbours_faces_the_eye():
 
 
 @pytest.mark.parametrize("supersample", [1, 3])
-def test_the_layer_against_a_scene_in_closed_form(supersample):
+def test_the_normal_layer_matches_an_analytic_scene(supersample):
     field = AnalyticField(
         [HalfSpace(), Box((-1.0, 2.0, -1.0), (1.0, 4.0, 2.0))],
         box=((-50.0, -50.0, -5.0), (50.0, 50.0, 9.0)),

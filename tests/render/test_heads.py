@@ -1,4 +1,4 @@
-"""Normals of the density and predicted ones, classes: values, gradients, what they depend on."""
+"""Density normals, predicted normals and classes: values, gradients, dependencies."""
 
 import torch
 from support.random_field import random_field
@@ -8,7 +8,7 @@ from climatenerf.ops import reference
 
 
 def log_density(field, q):
-    """The twin, in double precision."""
+    """Logarithm of the reference density in double precision."""
     layers = [
         (w.detach().double(), b.detach().double())
         for w, b in zip(field.geometry_net[::2], field.geometry_net[1::2], strict=True)
@@ -17,11 +17,11 @@ def log_density(field, q):
     return reference.density(q, grid, field.geometry_resolutions, layers).log()
 
 
-def positions(n=400, reach=3.0, seed=1):
-    return (torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) - 0.5) * 2 * reach
+def positions(n=400, half=3.0, seed=1):
+    return (torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) - 0.5) * 2 * half
 
 
-def test_density_normals_are_against_finite_differences():
+def test_density_normals_match_finite_differences():
     """Central differences of the twin, inside the core and in the contracted shell."""
     field, q = random_field(full=True), positions()
     h = 1e-5
@@ -35,7 +35,7 @@ def test_density_normals_are_against_finite_differences():
     steep = slope.norm(dim=-1) > 0.1 * slope.norm(dim=-1).median()
     expected = -torch.nn.functional.normalize(slope, dim=-1)
     cosine = (field.density_normal(q).double() * expected).sum(-1)[steep]
-    # A few points lie within h of a cell's face, where the slope jumps.
+    # Few points lie within h of a cell face, where the slope is discontinuous.
     assert cosine.quantile(0.02) > 0.999, cosine.quantile(0.02)
 
 
@@ -47,20 +47,20 @@ def test_density_normals_have_unit_length_and_are_finite_at_the_middle():
     assert torch.allclose(normal[1:].norm(dim=-1), torch.ones(400), atol=1e-5)
 
 
-def test_even_density_has_no_direction_and_no_bad_gradient():
+def test_constant_density_has_a_zero_normal_and_finite_gradients():
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_grid.zero_()
-    q = positions(20, reach=0.5)
+    q = positions(20, half=0.5)
     assert (field.density_normal(q) == 0).all()
     field.requires_grad_(True)
     field.finite_difference_normal(q, torch.full((20,), 1e-2)).sum().backward()
     assert torch.isfinite(field.geometry_grid.grad).all()
 
 
-def test_sloped_normals_approach_the_analytic_ones_and_move_the_density():
-    """Over a short step; up to the points whose step crosses a cell's face."""
-    field, q = random_field(full=True), positions(reach=0.8)
+def test_finite_difference_normals_converge_and_have_gradients_to_the_density():
+    """Short steps agree except for points whose step crosses a cell face."""
+    field, q = random_field(full=True), positions(half=0.8)
     analytic = field.density_normal(q)
     with torch.no_grad():
         near = field.finite_difference_normal(q, torch.full((400,), 2e-3))
@@ -76,8 +76,8 @@ def test_sloped_normals_approach_the_analytic_ones_and_move_the_density():
     assert (field.geometry_grid.grad != 0).any()
 
 
-def test_surface_reads_its_own_grid():
-    """So a change of appearance or of geometry leaves normals and classes bit-identical."""
+def test_the_surface_head_depends_on_its_own_grid_only():
+    """Changes of appearance or geometry leave normals and classes bit-identical."""
     field, u = random_field(full=True), torch.rand(50, 3)
     with torch.no_grad():
         field.surface_grid.normal_()

@@ -1,4 +1,4 @@
-"""Smog, flood and their composition: the checks of the physics, through the renderer."""
+"""Physics of smog, flood, snow and their composition, tested through the renderer."""
 
 import dataclasses
 import math
@@ -27,8 +27,8 @@ WIDE = ((-3000.0, -3000.0, -20.0), (3000.0, 3000.0, 30.0))
 CAMERA = Camera(96, 54, 60.0, 60.0, 48.0, 27.0)
 
 
-def looking(direction, eye=(0.0, -3.0, 1.6)):
-    """Pose that looks along a direction with a level horizon."""
+def pose_along(direction, eye=(0.0, -3.0, 1.6)):
+    """Pose with its axis along a direction and a level horizon."""
     forward = np.array(direction, float)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1.0])
@@ -40,7 +40,7 @@ def looking(direction, eye=(0.0, -3.0, 1.6)):
 
 
 def street():
-    """Ground that rises along y, a wall, a box; a sky that brightens upwards."""
+    """Ground that rises along y, a wall, a box, and a sky with a vertical gradient."""
     slope = np.array([0.0, -0.1, 1.0])
     slope /= np.linalg.norm(slope)
     return AnalyticField(
@@ -62,25 +62,25 @@ def flooded(level=0.3, **changes):
 
 
 def values(seen, name):
-    """A part of a render's output, or one of its layers."""
+    """An attribute or a layer of a render output."""
     return seen.layers[name] if name in seen.layers else getattr(seen, name)
 
 
 def frame(world, eye=(0.0, -3.0, 1.6), direction=(0.0, 1.0, -0.2), camera=CAMERA):
-    return render_frame(world, camera, looking(direction, eye))
+    return render_frame(world, camera, pose_along(direction, eye))
 
 
 def linear(world, direction=(0.0, 1.0, -0.2), eye=(0.0, -3.0, 1.6)):
     from climatenerf.render.volume import camera_rays
 
-    o, d = camera_rays(CAMERA, looking(direction, eye))
+    o, d = camera_rays(CAMERA, pose_along(direction, eye))
     return trace(world, o, d, torch.full((o.shape[0],), 1 / 60))
 
 
 # --- smog ---------------------------------------------------------------------------------------
 
 
-def test_smog_contrast_falls_with_depth_at_the_rate_asked_for():
+def test_smog_contrast_decreases_exponentially_with_depth():
     air = medium(Smog(visibility=30.0), 0.0)
     dry, hazy = linear(World(street())), linear(World(street(), media=(air,)))
     colour = torch.tensor(air.colour)
@@ -94,7 +94,7 @@ def test_smog_contrast_falls_with_depth_at_the_rate_asked_for():
         assert explained > 0.999
 
 
-def test_an_endless_smog_swallows_the_sky_and_layers_say_so():
+def test_infinite_smog_hides_the_sky():
     seen = linear(World(street(), media=(medium(Smog(visibility=30.0), 0.0),)))
     sky = torch.isinf(seen.depth)
     assert sky.any()
@@ -121,8 +121,8 @@ def test_white_furnace():
     assert seen.layers["mask_water"].min() > 0.999
 
 
-def test_a_perfect_mirror_shows_what_a_mirrored_camera_sees():
-    """Snowless, waveless, R = 1: the water shows the scene as from under it, cut at the plane."""
+def test_a_perfect_mirror_equals_the_view_of_a_mirrored_camera():
+    """R = 1 without waves: water shows the view of a mirrored camera, clipped at the plane."""
     level = 0.3
     still = flooded(level, wind_speed=0.0)
     water = dataclasses.replace(still, mirror_only=True)
@@ -130,7 +130,7 @@ def test_a_perfect_mirror_shows_what_a_mirrored_camera_sees():
     seen = linear(world)
     from climatenerf.render.volume import camera_rays
 
-    o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
+    o, d = camera_rays(CAMERA, pose_along((0.0, 1.0, -0.2)))
     t = (level - o[:, 2]) / d[:, 2]
     wet = (d[:, 2] < 0) & (seen.layers["mask_water"] > 0.999)
     assert wet.float().mean() > 0.1
@@ -143,8 +143,8 @@ def test_a_perfect_mirror_shows_what_a_mirrored_camera_sees():
     assert -10 * math.log10(float(error) + 1e-12) >= 40
 
 
-def test_fresnel_governs_how_much_the_sky_shows():
-    """Black opaque water under a white sky shows exactly its reflectance."""
+def test_black_water_reflects_the_sky_by_fresnel():
+    """Black opaque water under a white sky has the radiance of its reflectance."""
     black = AnalyticField(
         [HalfSpace(colour=(0.0, 0.0, 0.0))], zenith=(1.0,) * 3, horizon=(1.0,) * 3, box=WIDE
     )
@@ -159,7 +159,7 @@ def test_fresnel_governs_how_much_the_sky_shows():
 
 
 def test_attenuation_per_channel_is_recovered_from_the_picture():
-    """A white bed under depth d, seen from straight above: c = (1-R) L exp(-beta 2.2 d)."""
+    """A white bottom at depth d, seen vertically: c = (1-R) L exp(-beta 2.2 d)."""
     betas = (0.5, 1.0, 2.0)
     values = []
     for depth in (0.4, 0.9):
@@ -176,10 +176,10 @@ def test_attenuation_per_channel_is_recovered_from_the_picture():
     assert torch.allclose(found, torch.tensor(betas), rtol=0.01)
 
 
-def test_snell_apparent_depth_near_the_nadir():
-    """The edge of a block under water appears where a block at d / 1.333 would show it."""
+def test_apparent_depth_near_the_nadir_is_depth_over_ior():
+    """The edge of a block at depth d under water appears at the depth d / 1.333."""
     depth = 0.8
-    bed = AnalyticField(
+    bottom = AnalyticField(
         [HalfSpace(offset=-1.0, colour=(1.0,) * 3), Box((-9, -5, -9), (0.1, 5, -depth))],
         zenith=(0.0,) * 3, horizon=(0.0,) * 3, box=WIDE,
     )  # fmt: skip
@@ -190,56 +190,56 @@ def test_snell_apparent_depth_near_the_nadir():
         torch.stack([slant, torch.zeros_like(slant), -torch.ones_like(slant)], dim=-1), dim=-1
     )
     o = torch.tensor([0.0, 0.0, 1.0]).expand_as(d).contiguous()
-    green = trace(World(bed, surfaces=(water,)), o, d, torch.full((4001,), 1e-5)).rgb[:, 1]
+    green = trace(World(bottom, surfaces=(water,)), o, d, torch.full((4001,), 1e-5)).rgb[:, 1]
     edge = slant[(green[1:] - green[:-1]).abs().argmax()]
     apparent = 0.1 / float(edge) - 1.0
     assert abs(apparent / (depth / 1.333) - 1) < 0.01
 
 
-def test_a_bed_s_rays_leave_out_next_to_nothing(monkeypatch):
-    """They begin at the water, with short steps, of which each is thin; the eye's do not."""
-    asked, march = [], AnalyticField.march
+def test_refracted_rays_use_the_minimum_pruning_threshold(monkeypatch):
+    """Refracted rays start with short steps of small optical depth; camera rays do not."""
+    thresholds, march = [], AnalyticField.march
 
-    def noting(self, *rays, stop=1e-3, pruning_threshold=None):
-        asked.append(pruning_threshold)
+    def recorded(self, *rays, stop=1e-3, pruning_threshold=None):
+        thresholds.append(pruning_threshold)
         return march(self, *rays, stop=stop, pruning_threshold=pruning_threshold)
 
-    monkeypatch.setattr(AnalyticField, "march", noting)
+    monkeypatch.setattr(AnalyticField, "march", recorded)
     linear(World(street()))
-    assert set(asked) == {None}
+    assert set(thresholds) == {None}
     linear(World(street(), surfaces=(flooded(),)))
-    assert set(asked) == {None, MIN_TAU}
+    assert set(thresholds) == {None, MIN_TAU}
 
 
-def test_flooded_pixels_are_nested_as_the_level_rises():
+def test_coverage_of_each_pixel_increases_with_the_level():
     before = torch.zeros(CAMERA.width * CAMERA.height)
     for level in (0.05, 0.2, 0.35, 0.6):
-        share = linear(World(street(), surfaces=(flooded(level),))).layers["mask_water"]
-        assert (share >= before - 1e-4).all()
-        assert share.mean() > before.mean()
-        before = share
+        coverage = linear(World(street(), surfaces=(flooded(level),))).layers["mask_water"]
+        assert (coverage >= before - 1e-4).all()
+        assert coverage.mean() > before.mean()
+        before = coverage
 
 
-def test_water_depth_layer_against_the_true_ground():
+def test_the_water_depth_layer_is_level_minus_ground():
     level = 0.3
     seen = linear(World(street(), surfaces=(flooded(level),)))
     dry = linear(World(street()))
     wet = (seen.layers["mask_water"] > 0.999) & torch.isfinite(dry.depth)
     from climatenerf.render.volume import camera_rays
 
-    o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
-    bed = o[:, 2] + dry.depth * d[:, 2]
-    assert (seen.layers["water_depth"][wet] - (level - bed[wet])).abs().max() < 0.01
+    o, d = camera_rays(CAMERA, pose_along((0.0, 1.0, -0.2)))
+    bottom = o[:, 2] + dry.depth * d[:, 2]
+    assert (seen.layers["water_depth"][wet] - (level - bottom[wet])).abs().max() < 0.01
     assert (seen.layers["water_depth"][seen.layers["mask_water"] < 1e-4] == 0).all()
 
 
-def test_the_waterline_is_soft_and_lies_where_water_meets_ground():
+def test_the_waterline_is_antialiased_and_follows_the_ground():
     level = 0.3
     seen = linear(World(street(), surfaces=(flooded(level),)))
     dry = linear(World(street()))
     from climatenerf.render.volume import camera_rays
 
-    o, d = camera_rays(CAMERA, looking((0.0, 1.0, -0.2)))
+    o, d = camera_rays(CAMERA, pose_along((0.0, 1.0, -0.2)))
     ground = o[:, 2] + dry.depth * d[:, 2]
     solid = torch.isfinite(dry.depth)
     assert (seen.layers["mask_water"][solid & (ground < level - 0.1)] > 0.95).all()
@@ -247,7 +247,7 @@ def test_the_waterline_is_soft_and_lies_where_water_meets_ground():
     assert ((seen.layers["mask_water"] > 0.05) & (seen.layers["mask_water"] < 0.95)).any()
 
 
-def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it():
+def test_a_camera_under_water_has_snells_window_and_total_reflection():
     field = street()
     water = flooded(1.5, wind_speed=0.0, attenuation=(0.0,) * 3)
     o = torch.tensor([[0.0, -3.0, 1.0], [0.0, -3.0, 1.0]])
@@ -256,11 +256,11 @@ def test_an_eye_under_water_sees_the_air_in_snells_window_and_mirrors_outside_it
     zenith = field.sky(torch.tensor([[0.0, 0.0, 1.0]]))[0]
     assert torch.allclose(seen.rgb[0], zenith * (1 - 0.0204), atol=0.03)
     assert torch.isfinite(seen.rgb).all()
-    # Total reflection: the second ray sees the bed, which is darker than the sky at that height.
+    # Total reflection: the second ray ends on the bottom, which is darker than the sky.
     assert seen.rgb[1, 2] < 0.6
 
 
-# --- composition and anything ---
+# --- composition ------------------------------------------------------------------------------
 
 
 def snowed(depth, field=None):
@@ -269,7 +269,7 @@ def snowed(depth, field=None):
     )
 
 
-def test_weather_that_does_nothing_is_bit_identical():
+def test_smog_of_zero_extinction_is_bit_identical():
     clean, layers = frame(World(street()))
     same, same_layers = frame(World(street(), media=(medium(Smog(sigma=0.0), 0.0),)))
     assert np.array_equal(clean, same)
@@ -278,7 +278,7 @@ def test_weather_that_does_nothing_is_bit_identical():
 
 
 @pytest.mark.parametrize("what", ["smog", "flood", "snow"])
-def test_weather_in_the_limit_changes_no_pixel_by_more_than_one_step(what):
+def test_vanishing_weather_changes_no_pixel_by_more_than_one_level(what):
     flat = AnalyticField(
         [HalfSpace(colour=(0.3, 0.3, 0.3), checker=0.5), Box((1, 2, 0), (2, 3, 1))], box=WIDE
     )
@@ -291,13 +291,13 @@ def test_weather_in_the_limit_changes_no_pixel_by_more_than_one_step(what):
         world = World(small, matters=(snowed(1e-4, small),))
     clean, layers = frame(World(small))
     other, _ = frame(world)
-    # Not the sky: an endless smog swallows it at any visibility, and the ground here ends at 30 m.
+    # The sky is excluded: infinite smog hides it at any visibility, and the ground ends at 30 m.
     solid = np.isfinite(layers["depth"])
     difference = np.abs(clean.astype(int) - other.astype(int)).max(-1)
     assert difference[solid].max() <= 1
 
 
-def test_all_weathers_at_once_compose():
+def test_all_weathers_compose():
     level = 0.3
     snow = snowed(0.15)
     air = medium(Smog(visibility=60.0), 0.0)
@@ -305,18 +305,18 @@ def test_all_weathers_at_once_compose():
     seen = linear(world)
     assert seen.layers["mask_water"].max() > 0.99 and seen.layers["mask_snow"].max() > 0.99
     assert (seen.layers["snow_thickness"][seen.layers["mask_water"] > 0.99] == 0).all()
-    shown = (seen.layers["mask_snow"] > 0.9) & (seen.layers["snow_thickness"] > 0)
-    assert 0.05 < seen.layers["snow_thickness"][shown].mean() < 0.25
+    snowy = (seen.layers["mask_snow"] > 0.9) & (seen.layers["snow_thickness"] > 0)
+    assert 0.05 < seen.layers["snow_thickness"][snowy].mean() < 0.25
     assert torch.isfinite(seen.rgb).all()
-    # The snow of the bank shows in the water: reflections see the other weathers.
+    # Snow is reflected in the water, since reflected rays are traced with all weathers.
     without = linear(dataclasses.replace(world, matters=()))
     wet = seen.layers["mask_water"] > 0.999
     assert (seen.rgb[wet] - without.rgb[wet]).abs().max() > 0.02
 
 
 @pytest.mark.parametrize("tilt", [0.0, 5.0, 20.0])
-def test_snow_shows_its_depth_in_the_picture(tilt):
-    """Vertical thickness over planes, and whether it is there at all, by the layers."""
+def test_snow_on_planes_has_the_requested_thickness(tilt):
+    """Layers have the vertical thickness and coverage of snow on planes."""
     angle = math.radians(tilt)
     plane = HalfSpace((0.0, -math.sin(angle), math.cos(angle)), 0.0, (0.3,) * 3)
     field = AnalyticField([plane], box=((-8.0, -8.0, -4.0), (8.0, 8.0, 4.0)))
@@ -329,27 +329,27 @@ def test_snow_shows_its_depth_in_the_picture(tilt):
     seen = trace(World(field, matters=(snow,)), o, d, torch.full((400,), 2e-3))
     assert seen.layers["mask_snow"].min() > 0.99
     assert (seen.layers["snow_thickness"] - 0.15).abs().max() < 0.15 * 0.1
-    # And the layer's depth is to the snow, not to the ground.
+    # The depth layer is the distance to the snow, not to the ground.
     height = (o + seen.depth[:, None] * d)[:, 2] - (o + seen.depth[:, None] * d)[:, 1] * math.tan(
         angle
     )
     assert (height - 0.15).abs().max() < 0.15 * 0.15
 
 
-def test_snow_is_not_looked_for_behind_what_is_opaque(monkeypatch):
-    """Fewer samples, the same picture but for rounding; and what is before a wall all shows."""
+def test_snow_is_not_marched_behind_opaque_surfaces(monkeypatch):
+    """Fewer samples give the same picture up to rounding, with all snow in front of a wall."""
     world = World(street(), matters=(snowed(0.2),))
     few = linear(world)
-    wanted = []
+    limits = []
     march = type(world.matters[0]).march
 
-    def noted(self, rays_o, rays_d, t_min, t_max):
-        wanted.append(t_max)
+    def recorded(self, rays_o, rays_d, t_min, t_max):
+        limits.append(t_max)
         return march(self, rays_o, rays_d, t_min, t_max)
 
-    monkeypatch.setattr(type(world.matters[0]), "march", noted)
+    monkeypatch.setattr(type(world.matters[0]), "march", recorded)
     linear(world)
-    assert 0.1 < torch.isfinite(torch.cat(wanted)).float().mean() < 0.9
+    assert 0.1 < torch.isfinite(torch.cat(limits)).float().mean() < 0.9
     monkeypatch.setattr(trace_module, "HIDDEN", 0.0)
     every = linear(world)
     for name in ("rgb", "mask_snow", "snow_thickness"):
@@ -357,7 +357,7 @@ def test_snow_is_not_looked_for_behind_what_is_opaque(monkeypatch):
     assert few.layers["mask_snow"].max() > 0.99
 
 
-def test_no_snow_shows_under_a_roof_or_on_a_steep_slope():
+def test_no_snow_lies_under_a_roof():
     roof = Box((-2.0, -2.0, 2.2), (2.0, 2.0, 2.3))
     field = AnalyticField([HalfSpace(), roof], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 4.0)))
     snow = bake_snow(field, Snow(depth=0.15), np.array([[0.0, 0.0, 1.6]]), np.full(3, 0.6))
@@ -370,28 +370,27 @@ def test_no_snow_shows_under_a_roof_or_on_a_steep_slope():
     assert under.layers["mask_snow"].max() < 0.01 and under.layers["snow_thickness"].max() == 0
     down = torch.tensor([[0.0, 0.0, -1.0]]).expand(300, 3).contiguous()
     above = trace(world, foot + torch.tensor([0.0, 0.0, 3.5]), down, torch.full((300,), 2e-3))
-    assert above.layers["mask_snow"].min() > 0.99, "the roof itself carries it"
+    assert above.layers["mask_snow"].min() > 0.99, "snow lies on the roof"
 
 
-def test_muddy_water_is_lit_by_the_scene():
-    """Deep mud seen steeply is its colour times the light; twice the light, twice the radiance."""
+def test_radiance_of_muddy_water_is_proportional_to_irradiance():
+    """Radiance of deep mud at the nadir is its colour times the irradiance over pi."""
     black = AnalyticField([HalfSpace(offset=-5.0, colour=(0.0,) * 3)], zenith=(0.0,) * 3,
                           horizon=(0.0,) * 3, box=WIDE)  # fmt: skip
     flood = Flood(level=0.0, wind_speed=0.0, clarity=0.05)
     o, d = torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]])
-    shown = []
+    radiance = []
     for light in (0.5, 1.0):
         waves = at_time(make_waves(flood, 0), 0.0)
         water = Water(flood, 0.0, waves, torch.full((3,), math.pi * light))
-        shown.append(trace(World(black, surfaces=(water,)), o, d, torch.full((1,), 1e-3)).rgb[0])
+        radiance.append(trace(World(black, surfaces=(water,)), o, d, torch.full((1,), 1e-3)).rgb[0])
     albedo = ((torch.tensor(flood.colour) + 0.055) / 1.055) ** 2.4
-    assert torch.allclose(shown[0] * 2, shown[1], rtol=1e-4)
-    assert torch.allclose(shown[1], albedo * (1 - 0.0204), rtol=0.01)
+    assert torch.allclose(radiance[0] * 2, radiance[1], rtol=1e-4)
+    assert torch.allclose(radiance[1], albedo * (1 - 0.0204), rtol=0.01)
 
 
 def test_white_furnace_from_under_water():
-    """White walls and sky, water that takes nothing: white in every direction, also where the
-    surface reflects all or nearly all."""
+    """White ground and sky, clear water: white in all directions, also under total reflection."""
     white = AnalyticField(
         [HalfSpace(colour=(1.0,) * 3)], zenith=(1.0,) * 3, horizon=(1.0,) * 3, box=WIDE
     )
@@ -400,13 +399,13 @@ def test_white_furnace_from_under_water():
     elevation = torch.deg2rad(torch.linspace(5, 90, 400))
     d = torch.stack([torch.zeros(400), elevation.cos(), elevation.sin()], dim=-1)
     o = torch.tensor([0.0, 0.0, 1.0]).expand(400, 3).contiguous()
-    for angle in (2e-3, 0.5):  # waves resolved, and averaged over
+    for angle in (2e-3, 0.5):  # waves resolved, and filtered
         seen = trace(World(white, surfaces=(water,)), o, d, torch.full((400,), angle))
         assert (seen.rgb - 1).abs().max() < 1e-3
 
 
-def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypatch):
-    """A fitted kind of field, snow and water: Numba's kernels, not the closed form's torch."""
+def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch):
+    """A hash field with snow and water uses Numba kernels, unlike the analytic field."""
     import numba
 
     from climatenerf.field import compositing as module
@@ -415,9 +414,9 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
     field.occupancy.occupied[..., field.occupancy.side // 2 :] = 0  # air above the middle
     with torch.no_grad():
         field.geometry_net[-1].add_(5.0)
-    places = (field.centre + torch.tensor([0.0, 0.0, 1.5]))[None].numpy().astype(np.float64)
+    cameras = (field.centre + torch.tensor([0.0, 0.0, 1.5]))[None].numpy().astype(np.float64)
     air, ground = medium(Smog(visibility=60.0), 0.0), float(field.centre[2])
-    snow = bake_snow(field, Snow(depth=0.1), places, np.full(3, 0.6))
+    snow = bake_snow(field, Snow(depth=0.1), cameras, np.full(3, 0.6))
     snowy = World(field, None, (air,), (snow,))
     wet = World(field, None, (air,), (), (flooded(ground + 0.3),))
     o = (field.centre + torch.tensor([0.0, -1.0, 1.5])).expand(600, 3).contiguous()
@@ -439,7 +438,7 @@ def test_the_kernels_that_users_run_do_not_depend_on_threads_or_chunks(monkeypat
             assert (values(one, name) - values(other, name)).abs().max() < 1e-4, name
 
 
-def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):
+def test_renders_of_an_analytic_field_do_not_depend_on_threads_or_chunks(monkeypatch):
     from climatenerf.field import compositing as module
 
     world = World(street(), None, (medium(Smog(visibility=60.0), 0.0),), (), (flooded(0.3),))
@@ -452,11 +451,11 @@ def test_chunks_and_threads_do_not_change_the_picture(monkeypatch):
     assert (whole - parts).abs().max() < 1e-5
 
 
-def test_no_parameters_give_nan():
+def test_extreme_parameters_stay_finite():
     for flood in (
         Flood(level=0.3, wind_speed=20.0, fetch=1e4),
         Flood(level=0.3, clarity=50.0),
-        Flood(level=1.6),  # the eye is on the surface
+        Flood(level=1.6),  # camera at the surface
         Flood(level=2.5, clarity=0.01),
     ):
         assert flood.level is not None
@@ -469,8 +468,8 @@ def test_no_parameters_give_nan():
             assert (seen.rgb >= 0).all()
 
 
-class Nothing:
-    """Matter that is nowhere."""
+class EmptyMatter:
+    """Matter without samples."""
 
     mask, thickness_layer = "mask_nothing", "nothing_thickness"
 
@@ -489,32 +488,32 @@ class Nothing:
 
 
 @pytest.mark.parametrize("water", [None, flooded(wind_speed=4.0)])
-def test_what_meets_no_weather_takes_a_short_way_to_the_same(monkeypatch, water):
-    """Also reflected rays, and eyes under water; where matter could be leads the long way."""
+def test_the_fast_path_without_weather_equals_the_general_path(monkeypatch, water):
+    """Also for reflected rays and cameras under water; any matter disables the fast path."""
     field = random_field()
     with torch.no_grad():
         field.geometry_net[-1] += 2.0
     if water is not None:
         water = dataclasses.replace(water, level=float(field.centre[2]))
-    plain, taken = trace_module._trace_field, []
+    original, calls = trace_module._trace_field, []
     monkeypatch.setattr(
-        trace_module, "_trace_field", lambda *given: taken.append(given[1]) or plain(*given)
+        trace_module, "_trace_field", lambda *given: calls.append(given[1]) or original(*given)
     )
     d = directions(300)
     o = (field.centre + torch.tensor([0.0, 0.0, 1.5])).repeat(300, 1)
-    o[:40, 2] -= 3.0  # all of them meet water at once
+    o[:40, 2] -= 3.0  # below the water
     angle = torch.full((300,), 0.01)
     surfaces = () if water is None else (water,)
-    short = trace(World(field, surfaces=surfaces), o, d, angle)
+    fast = trace(World(field, surfaces=surfaces), o, d, angle)
     if water is None:
-        assert sum(map(len, taken)) == 300
+        assert sum(map(len, calls)) == 300
     else:
         rise = (d[40:, 2] >= 0).sum()
-        assert len(taken[0]) == rise and sum(map(len, taken)) > rise + 100, "and what is mirrored"
-    taken.clear()
-    long = trace(World(field, matters=(Nothing(),), surfaces=surfaces), o, d, angle)
-    assert not taken
-    assert torch.isfinite(long.depth).float().mean() > 0.1
-    for name in ("rgb", "depth", "normal", "transmittance", *short.layers):
-        ours, theirs = values(short, name), values(long, name)
+        assert len(calls[0]) == rise and sum(map(len, calls)) > rise + 100, "and reflected rays"
+    calls.clear()
+    general = trace(World(field, matters=(EmptyMatter(),), surfaces=surfaces), o, d, angle)
+    assert not calls
+    assert torch.isfinite(general.depth).float().mean() > 0.1
+    for name in ("rgb", "depth", "normal", "transmittance", *fast.layers):
+        ours, theirs = values(fast, name), values(general, name)
         assert torch.allclose(ours, theirs, atol=1e-5, rtol=1e-4), name

@@ -1,4 +1,4 @@
-"""Two media and two matters at once: in the right order, and equal to closed forms."""
+"""Two media and two matters together: depth order and closed forms."""
 
 import math
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class Slab:
 
 @dataclass(frozen=True)
 class Sheet:
-    """Matter in a thin level sheet of a known opacity."""
+    """Matter in a thin horizontal sheet of known opacity."""
 
     height: float
     opacity: float
@@ -82,8 +82,8 @@ def seen(world, o, d):
     return trace(world, o, d, torch.full((len(o),), 1e-3))
 
 
-def test_two_layers_of_air_act_one_behind_the_other():
-    """From above: through the upper slab, then the lower one, to white ground."""
+def test_two_slabs_attenuate_in_depth_order():
+    """A downward ray crosses the upper slab, then the lower one, and ends on white ground."""
     upper, lower = Slab(0.05, 10.0, 20.0, RED), Slab(0.2, 0.0, 10.0, BLUE)
     field = AnalyticField(
         [HalfSpace(colour=(1.0, 1.0, 1.0))], box=((-2e2, -2e2, -2), (2e2, 2e2, 30))
@@ -96,10 +96,10 @@ def test_two_layers_of_air_act_one_behind_the_other():
         first, second = torch.exp(-0.05 * length), torch.exp(-0.2 * length)
         ground = second * torch.ones(3) + (1 - second) * torch.tensor(BLUE)
         expected = first * ground + (1 - first) * torch.tensor(RED)
-        assert (rgb - expected).abs().max() < 2e-3, "whatever the order of the tuple"
+        assert (rgb - expected).abs().max() < 2e-3, "for any order of the tuple"
 
 
-def test_two_homogeneous_media_that_overlap_are_their_mixture():
+def test_overlapping_homogeneous_media_equal_their_mixture():
     one, other = Medium(0.02, None, 0.0, RED), Medium(0.06, None, 0.0, BLUE)
     mixed = Medium(0.08, None, 0.0, (0.25, 0.0, 0.75))
     o, d = rays()
@@ -113,8 +113,8 @@ def test_two_homogeneous_media_that_overlap_are_their_mixture():
 
 
 @pytest.mark.parametrize("falloff", [2.0, 15.0])
-def test_stratified_media_against_fine_steps(falloff):
-    """Two fall-offs have no closed form together: cut into 20 000 steps instead."""
+def test_stratified_media_equal_fine_quadrature(falloff):
+    """Media of different scale heights have no joint closed form: compare with 20 000 steps."""
     one, other = Medium(0.1, falloff, 0.0, RED), Medium(0.05, None, 0.0, BLUE)
     o, d = rays(20)
     t = torch.linspace(5.0, 60.0, 20)
@@ -127,8 +127,9 @@ def test_stratified_media_against_fine_steps(falloff):
         b = torch.full_like(a, 0.05)
         tau = (a + b) * float(t[r]) / steps
         before = torch.exp(-(tau.cumsum(0) - tau))
-        own = (a[:, None] * torch.tensor(RED) + b[:, None] * torch.tensor(BLUE)) / (a + b)[:, None]
-        expected = (before * (1 - torch.exp(-tau)))[:, None] * own
+        source = a[:, None] * torch.tensor(RED) + b[:, None] * torch.tensor(BLUE)
+        source = source / (a + b)[:, None]
+        expected = (before * (1 - torch.exp(-tau)))[:, None] * source
         expected = expected.sum(0) + torch.exp(-tau.sum()) * torch.ones(3)
         assert (ours[r] - expected).abs().max() < 0.02
 
@@ -147,8 +148,8 @@ def test_two_matters_are_merged_by_distance_and_have_their_own_layers():
         assert torch.allclose(found.layers["low_thickness"], torch.tensor(0.5), atol=1e-5)
 
 
-def test_two_media_and_two_matters_together():
-    """Each sheet's light crosses only the air in front of it."""
+def test_two_media_and_two_matters_have_the_closed_form():
+    """Light of each sheet is attenuated by the media in front of it only."""
     high = Sheet(5.0, 0.3, RED, "mask_high", "high_thickness")
     low = Sheet(2.0, 0.6, BLUE, "mask_low", "low_thickness")
     one, other = Slab(0.05, 0.0, 30.0, (0.5, 0.5, 0.5)), Slab(0.1, 0.0, 4.0, (0.9, 0.9, 0.9))
@@ -163,7 +164,7 @@ def test_two_media_and_two_matters_together():
     mean = (0.05 * grey + 0.1 * white) / 0.15
     through = torch.exp(-0.15 * 2 * path)  # 4 m to 2 m, both
     at_low = to_top * (through * torch.tensor(BLUE) + (1 - through) * mean) + (1 - to_top) * grey
-    down = torch.exp(-0.15 * 4 * path)  # 4 m to 0 m; below there is nothing but the sky
+    down = torch.exp(-0.15 * 4 * path)  # 4 m to 0 m; the sky is below
     sky = torch.tensor([0.2, 0.4, 0.2])
     at_sky = to_top * (down * sky + (1 - down) * mean) + (1 - to_top) * grey
     expected = 0.3 * at_high + 0.42 * at_low + 0.28 * at_sky

@@ -1,7 +1,7 @@
-"""Frames that show early, on a street in closed form that is flooded and in smog."""
+"""Progressive frames of an analytic street with flood and smog."""
 
 import numpy as np
-from test_integrator import CAMERA, flooded, looking, street
+from test_integrator import CAMERA, flooded, pose_along, street
 
 from climatenerf.core.cameras import Camera
 from climatenerf.render import progressive
@@ -11,17 +11,17 @@ from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.world import World
 
 WORLD = World(street(), media=(medium(Smog(visibility=40.0), 0.0),), surfaces=(flooded(),))
-POSE = looking((0.0, 1.0, -0.2))
+POSE = pose_along((0.0, 1.0, -0.2))
 
 
-def shown(world, camera, supersample=1):
+def render_progressively(world, camera, supersample=1):
     pictures = []
     options = FrameOptions(supersample, show=pictures.append)
     frame, layers = render_frame(world, camera, POSE, options)
     return pictures, frame, layers
 
 
-def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
+def test_the_last_picture_is_the_frame_and_each_ray_is_traced_once(monkeypatch):
     traced = []
 
     def counted(world, rays_o, *rest, **options):
@@ -30,7 +30,7 @@ def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
 
     trace = progressive.trace
     monkeypatch.setattr(progressive, "trace", counted)
-    pictures, frame, layers = shown(WORLD, CAMERA)
+    pictures, frame, layers = render_progressively(WORLD, CAMERA)
     exact, exact_layers = render_frame(WORLD, CAMERA, POSE)
     assert np.array_equal(pictures[-1], exact) and np.array_equal(frame, exact)
     assert layers.keys() == exact_layers.keys()
@@ -39,22 +39,22 @@ def test_the_last_picture_is_the_frame_and_no_ray_is_traced_twice(monkeypatch):
     assert sum(traced) == CAMERA.width * CAMERA.height and traced[0] < sum(traced) / 15
     for picture, spacing in zip(pictures, progressive.SPACINGS, strict=True):
         known = frame[::spacing, ::spacing]
-        assert np.array_equal(picture[::spacing, ::spacing], known), "it stays as it is"
+        assert np.array_equal(picture[::spacing, ::spacing], known), "traced pixels do not change"
         filled = known.repeat(spacing, 0).repeat(spacing, 1)
         assert np.array_equal(picture, filled[: CAMERA.height, : CAMERA.width])
 
 
-def test_several_rays_a_pixel_show_whole_pictures():
-    pictures, frame, _ = shown(WORLD, CAMERA, 2)
+def test_supersampled_frames_show_complete_pictures():
+    pictures, frame, _ = render_progressively(WORLD, CAMERA, 2)
     assert [each.shape for each in pictures] == [frame.shape] * 3
     assert np.array_equal(pictures[-1], frame)
     assert np.array_equal(frame, render_frame(WORLD, CAMERA, POSE, FrameOptions(2))[0])
-    off = [np.abs(each.astype(int) - frame).mean() for each in pictures]
-    assert off[0] > off[1] > off[2] == 0
+    error = [np.abs(each.astype(int) - frame).mean() for each in pictures]
+    assert error[0] > error[1] > error[2] == 0
 
 
-def test_sides_that_no_spacing_divides():
+def test_picture_sides_need_not_be_multiples_of_the_spacing():
     for width, height in ((7, 5), (2, 1)):
         camera = Camera(width, height, 6.0, 6.0, width / 2, height / 2)
-        pictures, _, _ = shown(World(street()), camera)
+        pictures, _, _ = render_progressively(World(street()), camera)
         assert np.array_equal(pictures[-1], render_frame(World(street()), camera, POSE)[0])

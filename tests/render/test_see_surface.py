@@ -1,4 +1,4 @@
-"""Normals and classes of a picture's rays, and the layers that show them."""
+"""Normals and classes of rays, and the layers that contain them."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ CAMERA = Camera(32, 24, 25.0, 25.0, 16.0, 12.0)
 
 @pytest.fixture
 def field():
-    """Dense matter everywhere; its head says: up, building."""
+    """Dense matter everywhere; the surface head predicts upward normals and buildings."""
     field = random_field(full=True)
     with torch.no_grad():
         field.geometry_net[-1].fill_(4.0)
@@ -34,7 +34,7 @@ def rays(field):
     return pose, camera_rays(CAMERA, pose)
 
 
-def test_composited_normals_and_classes_are_the_heads(field):
+def test_composited_normals_and_classes_are_those_of_the_head(field):
     _, (o, d) = rays(field)
     normal, label = see_surface(field, o, d)
     up = torch.tensor([0.0, 0.0, 1.0])
@@ -43,17 +43,17 @@ def test_composited_normals_and_classes_are_the_heads(field):
     assert (label == BUILDING).all()
 
 
-def test_rays_that_meet_nothing_are_sky_without_a_normal(field):
+def test_rays_without_samples_are_sky_with_a_zero_normal(field):
     field.occupancy.occupied.zero_()
     _, (o, d) = rays(field)
     normal, label = see_surface(field, o, d)
     assert (normal == 0).all() and (label == SKY).all()
 
 
-def test_layers_take_what_was_learned_and_planes_of_the_depth_otherwise(field):
+def test_layers_use_learned_heads_or_else_planes_of_the_depth(field):
     pose, (o, d) = rays(field)
     _, layers = see_frame(World(field), CAMERA, pose, FrameOptions(normals=True, labels=True))
-    assert "label" not in layers  # an untrained head is not asked
+    assert "label" not in layers  # an untrained head is not evaluated
     planes = layers["normal"]
     field.learned[:] = True
     _, layers = see_frame(World(field), CAMERA, pose, FrameOptions(normals=True, labels=True))
@@ -63,7 +63,7 @@ def test_layers_take_what_was_learned_and_planes_of_the_depth_otherwise(field):
     assert len(CLASS_NAMES) == 7
 
 
-def test_the_appearance_of_one_photo_or_the_mean(field):
+def test_the_sky_has_the_given_or_the_mean_appearance(field):
     d = torch.nn.functional.normalize(torch.randn(20, 3), dim=-1)
     mean = field.sky(d)
     one = field.sky(d, field.embeddings[[2]].detach())

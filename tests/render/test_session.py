@@ -1,4 +1,4 @@
-"""Weather that changes over time, on a scene in closed form."""
+"""Weather that changes over time, on an analytic scene."""
 
 import dataclasses
 import math
@@ -29,23 +29,23 @@ C2W[:3, 3] = (0.0, -3.0, 1.6)
 
 
 @dataclasses.dataclass(frozen=True)
-class Place(AnalyticField):
+class Scenery(AnalyticField):
     near: float = 0.0
 
 
 @pytest.fixture
 def session_of(monkeypatch):
-    """Prepares a weather table on ground that rises along y from -0.3 m at the camera's foot."""
+    """Prepare a weather table on ground that rises along y, from -0.3 m below the camera."""
     normal = np.array([0.0, -0.1, 1.0]) / math.hypot(0.1, 1.0)
     box = ((-12.0, -12.0, -3.0), (12.0, 12.0, 4.0))
-    place = Place([HalfSpace(tuple(normal), 0.0, (0.3, 0.3, 0.3))], box=box)
+    field = Scenery([HalfSpace(tuple(normal), 0.0, (0.3, 0.3, 0.3))], box=box)
     views = tuple(View(f"{i}.png", Path(f"{i}.png"), 0, C2W) for i in range(3))
     scene = Scene(Path("."), "test", (CAMERA,), views)
     monkeypatch.setattr(module, "scene_irradiance", lambda *_: torch.full((3,), 2.0))
 
     def make(table, times):
         weather = weather_from_table(table)
-        return RenderSession(place, scene, weather, C2W[None, :3, 3], np.array(times))
+        return RenderSession(field, scene, weather, C2W[None, :3, 3], np.array(times))
 
     return make
 
@@ -54,14 +54,14 @@ def seen(session, time):
     return render_frame(session.world(time), CAMERA, C2W)
 
 
-def test_a_keyframed_level_rises(session_of):
+def test_the_level_is_interpolated_between_keyframes(session_of):
     session = session_of({"flood": {"level": {"0 s": "-0.3 m", "4 s": "0.5 m"}}}, [0.0, 2.0, 4.0])
     assert session.world(2.0).surfaces[0].level == pytest.approx(0.1)
-    shares = [float(seen(session, t)[1]["mask_water"].mean()) for t in (0.0, 2.0, 4.0)]
-    assert shares[0] < shares[1] - 0.05 < shares[2] - 0.1
+    coverage = [float(seen(session, t)[1]["mask_water"].mean()) for t in (0.0, 2.0, 4.0)]
+    assert coverage[0] < coverage[1] - 0.05 < coverage[2] - 0.1
 
 
-def test_keyframed_snow_grows(session_of):
+def test_the_snow_depth_is_interpolated_between_keyframes(session_of):
     session = session_of({"snow": {"depth": {"0 s": "5 cm", "4 s": "20 cm"}}}, [0.0, 4.0])
     for time, depth in ((0.0, 0.05), (4.0, 0.2)):
         _, layers = seen(session, time)
@@ -71,7 +71,7 @@ def test_keyframed_snow_grows(session_of):
     assert session.world(0.0).matters[0].lattice is not session.world(4.0).matters[0].lattice
 
 
-def test_waves_move_and_nothing_else_does(session_of):
+def test_only_water_changes_over_time(session_of):
     session = session_of({"flood": {"level": "0 m", "wind-speed": "5 m/s"}}, [0.0, 0.5])
     (first, layers), (later, _) = seen(session, 0.0), seen(session, 0.5)
     changed = (first != later).any(-1)
@@ -79,7 +79,7 @@ def test_waves_move_and_nothing_else_does(session_of):
     assert changed[wet].mean() > 0.2
     assert not changed[layers["mask_water"] == 0].any()
     again, _ = seen(session, 0.0)
-    assert np.array_equal(first, again), "time alone decides"
+    assert np.array_equal(first, again), "the frame depends on the time only"
 
 
 def test_weather_without_effect_prepares_nothing(session_of):
@@ -97,17 +97,17 @@ def test_a_level_above_everything_is_refused_at_any_moment(session_of):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Counts the expensive preparations by name."""
+    """Count the expensive preparations by name."""
     counts = dict.fromkeys(("find_deposits", "grow", "make_waves", "irradiance"), 0)
 
     def watch(module, name, label=None):
         original = getattr(module, name)
 
-        def noting(*args, **kwargs):
+        def count(*args, **kwargs):
             counts[label or name] += 1
             return original(*args, **kwargs)
 
-        monkeypatch.setattr(module, name, noting)
+        monkeypatch.setattr(module, name, count)
 
     watch(snow_module, "find_deposits")
     watch(snow_module, "grow")
@@ -143,7 +143,7 @@ def test_a_change_prepares_only_what_it_invalidates(session_of, counted, name, v
     session.change(changed)
     world = session.world(0.0)
     assert {key: count for key, count in counted.items() if count} == again
-    # The change shows: a session made anew has the same world.
+    # The change is effective: a new session has the same world.
     fresh = session_of(weather_to_table(changed), [0.0]).world(0.0)
     assert world.media == fresh.media
     assert (world.surfaces[0].flood, world.surfaces[0].level) == (
@@ -156,7 +156,7 @@ def test_a_change_prepares_only_what_it_invalidates(session_of, counted, name, v
 def test_a_refused_change_keeps_the_weather(session_of):
     session = session_of({"flood": {"level": "0 m"}}, [0.0])
     before = session.weather
-    for level in (5e4, 50.0):  # out of any range, and above this scene
+    for level in (5e4, 50.0):  # outside the range, and above this scene
         with pytest.raises(UserError):
             session.change(before.base.with_value("flood.level", level))
     with pytest.raises(UserError):
@@ -164,7 +164,7 @@ def test_a_refused_change_keeps_the_weather(session_of):
     assert session.weather is before and session.world(0.0).surfaces[0].level == 0
 
 
-def test_the_shutter_s_middle_is_the_moment_that_is_rendered(session_of):
+def test_the_middle_of_the_shutter_interval_is_rendered(session_of):
     table = {"flood": {"level": {"0 s": "-0.3 m", "4 s": "0.5 m"}}}
     session = session_of(table, [0.0, 4.0])
     open_long = session.frame(CAMERA, C2W, 1.0, shutter=2.0)
@@ -175,32 +175,32 @@ def test_the_shutter_s_middle_is_the_moment_that_is_rendered(session_of):
 # --- cancelling -------------------------------------------------------------------------------
 
 
-def test_a_cancelled_frame_computes_no_further(session_of, monkeypatch):
-    """After the flag no chunk begins: neither of camera rays nor of reflected ones."""
+def test_a_cancelled_frame_starts_no_further_chunk(session_of, monkeypatch):
+    """No chunk of camera rays or reflected rays starts after the flag is raised."""
     session = session_of({"flood": {"level": "0 m", "wind-speed": "5 m/s"}}, [0.0])
     flag, traced_after = [False], []
     original = integrator._trace
 
-    def noting(world, rays_o, *rest, **options):
+    def recorded(world, rays_o, *rest, **options):
         traced_after.extend([len(rays_o)] * flag[0])
         return original(world, rays_o, *rest, **options)
 
-    monkeypatch.setattr(integrator, "_trace", noting)
-    asked = []
+    monkeypatch.setattr(integrator, "_trace", recorded)
+    answers = []
 
     def cancelled():
-        asked.append(flag[0])
-        flag[0] = len(asked) >= 5
-        return asked[-1]
+        answers.append(flag[0])
+        flag[0] = len(answers) >= 5
+        return answers[-1]
 
     with pytest.raises(RenderCancelled):
         session.frame(CAMERA, C2W, cancelled=cancelled)
-    assert asked == [False] * 5 + [True], "asked once more, and never again"
+    assert answers == [False] * 5 + [True], "called once more after the flag, then never"
     assert len(traced_after) <= 1, "at most the chunk in which the flag was raised"
 
 
-def test_chunks_follow_the_pace_of_the_machine(monkeypatch):
-    """With a clock of 0.02 ms a ray, chunks settle at 500 rays: 10 ms of the promised 20."""
+def test_chunk_sizes_adapt_to_the_speed(monkeypatch):
+    """At 0.02 ms per ray chunks converge to 500 rays: 10 ms of the allowed 20 ms."""
     clock = [0.0]
     monkeypatch.setattr(compositing.time, "perf_counter", lambda: clock[0])
     checkpoint, sizes = compositing.Checkpoints(lambda: False), []
@@ -219,7 +219,7 @@ def test_chunks_follow_the_pace_of_the_machine(monkeypatch):
     assert max(sizes) > 1500
 
 
-def test_a_frame_that_could_be_cancelled_equals_one_that_could_not(session_of):
+def test_a_cancellable_frame_is_identical(session_of):
     session = session_of({"flood": {"level": "0 m"}, "smog": {"visibility": "50 m"}}, [0.0])
     free = session.frame(CAMERA, C2W, layers=("normal",))
     bound = session.frame(CAMERA, C2W, layers=("normal",), cancelled=lambda: False)

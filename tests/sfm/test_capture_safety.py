@@ -86,8 +86,8 @@ def test_inputs_inside_the_output_are_refused(posed, capsys, what):
     before = snapshot(out)
     given = {"photos": posed / "photos", "from-colmap": posed / "model"}
     given[what] = out / {"photos": "images", "from-colmap": "sparse"}.get(what, "labels")
-    words = [w for k, v in given.items() if k != "photos" for w in (f"--{k}", v)]
-    assert run_cli("capture", given["photos"], *words, "-o", out) == 2
+    args = [w for k, v in given.items() if k != "photos" for w in (f"--{k}", v)]
+    assert run_cli("capture", given["photos"], *args, "-o", out) == 2
     assert "choose another folder" in capsys.readouterr().err and snapshot(out) == before
 
 
@@ -110,8 +110,8 @@ def test_files_that_the_user_adds_are_kept_and_used(posed, capsys):
         else:
             path.write_bytes(content)
     kept = {path: path.read_bytes() for path in mine}
-    for words in ((), ("--camera-height", "1.7 m"), ()):
-        assert capture(posed, out, *words) == 0
+    for args in ((), ("--camera-height", "1.7 m"), ()):
+        assert capture(posed, out, *args) == 0
         assert {path: path.read_bytes() for path in mine} == kept
         assert f"Files of yours stay in {out / 'masks'}: 1 (masks/" in capsys.readouterr().err
     used = {view.name: view for view in read_scene(out).views}
@@ -121,7 +121,7 @@ def test_files_that_the_user_adds_are_kept_and_used(posed, capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "words", "message"),
+    ("name", "args", "message"),
     [
         ("images/extra.jpg", (), "was not written by capture"),
         ("images/0000.jpg", (), "has changed since"),
@@ -131,7 +131,7 @@ def test_files_that_the_user_adds_are_kept_and_used(posed, capsys):
         ("labels/mine.png", ("--labels", STREET / "labels"), "is your file"),
     ],
 )
-def test_files_that_would_be_lost_are_named_before_any_work(posed, capsys, name, words, message):
+def test_files_that_would_be_lost_are_named_before_any_work(posed, capsys, name, args, message):
     out = posed / "scene"
     assert capture(posed, out) == 0
     name = name.replace("0000.jpg", load_scene(out).views[0].name)
@@ -139,7 +139,7 @@ def test_files_that_would_be_lost_are_named_before_any_work(posed, capsys, name,
     (out / name).write_bytes(b"mine")
     before = snapshot(out)
     capsys.readouterr()
-    assert capture(posed, out, *words) == 2
+    assert capture(posed, out, *args) == 2
     err = capsys.readouterr().err
     assert message in err and str(out / name) in err and len(err.strip().splitlines()) == 1
     assert snapshot(out) == before
@@ -233,7 +233,7 @@ def test_unusable_marks_leave_a_finished_scene_unchanged(posed, capsys, picture,
 @pytest.mark.parametrize(
     ("text", "message"),
     [("DOOR", "a name and a length"), ("DOOR=2", "no unit"), ("DOOR=-2 m", "above 0"),
-     ("DOOR=2 kg", "a length"), ("", "a name and a length"), ("=2 m", "wants a name"),
+     ("DOOR=2 kg", "a length"), ("", "a name and a length"), ("=2 m", "needs a name"),
      ("DOOR=2 m", "run this once without --known-length")],
 )  # fmt: skip
 def test_known_lengths_are_checked_first(posed, capsys, text, message):
@@ -300,7 +300,7 @@ def test_failed_run_leaves_the_scene_unchanged(posed, tmp_path, capsys):
     marks = tmp_path / "marks.toml"
     marks.write_text('[D.from]\n"x.jpg" = [1, 2]\n"y.jpg" = [1, 2]\n[D.to]\n"x.jpg" = [1, 2]\n'
                      '"y.jpg" = [1, 2]\n')  # fmt: skip
-    for words in (
+    for args in (
         ("--camera-height", "0 m"),
         ("--labels", bad),
         ("--known-length", "DOOR 2.0"),
@@ -311,7 +311,7 @@ def test_failed_run_leaves_the_scene_unchanged(posed, tmp_path, capsys):
         ("--seed", "-1"),
         ("--features", "3"),
     ):
-        assert capture(posed, out, *words) == 2, words
+        assert capture(posed, out, *args) == 2, args
         output = capsys.readouterr().err
         assert "Traceback" not in output
         assert {k: v for k, v in snapshot(out).items() if not k.startswith("work/")} == before

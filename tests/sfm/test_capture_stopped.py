@@ -32,14 +32,14 @@ def street_photos(folder, count):
 def on_disk(folder, mounting, command):
     """Run a command with a temporary disk mounted at a folder; skip where that is not allowed."""
     inner = f'mount -t tmpfs {mounting} tmpfs "$0" && exec "$@"'
-    words = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
+    args = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
     folder.mkdir(exist_ok=True)
     if (
         shutil.which("unshare") is None
-        or subprocess.run([*words, inner, str(folder), "true"], capture_output=True).returncode
+        or subprocess.run([*args, inner, str(folder), "true"], capture_output=True).returncode
     ):
         pytest.skip("needs permission to mount a disk in a user namespace")
-    return subprocess.run([*words, inner, str(folder), *command], capture_output=True, text=True)
+    return subprocess.run([*args, inner, str(folder), *command], capture_output=True, text=True)
 
 
 @pytest.mark.parametrize("size", ["100k", "700k", "1500k"])
@@ -124,6 +124,6 @@ def test_photo_of_200_megapixels(tmp_path):
     large.save(tmp_path / "in" / "large.png", compress_level=1)
     large.save(tmp_path / "in" / "large.jpg", quality=80)
     tile.save(tmp_path / "in" / "small.jpg")
-    taken = import_photos(tmp_path / "in", tmp_path / "work", lambda done, total: None)
-    assert not taken.unusable
-    assert {max(p.width, p.height) for p in taken.pictures} == {MAX_SIDE, 1000}
+    imported = import_photos(tmp_path / "in", tmp_path / "work", lambda done, total: None)
+    assert not imported.unusable
+    assert {max(p.width, p.height) for p in imported.pictures} == {MAX_SIDE, 1000}

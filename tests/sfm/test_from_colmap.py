@@ -45,8 +45,8 @@ def test_model_photos_and_labels_become_a_scene(posed, tmp_path, capsys):
     truth, root = posed
     labels = STREET / "labels"
     out = tmp_path / "scene"
-    words = ("capture", root / "photos", "--from-colmap", root, "-o", out, "--labels", labels)
-    assert run_cli(*words) == 0
+    args = ("capture", root / "photos", "--from-colmap", root, "-o", out, "--labels", labels)
+    assert run_cli(*args) == 0
     output = capsys.readouterr()
     assert "11 of 12 pictures have poses" in output.out
     assert "it is not in the COLMAP model" in output.err
@@ -81,22 +81,22 @@ def offset(scene, truth):
 def test_labels_can_be_added_in_a_second_run(posed, tmp_path):
     _, root = posed
     out = tmp_path / "scene"
-    words = ("capture", root / "photos", "--from-colmap", root / "sparse", "-o", out)
-    assert run_cli(*words) == 0
+    args = ("capture", root / "photos", "--from-colmap", root / "sparse", "-o", out)
+    assert run_cli(*args) == 0
     assert all(view.label_path is None for view in load_scene(out).views)
-    assert run_cli(*words, "--labels", STREET / "labels") == 0
+    assert run_cli(*args, "--labels", STREET / "labels") == 0
     assert all(view.label_path is not None for view in load_scene(out).views)
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         (lambda root, here: (here / "no-model", root / "photos"), "contains no COLMAP model"),
         (lambda root, here: (root, here / "photos"), "0 of the 11 pictures"),
         (lambda root, here: (root, root / "photos" / "none.jpg"), "does not exist"),
     ],
 )
-def test_mismatched_inputs_give_one_error_sentence(posed, tmp_path, capsys, change, words):
+def test_mismatched_inputs_give_one_error_sentence(posed, tmp_path, capsys, change, message):
     _, root = posed
     (tmp_path / "photos").mkdir()
     (tmp_path / "no-model").mkdir()
@@ -104,7 +104,7 @@ def test_mismatched_inputs_give_one_error_sentence(posed, tmp_path, capsys, chan
     out = tmp_path / "scene"
     assert run_cli("capture", photos, "--from-colmap", model, "-o", out) == 2
     output = capsys.readouterr().err
-    assert words in output and "Traceback" not in output
+    assert message in output and "Traceback" not in output
     assert not (out / "scene.json").exists()
 
 
@@ -122,7 +122,7 @@ def test_photos_in_the_output_folder_are_not_removed(posed, tmp_path, capsys):
 
 def test_sidecar_flags_need_existing_folders(posed, tmp_path, capsys):
     _, root = posed
-    words = ("capture", root / "photos", "--from-colmap", root, "-o", tmp_path / "scene")
+    args = ("capture", root / "photos", "--from-colmap", root, "-o", tmp_path / "scene")
     for kind in ("labels", "masks", "depth"):
-        assert run_cli(*words, f"--{kind}", tmp_path / "absent") == 2
+        assert run_cli(*args, f"--{kind}", tmp_path / "absent") == 2
         assert f"--{kind}" in capsys.readouterr().err

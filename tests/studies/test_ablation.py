@@ -71,7 +71,7 @@ def test_each_row_leaves_out_one_part():
         "no appearance": {"appearance"},
         "no distortion": {"distortion"},
         "no normals": {"normals"},
-        "no flatness": {"planarity"},
+        "no planarity": {"planarity"},
         "no sky": {"sky_labels"},
         "no depth": {"sparse_depth", "ground_height", "monocular_depth"},
         "full": set(),

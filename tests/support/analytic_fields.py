@@ -1,8 +1,8 @@
 """A radiance field in closed form, for tests of the weather and of the renderer.
 
 Solids with sharp faces: half-spaces (ground, slopes) and upright boxes (roofs, tables, posts). It
-offers what a fitted field offers (`march`, `density`, `colour`, `sky`, `bounds`) and is exact: the
-samples along a ray begin where the ray enters a solid.
+implements the protocol of fields (`march`, `density`, `colour`, `sky`, `bounds`) exactly: samples
+begin where a ray enters a solid.
 """
 
 from collections.abc import Sequence
@@ -14,8 +14,8 @@ from torch import Tensor
 from climatenerf.core.samples import Samples
 from climatenerf.field.capabilities import DENSITY
 
-_OPAQUE = 8.0  # optical depth after which a solid is not followed further: exp(-8) < 1e-3
-_PIECES = 4  # samples that follow a solid down to that depth
+_OPAQUE = 8.0  # optical depth at which samples of a solid end: exp(-8) < 1e-3
+_PIECES = 4  # samples of a solid up to that depth
 
 
 @dataclass(frozen=True)
@@ -104,16 +104,16 @@ class AnalyticField:
         stop: float = 1e-3,
         pruning_threshold: float | None = None,
     ) -> Samples:
-        """Samples from where each ray enters a solid (inside `bounds`) until it is opaque.
+        """Samples from the entry of each ray into a solid (inside `bounds`) until it is opaque.
 
-        All of them count, whatever `pruning_threshold` is: nothing here is a veil.
+        `pruning_threshold` is ignored, since no solid is translucent.
         """
         lower, upper = self.bounds
         limits = Box(tuple(lower.tolist()), tuple(upper.tolist())).interval(rays_o, rays_d)
         low = torch.maximum(t_min, limits[0])
         high = torch.minimum(t_max, limits[1])
-        # Overlapping solids are not twice as dense: all borders of all solids cut the ray into
-        # stretches, and a stretch whose middle is inside any solid is filled.
+        # Overlapping solids have the density of one. The faces of all solids divide the ray into
+        # intervals; an interval is filled if its middle is inside any solid.
         intervals = [solid.interval(rays_o, rays_d) for solid in self.solids]
         edges = torch.stack([low, high, *(t for pair in intervals for t in pair)], -1)
         edges = edges.clamp(low[:, None], torch.maximum(low, high)[:, None]).sort(-1).values
@@ -149,7 +149,7 @@ class AnalyticField:
         ids: Tensor | None = None,
         appearance: Tensor | None = None,
     ) -> Tensor:
-        """Colour of the nearest solid, whatever the direction."""
+        """Colour of the nearest solid, the same in all directions."""
         nearest = self._distances(x).abs().argmin(-1)
         colours = x.new_tensor([solid.colour for solid in self.solids])
         sides = x.new_tensor([solid.checker for solid in self.solids])[nearest][:, None]
@@ -158,9 +158,9 @@ class AnalyticField:
         return torch.where(black, 0.0, colours[nearest])
 
     def sky(self, d: Tensor, appearance: Tensor | None = None) -> Tensor:
-        """From the horizon's colour to the zenith's, linear in the sine of the elevation."""
-        share = d[:, 2:].clamp(0, 1)
-        return (1 - share) * d.new_tensor(self.horizon) + share * d.new_tensor(self.zenith)
+        """Interpolate between horizon and zenith, linearly in the sine of the elevation."""
+        weight = d[:, 2:].clamp(0, 1)
+        return (1 - weight) * d.new_tensor(self.horizon) + weight * d.new_tensor(self.zenith)
 
     def _distances(self, x: Tensor) -> Tensor:
         if not self.solids:

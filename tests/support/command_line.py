@@ -13,18 +13,18 @@ FEW_ROWS = dataclasses.replace(
 )
 
 
-def run_cli(*words: object) -> int:
-    """Run `climatenerf` with these words and return the exit status."""
+def run_cli(*args: object) -> int:
+    """Run `climatenerf` with arguments and return the exit status."""
     try:
-        return cli.main([str(word) for word in words])
+        return cli.main([str(arg) for arg in args])
     except SystemExit as exit_:
         return int(exit_.code or 0)
 
 
-def complaint(capsys, *words: object) -> str:
-    """Return the sentence on standard error of a command that fails with status 2."""
+def error_message(capsys, *args: object) -> str:
+    """Return the message on standard error of a command that fails with status 2."""
     capsys.readouterr()
-    assert run_cli(*words) == 2
+    assert run_cli(*args) == 2
     err = capsys.readouterr().err
     assert "Traceback" not in err
     lines = [line for line in err.splitlines() if line.startswith("climatenerf: ")]

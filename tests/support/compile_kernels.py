@@ -1,8 +1,8 @@
-"""Compiles every GPU kernel for CUDA, without a GPU: prints its name, or fails.
+"""Compile every GPU kernel for CUDA, without a GPU, and print the names.
 
-The interpreter runs kernels as NumPy; what Triton's compiler refuses shows here alone. Run in a
-process of its own, by `test_gpu_kernels.py`: it must not be in the interpreter. An argument is the
-card's compute capability, such as 80 or 90.
+Triton's interpreter runs kernels as NumPy, so it accepts code that the compiler rejects.
+`test_gpu_kernels.py` runs this file in a process without the interpreter. The argument is the
+compute capability, such as 80 or 90.
 """
 
 import functools
@@ -26,14 +26,14 @@ from climatenerf.ops.triton import (
     visual_hull,
 )
 
-CARD = GPUTarget("cuda", int(sys.argv[1]) if len(sys.argv) > 1 else 80, 32)
+TARGET = GPUTarget("cuda", int(sys.argv[1]) if len(sys.argv) > 1 else 80, 32)
 
 
-class NoCard:
-    """A driver that knows for which card to compile."""
+class TargetDriver:
+    """A driver that names the compilation target only."""
 
     def get_current_target(self):
-        return CARD
+        return TARGET
 
     def get_current_device(self):
         return 0
@@ -52,7 +52,7 @@ def net(levels: int, rows: int, hidden: int, outputs: int) -> tuple[torch.Tensor
 
 
 def net_of(size: FieldSize, kind: str) -> tuple[torch.Tensor, ...]:
-    """An encoding of few rows, and the network on it, as a field of that size has them."""
+    """An encoding with few rows and its network, in the widths of a field of that size."""
     if kind == "geometry":
         return net(size.geometry_levels, 10, size.geometry_hidden, 1)
     if kind == "colour":
@@ -63,33 +63,36 @@ def net_of(size: FieldSize, kind: str) -> tuple[torch.Tensor, ...]:
 
 def compile_all() -> None:
     n, s = 8, 40
-    real, whole, some = torch.zeros(n, 3), torch.zeros(n + 1, dtype=torch.long), torch.zeros(s)
+    vectors, values = torch.zeros(n, 3), torch.zeros(s)
+    offsets = torch.zeros(n + 1, dtype=torch.long)
     u, order = torch.zeros(s, 3), torch.zeros(s, dtype=torch.long)
     cells = torch.ones(2, 32, 32, 32, dtype=torch.uint8), torch.ones(2, 4, 4, 4, dtype=torch.uint8)
     density = net_of(PRESETS["gpu"], "geometry")
-    steps, room = (1 / 256, 1 / 160, 1e-3), torch.zeros(3, 1024, n)
+    steps, buffers = (1 / 256, 1 / 160, 1e-3), torch.zeros(3, 1024, n)
     table, resolutions = density[:2]
     features = torch.zeros(24, s)
     encoding.hash_encode(u, table, resolutions, features)
     encoding.hash_encode_backward(u, features, resolutions, table)
     encoding.hash_encode_slopes(u, features, table, resolutions, u)
     one = cells[0][:1, :12, :12, :12].contiguous()  # a single cascade without blocks
-    marching.march(real, real, real, (one, one), steps, 1e-3, density, room, whole[1:])
-    marching.pack(room, whole, torch.zeros(3, s))
-    marching.grid_positions(real, real, whole, some, u)
-    compositing.weights_forward(some, whole, some, real[:, 0])
-    compositing.weights_backward(some, whole, some, real[:, 0], some)
-    compositing.accumulate_forward(some, u, whole, real)
-    compositing.accumulate_backward(some, u, whole, real, some, u)
-    compositing.distortion_forward(some, some, some, whole, real[:, 0])
-    compositing.distortion_backward(some, some, some, whole, real[:, 0], some)
-    compositing.merge_order(some, whole, some, whole, whole, order)
-    maps, few = torch.zeros(s, dtype=torch.uint8), torch.zeros(2, dtype=torch.long)
-    views = maps, few, torch.zeros(2, 2, dtype=torch.long), torch.zeros(2, 4), torch.zeros(2, 4, 4)
+    marching.march(
+        vectors, vectors, vectors, (one, one), steps, 1e-3, density, buffers, offsets[1:]
+    )
+    marching.pack(buffers, offsets, torch.zeros(3, s))
+    marching.grid_positions(vectors, vectors, offsets, values, u)
+    compositing.weights_forward(values, offsets, values, vectors[:, 0])
+    compositing.weights_backward(values, offsets, values, vectors[:, 0], values)
+    compositing.accumulate_forward(values, u, offsets, vectors)
+    compositing.accumulate_backward(values, u, offsets, vectors, values, u)
+    compositing.distortion_forward(values, values, values, offsets, vectors[:, 0])
+    compositing.distortion_backward(values, values, values, offsets, vectors[:, 0], values)
+    compositing.merge_order(values, offsets, values, offsets, offsets, order)
+    maps, pair = torch.zeros(s, dtype=torch.uint8), torch.zeros(2, dtype=torch.long)
+    views = maps, pair, torch.zeros(2, 2, dtype=torch.long), torch.zeros(2, 4), torch.zeros(2, 4, 4)
     for count in (views, tuple(each[:1] for each in views)):
-        visual_hull.label_votes(u, some, count, (1, 0.1, 0.5), maps)
-    optimiser.adam(some, some, some, some, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
-    for size in PRESETS.values():  # their widths are constants of the kernels
+        visual_hull.label_votes(u, values, count, (1, 0.1, 0.5), maps)
+    optimiser.adam(values, values, values, values, 0.1, 0.9, 0.99, 1e-15, 1.0, 1.0)
+    for size in PRESETS.values():  # widths are compile-time constants
         rays = torch.zeros(n, size.colour_hidden), order
         for kind, shared in (("geometry", None), ("colour", rays), ("surface", None)):
             layers = net_of(size, kind)
@@ -98,15 +101,15 @@ def compile_all() -> None:
             grads = layers[0], None if shared is None else shared[0], u if shared is None else None
             network.network_backward(u, layers[:2], layers[2:], shared, out, grads)
         density, colour = net_of(size, "geometry"), net_of(size, "colour")
-        marching.density_at(u, density, some)
-        marching.march(real, real, real, cells, steps, 1e-3, density, room, whole[1:])
+        marching.density_at(u, density, values)
+        marching.march(vectors, vectors, vectors, cells, steps, 1e-3, density, buffers, offsets[1:])
         marching.density_slopes(u, density, u)
-        fused_render.composite((real, real), real, cells, steps, (1e-3, 1e-4), density, colour,
-                             rays[0], torch.zeros(n, 5))  # fmt: skip
+        fused_render.composite((vectors, vectors), vectors, cells, steps, (1e-3, 1e-4), density,
+                               colour, rays[0], torch.zeros(n, 5))  # fmt: skip
 
 
 def main() -> None:
-    triton.runtime.driver.set_active(NoCard())
+    triton.runtime.driver.set_active(TargetDriver())
     run = JITFunction.run
 
     @functools.wraps(run)

@@ -1,9 +1,9 @@
-"""A second kind of field: a few dozen anisotropic Gaussians, each with a colour of its own.
+"""A second kind of field: a few dozen anisotropic Gaussians, each with its own colour.
 
 Density is a sum of Gaussians, sigma_i exp(-(x - mu_i)^T A_i (x - mu_i) / 2). Along a ray each one
 is a one-dimensional Gaussian, so its optical depth is known in closed form; `march` gives one
 sample for each, at its peak, whose `ids` name it. Colours are spherical harmonics of degree 1 per
-Gaussian and are asked by id; at a mere position they are the density's mean.
+Gaussian, looked up by id; without an id a position has the density-weighted mean colour.
 """
 
 import math
@@ -72,10 +72,10 @@ class GaussianField:
         if ids is not None:
             slope = torch.einsum("sci,si->sc", self.colour_slope[ids], d)
             return (self.colour_mean[ids] + slope).clamp_min(0)
-        share = self.parts(x) + 1e-12  # far from all: the plain mean instead of 0/0
-        share = share / share.sum(-1, keepdim=True)
-        slope = torch.einsum("ng,gci,ni->nc", share, self.colour_slope, d)
-        return (share @ self.colour_mean + slope).clamp_min(0)
+        weights = self.parts(x) + 1e-12  # far from all Gaussians: their plain mean instead of 0/0
+        weights = weights / weights.sum(-1, keepdim=True)
+        slope = torch.einsum("ng,gci,ni->nc", weights, self.colour_slope, d)
+        return (weights @ self.colour_mean + slope).clamp_min(0)
 
     def sky(self, d, appearance=None):
         up = d[:, 2:].clamp(0, 1)

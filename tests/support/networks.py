@@ -1,4 +1,4 @@
-"""Tiny networks with random weights, saved as the large ones are."""
+"""Tiny networks with random weights, saved in the format of the large ones."""
 
 import json
 from pathlib import Path

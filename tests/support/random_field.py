@@ -1,4 +1,4 @@
-"""A small field with random contents: matter of all densities in random cells."""
+"""A small field with random parameters and random occupied cells."""
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ SMALL = FieldSize(
 
 
 def random_field(seed: int = 0, images: int = 5, full: bool = False) -> Field:
-    """A field whose core is 2.5 m around (1, -2, 0.5); a third of its cells are occupied."""
+    """A field with a core of radius 2.5 m at (1, -2, 0.5); a third of its cells are occupied."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
     field = Field(SMALL, images, np.array([1.0, -2.0, 0.5]), unit=2.5, near=0.1)
@@ -51,6 +51,6 @@ def directions(n: int, seed: int = 0) -> torch.Tensor:
 
 
 def points(field: Field, n: int, spread: float = 1.5, seed: int = 0) -> torch.Tensor:
-    """World positions around the core, some of them outside it."""
+    """World positions around the core, partly outside."""
     generator = torch.Generator().manual_seed(seed)
     return field.centre + field.unit * spread * torch.randn(n, 3, generator=generator)

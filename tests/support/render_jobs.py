@@ -1,4 +1,4 @@
-"""Render jobs with a frame source that costs nothing, and processes that render or join them."""
+"""Render jobs with a trivial frame source, and processes that render or join their parts."""
 
 import re
 from pathlib import Path
@@ -29,7 +29,7 @@ def make_job(frames: int = 8, visibility: float = 50.0, **changes) -> RenderJob:
 
 
 def noise_of(job: RenderJob):
-    """A frame source whose pictures depend on the job and the index alone."""
+    """A frame source whose pictures depend on the job and the index only."""
 
     def render(index, preview):
         rng = np.random.default_rng([int(job.key[:8], 16), index])
@@ -56,7 +56,7 @@ def join_parts(out: Path, frames: int) -> None:
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    """All files of a render by relative path, except the lock and what a killed process left."""
+    """All files of a render by relative path, except the lock and temporary files."""
     found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
     temporary = re.compile(r"(.*/)?\.[0-9a-f]{12}\.tmp\.\w+|\.frames/(lock|unfinished-.*)")
     return {name: p.read_bytes() for name, p in found.items() if not temporary.fullmatch(name)}

@@ -1,4 +1,4 @@
-"""Fits of the toy scene, with labels and points if wanted."""
+"""Fits of the toy scene, optionally with labels and points."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def begin(scene, **settings):
 
 
 def labelled(scene):
-    """The scene with points on its ground, and what its pixels show: terrain, building or sky."""
+    """The scene with points on its ground, and labels of its pixels: terrain, building or sky."""
     labels, ends = [], []
     for view in scene.of_split("train"):
         _, layers = render_frame(World(FIELD), CAMERA, scene.c2w_world(view))
@@ -44,7 +44,7 @@ def labelled(scene):
 
 
 def labelled_pixels(scene, labels):
-    """The photos as they are now, with labels."""
+    """The current photos, with labels."""
     views = scene.of_split("train")
     return TrainingPixels(
         [CAMERA],
@@ -56,7 +56,7 @@ def labelled_pixels(scene, labels):
 
 
 def with_labels(scene, relabel, **settings):
-    """A fit of the labelled scene, with its labels changed, that is past a quarter."""
+    """A fit of the labelled scene with changed labels, after the first quarter of its steps."""
     known, labels = labelled(scene)
     views = known.of_split("train")
     extent = find_extent(np.stack([known.c2w_world(v) for v in views]), None)

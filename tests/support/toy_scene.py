@@ -1,4 +1,4 @@
-"""Boxes on plain ground under a sky, photographed all around: quick to render and to fit."""
+"""Boxes on plain ground under a sky, photographed from a circle: fast to render and to fit."""
 
 import numpy as np
 import torch
@@ -63,7 +63,7 @@ def picture(c2w: np.ndarray) -> np.ndarray:
 
 
 def make_scene(folder) -> Scene:
-    """The toy as a scene on disk; every sixth picture is held out."""
+    """Write the toy scene to disk; every sixth picture is held out."""
     views = []
     for i, c2w in enumerate(poses()):
         path = folder / "images" / f"{i:02d}.png"

@@ -15,7 +15,7 @@ CAMERAS = [Camera(20, 14, 20.0, 20.0, 10.0, 7.0), Camera(14, 20, 20.0, 20.0, 7.0
 
 
 def made() -> TrainingPixels:
-    """Four pictures of two cameras; labels, masks and depths of some are missing."""
+    """Four pictures of two cameras, partly without labels, masks and depths."""
     rng = np.random.default_rng(0)
     camera_of = [0, 1, 0, 1]
     shapes = [(CAMERAS[i].height, CAMERAS[i].width) for i in camera_of]
@@ -27,7 +27,7 @@ def made() -> TrainingPixels:
     return TrainingPixels(CAMERAS, camera_of, poses, images, labels, masks, relative)
 
 
-def test_pixels_are_drawn_alike_from_memory_and_from_a_file(monkeypatch):
+def test_draws_from_memory_and_from_a_file_are_equal(monkeypatch):
     inside = made()
     monkeypatch.setattr(module, "MAX_IN_MEMORY", 100)
     outside = made()
@@ -51,7 +51,7 @@ def test_missing_labels_masks_and_depths_are_unknown_in_their_image_only():
     assert pixels.usable[n:].all() and pixels.usable_fraction == pytest.approx(1 - 94 / (4 * n))
 
 
-def test_classes_are_counted_in_pieces(monkeypatch):
+def test_classes_are_counted_in_chunks(monkeypatch):
     pixels = made()
     assert pixels.label is not None
     pixels.label[5], pixels.label[700] = 3, 4
@@ -83,12 +83,12 @@ def test_a_picture_of_another_size_is_refused():
         TrainingPixels(CAMERAS, [0], np.eye(4)[None], [np.zeros((20, 14, 3), np.uint8)])
 
 
-def test_masked_pixels_are_no_evidence_of_empty_space():
-    """A thumb or a mirror labelled as sky forces no cell empty once it is masked."""
+def test_masked_sky_labels_force_no_cell_empty():
+    """A masked thumb or mirror can be labelled as sky."""
     poses = np.stack([np.eye(4)] * 6)
-    poses[:, 0, 3] = np.arange(6)  # m, side by side, looking the same way
+    poses[:, 0, 3] = np.arange(6)  # m, side by side, with parallel axes
     images = [np.zeros((14, 20, 3), np.uint8)] * 6
-    labels = [np.full((14, 20), 10, np.uint8)] * 6  # sky, by each
+    labels = [np.full((14, 20), 10, np.uint8)] * 6  # sky in each view
     masks = [np.ones((14, 20), bool) for _ in range(6)]
     for mask in masks:
         mask[:, :12] = False

@@ -1,17 +1,17 @@
-"""A whole step of a fit with the GPU kernels, in Triton's interpreter, against the CPU's."""
+"""A step of a fit with GPU kernels, in Triton's interpreter, against the CPU kernels."""
 
 import os
 
 import pytest
 import torch
-from test_static_shapes import begun, learned_in
+from test_static_shapes import frozen_fit, gradients_of
 
 from climatenerf.ops import dispatch, marching
 
-os.environ.setdefault("TRITON_INTERPRET", "1")  # it is read where a kernel is defined
+os.environ.setdefault("TRITON_INTERPRET", "1")  # read when a kernel is defined
 pytest.importorskip("triton", reason="Triton is for Linux")
 if os.environ["TRITON_INTERPRET"] != "1":
-    pytest.skip("kernels run on the GPU that is here", allow_module_level=True)
+    pytest.skip("kernels run on the GPU of this machine", allow_module_level=True)
 
 from climatenerf.ops.triton import compositing as gpu_compositing
 from climatenerf.ops.triton import encoding as gpu_encoding
@@ -35,7 +35,7 @@ def use_backend(backend, monkeypatch):
 
 
 def test_a_step_with_the_gpu_kernels_has_the_gradients_of_the_cpu_kernels(scene, monkeypatch):
-    """Tiles are large: the interpreter takes milliseconds for an operation of any length."""
+    """Tiles are large, since the interpreter takes milliseconds per operation of any size."""
     for module in (gpu_encoding, gpu_network, gpu_marching):
         monkeypatch.setattr(module, "SAMPLES", 4096)
     for module, name, size in (
@@ -51,20 +51,20 @@ def test_a_step_with_the_gpu_kernels_has_the_gradients_of_the_cpu_kernels(scene,
     results = []
     for backend in ("cpu", "triton"):
         use_backend(backend, monkeypatch)
-        trainer = begun(scene, backend == "triton")
+        trainer = frozen_fit(scene, backend == "triton")
         with torch.no_grad():  # varied colours, so that gradients are not zero
             generator = torch.Generator().manual_seed(7)
             for grid in trainer.grid_adam.tables:
                 grid.copy_(0.1 * torch.randn(grid.shape, generator=generator))
-        for _ in range(2):  # the second with smaller capacities
+        for _ in range(2):  # the second one with smaller capacities
             batch = trainer.pixels.draw(60, torch.Generator().manual_seed(2), 10, 0.1)
             trainer.objective.depth_alignment.sums.zero_()
-            result, gradients = learned_in(trainer, batch)
+            result, gradients = gradients_of(trainer, batch)
         results.append((result, gradients))
-    (exact, wanted), (deferred, found) = results
+    (exact, expected), (deferred, found) = results
     assert deferred[0] == pytest.approx(exact[0], rel=1e-3)
     assert deferred[1] == pytest.approx(exact[1], abs=9)
-    assert wanted.keys() == found.keys()
-    for name, gradient in wanted.items():
+    assert expected.keys() == found.keys()
+    for name, gradient in expected.items():
         off = (found[name] - gradient).norm()
         assert off <= 1e-3 * gradient.norm() + 1e-9, name

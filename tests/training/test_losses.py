@@ -1,4 +1,4 @@
-"""Values of each loss, and that the objective adds it with its weight."""
+"""Values of each loss, and its weight in the objective."""
 
 import dataclasses
 import math
@@ -80,7 +80,7 @@ def test_sky_loss_is_the_weight_in_the_sky_over_the_number_of_rays():
 
 
 def only(scene, weight=1.0, **settings):
-    """A fit with one loss alone, half way, and a batch with its rendered rays."""
+    """A fit with a single loss at half of its steps, and a batch with its rendered rays."""
     nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
     name = settings.pop("loss")
     trainer = begin(scene, steps=1000, losses=Losses(**{**nothing, name: weight}), **settings)
@@ -94,7 +94,7 @@ def only(scene, weight=1.0, **settings):
 
 
 def geometry(trainer, batch, rays):
-    """The terms on the density, half way through a fit."""
+    """The terms on the density at half of a fit."""
     return trainer.objective.geometry(trainer.field, batch, rays, 0.5)
 
 
@@ -113,12 +113,12 @@ def test_unlabelled_surfaces_have_a_smaller_planarity_weight(scene):
 
 def test_distortion_and_opacity_entropy_of_a_step_are_the_formulas_times_their_weights(scene):
     trainer, batch, rays = only(scene, loss="distortion", weight=3.0)
-    wanted = losses.distortion_loss(rays.weights, rays.t, rays.dt, rays.samples.offsets)
-    assert wanted > 0 and geometry(trainer, batch, rays) == pytest.approx(3.0 * wanted)
+    expected = losses.distortion_loss(rays.weights, rays.t, rays.dt, rays.samples.offsets)
+    assert expected > 0 and geometry(trainer, batch, rays) == pytest.approx(3.0 * expected)
     trainer, batch, rays = only(scene, loss="opacity_entropy", weight=3.0)
     rays = replace(rays, transmittance=torch.linspace(0.0, 1.0, 900))
-    wanted = losses.opacity_entropy_loss(rays.transmittance)
-    assert wanted > 0 and geometry(trainer, batch, rays) == pytest.approx(3.0 * wanted)
+    expected = losses.opacity_entropy_loss(rays.transmittance)
+    assert expected > 0 and geometry(trainer, batch, rays) == pytest.approx(3.0 * expected)
 
 
 def test_an_opaque_sky_is_penalised_by_its_composited_distance(scene):
@@ -130,8 +130,8 @@ def test_an_opaque_sky_is_penalised_by_its_composited_distance(scene):
     # Translucent rays: their composited distance is not the mean distance of their matter.
     thin = replace(rays, weights=0.5 * rays.weights, transmittance=0.5 + 0.5 * rays.transmittance)
     distance = torch.zeros(900).index_add(0, rays.samples.ray_index(), thin.weights * thin.t)
-    wanted = float(torch.exp(-distance)[::2].sum() / 900)
-    assert geometry(trainer, batch, thin) == pytest.approx(wanted, rel=1e-4)
+    expected = float(torch.exp(-distance)[::2].sum() / 900)
+    assert geometry(trainer, batch, thin) == pytest.approx(expected, rel=1e-4)
 
 
 def test_monocular_depth_counts_by_its_weight_where_it_is_known(scene):

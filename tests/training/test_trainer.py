@@ -106,7 +106,7 @@ def test_the_time_limit_ends_the_fit_with_the_first_step_beyond_it(scene, monkey
     monkeypatch.setattr(module, "time", Clock())
     both = begin(scene, minutes=0.1, steps=3)
     both.run(lambda _: None)
-    assert both.steps == 3, "whichever comes first"
+    assert both.steps == 3, "the first limit ends the fit"
 
 
 def parameters_after(scene, seed, steps=40):
@@ -148,7 +148,7 @@ def test_space_outside_all_frusta_stays_empty(scene):
             trainer.evidence.free_space.force_empty(everywhere=False)
 
 
-def test_normals_count_as_learned_only_late_in_a_fit(scene):
+def test_normals_are_marked_as_learned_late_in_a_fit(scene):
     trainer = begin(scene, steps=100)
 
     def report(state):
@@ -166,7 +166,7 @@ def test_colours_are_view_independent_until_surfaces_are_found(scene):
     trainer = begin(scene, steps=40)
     seen = []
 
-    def look(report):
+    def record(report):
         u = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
         d = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
         with torch.no_grad():
@@ -178,7 +178,7 @@ def test_colours_are_view_independent_until_surfaces_are_found(scene):
             ]
         seen.append((report.progress, float((colours[0] - colours[1]).abs().max())))
 
-    trainer.run(look)
+    trainer.run(record)
     assert all(change == 0 for progress, change in seen if progress <= Schedule().refine_at)
     assert seen[-1][1] > 0
 
@@ -192,7 +192,7 @@ def test_colours_recover_from_black(scene):
     assert heldout_psnr(scene, lambda c2w: render_view(trainer.field, CAMERA, c2w)) > 14
 
 
-def test_marching_begins_nearer_to_the_camera_later(scene):
+def test_the_near_distance_decreases_during_a_fit(scene):
     trainer = begin(scene, steps=100)
     assert trainer.near == pytest.approx(Schedule().first_near * trainer.field.unit)
     trainer.steps = 50
@@ -201,8 +201,8 @@ def test_marching_begins_nearer_to_the_camera_later(scene):
 
 
 @pytest.mark.parametrize("steps", [100, 5000])
-def test_the_pruning_threshold_rises_once_light_ends_on_dense_samples(scene, steps):
-    """For any number of steps; each march leaves out samples below the threshold."""
+def test_the_pruning_threshold_increases_once_samples_are_dense(scene, steps):
+    """For any number of steps; each march prunes samples below the threshold."""
     generator = torch.Generator().manual_seed(0)
     ends = {}
     for kind, dense in (("surfaces", 0.97), ("haze", 0.0)):
@@ -213,8 +213,8 @@ def test_the_pruning_threshold_rises_once_light_ends_on_dense_samples(scene, ste
         tau = torch.where(surface, tau + 0.5, tau)
         for step in range(steps):
             trainer.steps = step
-            met = tau[tau > field.pruning_threshold]
-            trainer.raise_pruning_threshold(met, torch.ones_like(met))
+            kept = tau[tau > field.pruning_threshold]
+            trainer.raise_pruning_threshold(kept, torch.ones_like(kept))
             if step < Schedule().prune_from * steps:
                 assert field.pruning_threshold == MIN_TAU
         ends[kind] = field.pruning_threshold

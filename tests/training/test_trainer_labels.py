@@ -1,4 +1,4 @@
-"""Effects of labels, of sky, ground and classes, on a fit."""
+"""Effects of sky, ground and class labels on a fit."""
 
 import dataclasses
 
@@ -38,7 +38,7 @@ def opacity(trainer):
 
 
 def colour_loss(trainer, radiance, error, batch):
-    """The term on colours, and the batch that masks leave, where the fit is now."""
+    """The colour term and the unmasked batch at the current progress of the fit."""
     progress = trainer.progress
     return trainer.objective.colour(radiance, error, batch, progress, trainer.error)
 
@@ -54,10 +54,10 @@ def test_sky_labels_remove_matter(scene):
     assert opacity(trainer) < 0.2 * opacity(plain), (opacity(trainer), opacity(plain))
 
 
-def test_the_labelled_sky_learns_from_sky_pixels_only(scene):
+def test_a_labelled_sky_has_gradients_from_sky_pixels_only(scene):
     trainer = begin(scene, steps=1, losses=Losses(sky_prior=0.0))
     trainer.pixels.label = torch.full((trainer.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
-    trainer.pixels.label[0] = SKY  # labels that know of sky
+    trainer.pixels.label[0] = SKY  # so that the labels contain sky
     trainer = make_trainer(trainer.pixels, trainer.extent, trainer.settings)
     batch = trainer.pixels.draw(200, trainer.generator)
     batch.label[:] = ROAD
@@ -67,11 +67,11 @@ def test_the_labelled_sky_learns_from_sky_pixels_only(scene):
     batch.label[:] = SKY
     trainer.step(batch)
     assert any((p.grad != 0).any() for p in trainer.field.sky_net)
-    # Nor does haze before it take its colour.
+    # The colour of haze in front of the sky is not changed.
     assert all((p.grad == 0).all() for p in trainer.field.colour_net)
 
 
-def test_the_sky_learns_from_unlabelled_pixels_too(scene):
+def test_the_sky_has_gradients_from_unlabelled_pixels(scene):
     trainer = begin(scene, steps=1, losses=Losses(sky_prior=0.0))
     trainer.pixels.label = torch.full((trainer.pixels.rgb.shape[0],), ROAD, dtype=torch.uint8)
     trainer.pixels.label[0] = SKY
@@ -83,7 +83,7 @@ def test_the_sky_learns_from_unlabelled_pixels_too(scene):
 
 
 def test_sky_samples_exclude_matter_in_other_photos_and_cells_of_points(scene):
-    """A translucent pole in front of the sky: samples that other photos see as matter are kept."""
+    """A translucent pole before the sky: samples are kept if other photos label them matter."""
     trainer = begin(scene, steps=1)
     batch = trainer.pixels.draw(2, trainer.generator)
     batch.label[:] = torch.tensor([SKY, ROAD], dtype=torch.uint8)
@@ -100,19 +100,19 @@ def test_sky_samples_exclude_matter_in_other_photos_and_cells_of_points(scene):
     class VisualHull:
         def consensus(self, x, radius):
             far = (x - batch.rays_o[0]).norm(dim=-1)
-            return far > 1.5  # the nearest is seen as matter elsewhere
+            return far > 1.5  # the nearest sample is matter in other photos
 
     trainer.pixels.sky_hull = VisualHull()
     assert sky_samples() == [1, 2]
     x = batch.rays_o[0] + 3.0 * batch.rays_d[0]
     cell, _ = trainer.field.occupancy.cell_index(trainer.field.to_grid(x[None]))
-    trainer.evidence.free_space.protected.view(-1)[cell] = True  # a sparse point lies by the last
+    trainer.evidence.free_space.protected.view(-1)[cell] = True  # cell of a sparse point
     assert sky_samples() == [1]
 
 
-def test_masked_pixels_lose_their_label_and_relative_depth(scene, monkeypatch):
+def test_masked_pixels_have_no_label_and_no_relative_depth(scene, monkeypatch):
     trainer = begin(scene, steps=10)
-    trainer.steps = 9  # masks are in use
+    trainer.steps = 9  # masks are active
     batch = trainer.pixels.draw(4, trainer.generator)
     batch.label[:], batch.relative = VEHICLE, torch.ones(4)
     mask = torch.tensor([0.9, 0.1, 0.4, 0.6])
@@ -130,13 +130,13 @@ def test_a_partly_masked_triple_does_not_count(scene, monkeypatch):
     n, m = batch.rays_o.shape[0], 3
     batch.in_line[:] = True
     mask = torch.zeros(n)
-    mask[1], mask[n - 2 * m + 2] = 0.9, 0.9  # a middle, and a side of another
+    mask[1], mask[n - 2 * m + 2] = 0.9, 0.9  # the middle of one triple, a side of another
     monkeypatch.setattr(trainer.objective, "masks", lambda image, xy: mask)
     _, unmasked = colour_loss(trainer, torch.ones(n, 3), torch.ones(n), batch)
     assert unmasked.in_line.tolist() == [True, False, False]
 
 
-def test_sky_pixels_teach_an_opaque_sky_their_colour(scene):
+def test_sky_pixels_give_gradients_to_the_colour_of_an_opaque_sky(scene):
     """The paper's sky is matter, so rays labelled sky give gradients to its colour."""
     pixels = load_pixels(scene, 1)
     pixels.label = torch.full((len(pixels.rgb),), SKY, dtype=torch.uint8)
@@ -152,14 +152,14 @@ def test_sky_pixels_teach_an_opaque_sky_their_colour(scene):
 @pytest.mark.slow
 @pytest.mark.parametrize(("obstacles", "steps"), [(False, 40), (True, 80)])
 def test_ground_height_moves_matter_to_the_ground(scene, monkeypatch, obstacles, steps):
-    """The sparse depth, which would do the same, is switched off.
+    """Sparse depth has the same effect and is switched off.
 
-    Once without obstacles, and once with obstacles everywhere, so that only samples that the field
-    classifies as ground are moved (`test_free_space.py` tests obstacles).
+    With obstacles everywhere only samples that the field classifies as ground are moved
+    (`test_free_space.py` tests obstacles).
     """
 
-    def everywhere(carving):
-        return torch.full_like(carving.field.occupancy.occupied, obstacles, dtype=torch.bool)
+    def everywhere(free_space):
+        return torch.full_like(free_space.field.occupancy.occupied, obstacles, dtype=torch.bool)
 
     monkeypatch.setattr(FreeSpace, "find_obstacles", everywhere)
     known, labels = labelled(scene)
@@ -196,13 +196,13 @@ def test_multiview_matches_on_the_ground_are_dropped(scene):
     settings = FitSettings(size=TINY, minutes=None, steps=10)
     batch = pixels.draw(2000, torch.Generator().manual_seed(0))
     matched = SparseDepth(batch.rays_o, batch.rays_d, torch.full((2000,), 3.0), batch.image)
-    lies = int((batch.label == 3).sum())
-    assert 200 < lies < 1800
+    on_ground = int((batch.label == 3).sum())
+    assert 200 < on_ground < 1800
     points = read_sparse_depth(known)
     trainer = make_trainer(pixels, extent, settings, points, matched)
     assert trainer.evidence.free_space.ground is not None
     assert trainer.evidence.depths[0] is points
-    assert len(trainer.evidence.depths[1].depth) == pytest.approx(2000 - lies, abs=20)
+    assert len(trainer.evidence.depths[1].depth) == pytest.approx(2000 - on_ground, abs=20)
     alone = make_trainer(pixels, extent, settings, None, matched)
     assert alone.evidence.free_space.ground is None and alone.evidence.depths == (matched,)
 
@@ -211,8 +211,10 @@ def test_classes_and_normals_do_not_change_the_density(scene, monkeypatch):
     """The colour loss is zeroed, so that only classes and normals give gradients."""
     monkeypatch.setattr(losses, "colour_error", lambda linear, _: 0.0 * linear.sum(-1))
     nothing = {each.name: 0.0 for each in dataclasses.fields(Losses)}
-    for bend, moves in ((0.0, False), (1.0, True)):
-        weights = Losses(**{**nothing, "classes": 1.0, "normals": 1.0, "normal_consistency": bend})
+    for consistency, changed in ((0.0, False), (1.0, True)):
+        weights = Losses(
+            **{**nothing, "classes": 1.0, "normals": 1.0, "normal_consistency": consistency}
+        )
         trainer = with_labels(scene, np.asarray, losses=weights)
         field = trainer.field
         before = {name: value.clone() for name, value in field.named_parameters()}
@@ -220,14 +222,14 @@ def test_classes_and_normals_do_not_change_the_density(scene, monkeypatch):
             trainer.step(trainer.pixels.draw(1024, trainer.generator))
         moved = {n for n, value in field.named_parameters() if not torch.equal(value, before[n])}
         assert any(name.startswith("surface_net") for name in moved)
-        assert any(name.startswith("geometry") for name in moved) == moves, moved
+        assert any(name.startswith("geometry") for name in moved) == changed, moved
 
 
 @pytest.mark.parametrize(
     ("labelled_ids", "learned"), [((9,), False), ((2,), False), ((2, 9), True)]
 )
 def test_a_single_class_is_not_learned(scene, labelled_ids, learned):
-    """Heuristic labels hold sky and terrain alone: everything would be classified as terrain."""
+    """With heuristic labels (sky and terrain) everything would be classified as terrain."""
     trainer = with_labels(scene, lambda ids: np.where(np.isin(ids, (*labelled_ids, 10)), ids, 255))
     assert trainer.field.knows_classes == learned
     before = trainer.field.surface_net[-2].detach().clone()
@@ -251,24 +253,24 @@ def test_points_on_a_movable_class_keep_the_full_mask_price(scene, monkeypatch):
     person = batch.label == PERSON
     full = trainer.settings.losses.transient
     assert torch.isclose(prices[0][~person], torch.tensor(full)).all()
-    still = torch.isclose(prices[0][person], torch.tensor(full))
-    suspected = torch.isclose(prices[0][person], torch.tensor(MOVABLE_PRICE * full))
-    assert (still | suspected).all() and still.float().mean() > 0.05 and suspected.any()
+    static = torch.isclose(prices[0][person], torch.tensor(full))
+    movable = torch.isclose(prices[0][person], torch.tensor(MOVABLE_PRICE * full))
+    assert (static | movable).all() and static.float().mean() > 0.05 and movable.any()
     images = trainer.evidence.static_cells.shape[0]
-    static = find_static_cells(trainer.pixels, trainer.evidence.depths, images)
-    assert static.any() and torch.equal(static, trainer.evidence.static_cells)
+    cells = find_static_cells(trainer.pixels, trainer.evidence.depths, images)
+    assert cells.any() and torch.equal(cells, trainer.evidence.static_cells)
     assert not find_static_cells(trainer.pixels, [], images).any()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("label", [True, False])
-def test_the_sky_prior_continues_the_sky_where_no_photo_shows_it(scene, label):
-    """The sky begins as noise or black, which only the prior can correct overhead."""
-    schedule = Schedule(unlabelled_sky=(1.0, 1.0))  # the default is slow
+def test_the_sky_prior_extrapolates_the_sky_to_unseen_directions(scene, label):
+    """The sky is initialised with noise or black, which only the prior corrects overhead."""
+    schedule = Schedule(unlabelled_sky=(1.0, 1.0))  # the default ramp is slow
     up = torch.randn(500, 3, generator=torch.Generator().manual_seed(0))
     up[:, 2] = 2 * up[:, 2].abs() + 1.0
     up = torch.nn.functional.normalize(up, dim=-1)
-    off = {}
+    errors = {}
     for weight in (Losses.sky_prior, 0.0):
         relabel = np.asarray if label else lambda ids: np.full_like(ids, 255)
         trainer = with_labels(scene, relabel, losses=Losses(sky_prior=weight), schedule=schedule)
@@ -288,11 +290,11 @@ def test_the_sky_prior_continues_the_sky_where_no_photo_shows_it(scene, label):
         with torch.no_grad():
             sky = field.sky_colour(up, field.mean_embedding.expand(500, -1))
         ratio = sky.mean(-1) / photographed
-        off[weight] = float(((ratio < 0.5) | (ratio > 2.0)).float().mean())
-    assert off[Losses.sky_prior] < 0.5 * off[0.0], off
+        errors[weight] = float(((ratio < 0.5) | (ratio > 2.0)).float().mean())
+    assert errors[Losses.sky_prior] < 0.5 * errors[0.0], errors
 
 
-def test_settings_of_the_ablation_switch_parts_off(scene, monkeypatch):
+def test_settings_of_the_ablation_disable_parts(scene, monkeypatch):
     full = with_labels(scene, np.asarray)
     assert full.field.occupancy.forced_empty.any() and full.evidence.knows_sky
     assert not with_labels(scene, np.asarray, free_space=False).field.occupancy.forced_empty.any()
@@ -305,12 +307,12 @@ def test_settings_of_the_ablation_switch_parts_off(scene, monkeypatch):
         factors.clear()
         trainer = with_labels(scene, np.asarray, near_camera_gradient_scaling=scaling)
         trainer.step(trainer.pixels.draw(1024, trainer.generator))
-        # The first factors are on the density: 1 / inclusion probability, less near cameras.
+        # The first factors scale the density: 1 / inclusion probability, reduced near cameras.
         assert (factors[0].min() < 1) == (scaling > 0)
 
 
-def test_a_neighbouring_pixels_colour_is_explained(scene, monkeypatch):
-    """Leaves in front of the sky never match pixel by pixel, but are not transient."""
+def test_the_colour_of_a_neighbouring_pixel_is_no_unexplained_error(scene, monkeypatch):
+    """Leaves in front of the sky never match exactly, but are not transient."""
     found = []
 
     def recorded(error, unexplained, mask, price):
@@ -324,8 +326,8 @@ def test_a_neighbouring_pixels_colour_is_explained(scene, monkeypatch):
     batch = pixels.draw(4000, torch.Generator().manual_seed(0))
     x = (batch.xy[:, 0] * pixels.width[batch.image]).long()
     y = (batch.xy[:, 1] * pixels.height[batch.image]).long()
-    beside = (x + 1).minimum(pixels.width[batch.image] - 1)
-    neighbour = pixels.rgb[pixels.pixel_start[batch.image] + y * pixels.width[batch.image] + beside]
+    right = (x + 1).minimum(pixels.width[batch.image] - 1)
+    neighbour = pixels.rgb[pixels.pixel_start[batch.image] + y * pixels.width[batch.image] + right]
     linear = decode_srgb(neighbour.float() / 255)
     colour_loss(trainer, linear, torch.ones(4000), batch)
     colour_loss(trainer, linear + 8.0, torch.ones(4000), batch)

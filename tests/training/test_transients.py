@@ -10,7 +10,7 @@ RATE = Schedule().masks[1] * FitSettings().net_rate
 
 
 def train(error_at, images=4, steps=600):
-    """Masks fitted to images with a given squared error at (image, position)."""
+    """Fit masks to images with the squared error `error_at(image, position)`."""
     torch.manual_seed(0)
     masks = TransientMasks(images)
     adam = torch.optim.Adam(masks.parameters(), lr=RATE)
@@ -38,7 +38,7 @@ def test_an_object_in_one_photo_is_masked_there_only():
     there = person(image, xy)
     assert m[there].mean() > 0.8, m[there].mean()
     assert m[~there].mean() < 0.03, m[~there].mean()
-    assert m[image != 1].max() < 0.2  # images do not leak into each other
+    assert m[image != 1].max() < 0.2  # images are independent
     fractions = masks.masked_fractions()
     assert (
         fractions[1].isclose(torch.tensor(0.2 * 0.7), atol=0.03) and not fractions[[0, 2, 3]].any()
@@ -53,8 +53,8 @@ def test_a_static_capture_is_not_masked():
     assert (m > 0.5).float().mean() < 0.02
 
 
-def test_masks_can_still_turn_on_after_a_long_time_at_rest():
-    """Without the logarithm M would fall to 0 and stay there; here a person appears late."""
+def test_masks_can_turn_on_late():
+    """The logarithm keeps a gradient at M near 0; here a person appears late."""
     step = iter(range(10**9))
     masks = train(lambda image, xy: 0.1 * person(image, xy) * (next(step) > 400), steps=700)
     image, xy = torch.randint(4, (8000,)), torch.rand(8000, 2)
@@ -64,8 +64,8 @@ def test_masks_can_still_turn_on_after_a_long_time_at_rest():
     assert m[there].mean() > 0.8 and m[~there].mean() < 0.05, (m[there].mean(), m[~there].mean())
 
 
-def test_the_masked_loss_has_its_minimum_by_the_price():
-    """M turns on exactly where the unexplained error is above the price."""
+def test_the_price_decides_the_minimum_of_the_masked_loss():
+    """The best M is near 1 exactly if the unexplained error exceeds the price."""
     price, m = torch.tensor([PRICE]), torch.linspace(0.001, 0.999, 999)[:, None]
     for unexplained, best in ((2 * PRICE, 0.999), (0.5 * PRICE, 2 * losses.RESTING_MASK)):
         off = torch.tensor([unexplained])

@@ -1,10 +1,11 @@
-"""The weather file: read, refused, keyframed, overridden by flags, and written back."""
+"""Weather files: reading, errors, keyframes, flags and round trips."""
 
 import json
 import math
 import tomllib
 
 import pytest
+import tomli_w
 
 from climatenerf.core.errors import UserError
 from climatenerf.weather.description import (
@@ -12,7 +13,6 @@ from climatenerf.weather.description import (
     combine,
     given_flags,
     read_weather,
-    to_toml,
     weather_from_table,
     weather_to_table,
 )
@@ -42,7 +42,7 @@ def film(tmp_path) -> KeyframedWeather:
     return read_weather(path)
 
 
-def test_values_and_keyframes(film):
+def test_values_and_keyframes_are_read(film):
     assert film.base.seed == 7
     assert film.base.flood.wind_speed == 6
     assert film.base.flood.colour == (0.5, 0.4, 0.3)
@@ -53,7 +53,7 @@ def test_values_and_keyframes(film):
     assert film.at(3).smog == film.base.smog
 
 
-def test_colours_move_too():
+def test_colours_are_interpolated():
     film = weather_from_table(
         {"smog": {"sigma": "1 1/m", "colour": {"1 s": [0, 0, 0], "3 s": [1, 0.5, 0]}}}
     )
@@ -66,25 +66,25 @@ def test_colours_move_too():
         ("[fload]", 'unknown section "fload"; did you mean "flood"?'),
         ('[flood]\nlevle = "1 m"', 'unknown key in [flood] "levle"; did you mean "level"?'),
         ('[flood]\nwind = "1 m/s"', "did you mean"),
-        ('[flood]\nlevel = "3 kg"', 'flood.level wants a length such as "0.5 m"; got "3 kg"'),
-        ("[flood]\nlevel = 3", 'flood.level wants a length such as "0.5 m"; got 3'),
-        ("[flood]\nwave-scale = true", "flood.wave-scale wants a number; got True"),
-        ("[flood]\ncolour = [1, 2]", "flood.colour wants three numbers"),
+        ('[flood]\nlevel = "3 kg"', 'flood.level must be a length such as "0.5 m"; got "3 kg"'),
+        ("[flood]\nlevel = 3", 'flood.level must be a length such as "0.5 m"; got 3'),
+        ("[flood]\nwave-scale = true", "flood.wave-scale must be a number; got True"),
+        ("[flood]\ncolour = [1, 2]", "flood.colour must be three numbers"),
         ("[flood]\nlevel = {}", "empty table of keyframes"),
         (
             '[flood]\nlevel = {"1 m" = "1 m"}',
-            'a time of flood.level wants a duration such as "4 s"',
+            'a time of flood.level must be a duration such as "4 s"',
         ),
         ('[flood]\nlevel = {"1 s" = "1 m", "1000 ms" = "2 m"}', "names the same time twice"),
         ('[flood]\nlevel = {"0 s" = "none", "1 s" = "2 m"}', 'has "none" in a keyframe'),
         ('[flood]\nlevel = {"0 s" = "1 m", "1 s" = "2000 m"}', "must lie between"),
         ('[smog]\nvisibility = "9 m"\nsigma = "1 1/m"', "give only one"),
-        ("flood = 3", "[flood] wants a table of values; got 3"),
-        ("seed = 1.5", "seed wants a whole number; got 1.5"),
+        ("flood = 3", "[flood] must be a table of values; got 3"),
+        ("seed = 1.5", "seed must be a whole number; got 1.5"),
         ("[flood", "is not valid TOML"),
     ],
 )
-def test_refused(tmp_path, text, message):
+def test_invalid_files_are_refused(tmp_path, text, message):
     path = tmp_path / "weather.toml"
     path.write_text(text)
     with pytest.raises(UserError) as error:
@@ -93,7 +93,7 @@ def test_refused(tmp_path, text, message):
     assert str(path) in str(error.value)
 
 
-def test_missing_and_binary_files(tmp_path):
+def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(UserError, match="cannot read the weather file"):
         read_weather(tmp_path / "none.toml")
     with pytest.raises(UserError, match="cannot read the weather file"):
@@ -103,11 +103,11 @@ def test_missing_and_binary_files(tmp_path):
         read_weather(tmp_path / "a.toml")
 
 
-def test_round_trip(film):
+def test_weather_round_trips(film):
     for weather in (film, KeyframedWeather(Weather(), {})):
         table = weather_to_table(weather)
         assert weather_from_table(json.loads(json.dumps(table))) == weather
-        assert weather_from_table(tomllib.loads(to_toml(table))) == weather
+        assert weather_from_table(tomllib.loads(tomli_w.dumps(table))) == weather
     assert weather_to_table(film.at(2))["flood"]["level"] == "0.4 m"
 
 
@@ -115,7 +115,7 @@ def test_flags_override_the_file(film):
     arguments = ["render", "--flood.wind-speed=2 m/s", "--smog.sigma", "0.1 1/m", "--frames", "3"]
     given = given_flags(arguments)
     assert given == {"flood.wind_speed", "smog.sigma"}
-    # A flag counts even where it repeats the default, so the file's value does not come back.
+    # A flag overrides the file even if it repeats the default.
     flags = Weather(flood=Flood(wind_speed=Flood().wind_speed), smog=Smog(sigma=0.1))
     mixed = combine(film, flags, given)
     assert mixed.base.flood.wind_speed == Flood().wind_speed
@@ -130,7 +130,7 @@ def test_a_flag_replaces_keyframes(film):
     assert combine(film, Weather(flood=Flood(level=2.0)), given).at(3).flood.level == 2
 
 
-def test_flags_alone():
+def test_flags_without_a_file():
     assert combine(None, Weather(seed=3), frozenset()).at(1) == Weather(seed=3)
 
 

@@ -1,4 +1,4 @@
-"""Effects as packages: a user's own one, and those that cannot be used together."""
+"""Effects as packages: one of the user, and effects that are incompatible."""
 
 import dataclasses
 import importlib.util
@@ -38,7 +38,7 @@ C2W[:3, 3] = (0.0, -4.5, 1.8)
 
 @pytest.fixture(scope="module")
 def ash():
-    """The module of the example, as a package would be imported."""
+    """The module of the example, imported like a package."""
     spec = importlib.util.spec_from_file_location("volcanic_ash", EXAMPLE)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -52,7 +52,7 @@ def scene_at(folder):
     return Scene(folder, "test", (CAMERA,), views)
 
 
-def test_ash_from_its_own_package_lies_on_the_scene(ash, tmp_path):
+def test_ash_of_an_external_package_is_rendered(ash, tmp_path):
     effects = (*EFFECTS, ash.ASH)
     box = ((-6.0, -6.0, -2.0), (6.0, 6.0, 4.0))
     field = AnalyticField([HalfSpace(), Box((-1.0, 0.0, 0.0), (0.5, 1.0, 0.8))], box=box)
@@ -75,7 +75,7 @@ def test_ash_from_its_own_package_lies_on_the_scene(ash, tmp_path):
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """A folder on the path with the example as an installed package, and a run to render."""
+    """A folder on the path that contains the example as an installed package, and a run."""
     site = tmp_path_factory.mktemp("site")
     shutil.copy(EXAMPLE, site / "volcanic_ash.py")
     about = site / "volcanic_ash-1.0.dist-info"
@@ -93,9 +93,9 @@ def installed(tmp_path_factory):
     return site
 
 
-def climatenerf(site, *words):
+def climatenerf(site, *args):
     paths = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-    command = [sys.executable, "-m", "climatenerf", *map(str, words)]
+    command = [sys.executable, "-m", "climatenerf", *map(str, args)]
     environment = os.environ | {"PYTHONPATH": paths}
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
 
@@ -103,9 +103,9 @@ def climatenerf(site, *words):
 def test_an_installed_effect_has_flags_keyframes_and_layers(installed, tmp_path):
     (tmp_path / "film.toml").write_text('[ash]\ndepth = { "0 s" = "0 m", "1 s" = "4 cm" }\n')
     out = tmp_path / "out"
-    words = ["--weather", tmp_path / "film.toml", "--ash.albedo", "0.3", "--layers", "mask_ash"]
-    words += ["--path", "still", "--frames", "2", "--fps", "1", "--size", "32x18"]
-    done = climatenerf(installed, "render", installed / "run", "-o", out, *words)
+    args = ["--weather", tmp_path / "film.toml", "--ash.albedo", "0.3", "--layers", "mask_ash"]
+    args += ["--path", "still", "--frames", "2", "--fps", "1", "--size", "32x18"]
+    done = climatenerf(installed, "render", installed / "run", "-o", out, *args)
     assert done.returncode == 0, done.stderr
     sidecar = json.loads((out / "movie.json").read_text())
     assert sidecar["weather"]["ash"] == {"depth": {"0 s": "0 m", "1 s": "0.04 m"}, "albedo": 0.3}
@@ -117,15 +117,15 @@ def test_an_installed_effect_has_flags_keyframes_and_layers(installed, tmp_path)
 
 
 def test_an_installed_effect_has_help_and_a_range(installed, tmp_path):
-    shown = " ".join(climatenerf(installed, "render", "--help").stdout.replace("│", " ").split())
-    assert '--ash.depth LENGTH, e.g. "0.5 m"; 0 m to 1 m' in shown
-    words = ["render", installed / "run", "-o", tmp_path / "out", "--ash.depth", "3 m"]
-    done = climatenerf(installed, *words)
+    printed = " ".join(climatenerf(installed, "render", "--help").stdout.replace("│", " ").split())
+    assert '--ash.depth LENGTH, e.g. "0.5 m"; 0 m to 1 m' in printed
+    args = ["render", installed / "run", "-o", tmp_path / "out", "--ash.depth", "3 m"]
+    done = climatenerf(installed, *args)
     assert done.returncode == 2 and not (tmp_path / "out").exists()
     assert done.stderr.strip() == ("climatenerf: --ash.depth must lie between 0 m and 1 m; got 3 m")
 
 
-# --- effects that clash -----------------------------------------------------------------------
+# --- incompatible effects ---------------------------------------------------------------------
 
 
 def effect(**changes) -> Effect:
@@ -134,7 +134,7 @@ def effect(**changes) -> Effect:
     )
 
 
-RAIN = Layer("mask_rain", "1", "share of the pixel that shows rain", 1 / 255, 8)
+RAIN = Layer("mask_rain", "1", "fraction of the pixel that shows rain", 1 / 255, 8)
 
 
 @pytest.mark.parametrize(
@@ -153,13 +153,13 @@ RAIN = Layer("mask_rain", "1", "share of the pixel that shows rain", 1 / 255, 8)
         ([effect(after=("sleet",)), effect(name="sleet", after=("rain",))], "waits for it"),
     ],
 )
-def test_effects_that_clash_are_refused_in_one_sentence(added, message):
+def test_incompatible_effects_are_refused_in_one_sentence(added, message):
     with pytest.raises(UserError) as error:
         check_effects((*EFFECTS, *added), reserved=["path"])
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_clash_of_installed_effects_ends_with_status_2(installed, tmp_path):
+def test_incompatible_installed_effects_exit_with_status_2(installed, tmp_path):
     for name in ("volcanic_ash.py", "volcanic_ash-1.0.dist-info"):
         copy = shutil.copytree if (installed / name).is_dir() else shutil.copy
         copy(installed / name, tmp_path / name)
@@ -171,7 +171,7 @@ def test_a_clash_of_installed_effects_ends_with_status_2(installed, tmp_path):
     assert done.stderr.count("\n") == 1
 
 
-def test_built_in_effects_stand_together_and_snow_follows_the_flood():
+def test_built_in_effects_are_compatible_and_snow_follows_the_flood():
     assert check_effects(EFFECTS) == EFFECTS
     names = [each.name for each in in_order(EFFECTS[::-1])]
     assert names.index("flood") < names.index("snow")
@@ -180,14 +180,14 @@ def test_built_in_effects_stand_together_and_snow_follows_the_flood():
     assert len(layer_table()) == 4 + sum(len(each.layers) for each in EFFECTS)
 
 
-def test_every_parameter_that_preparation_depends_on_exists():
+def test_prepared_from_names_existing_parameters():
     weather = Weather()
     for each in EFFECTS:
         for name in each.prepared_from:
             weather.value(name)
 
 
-def test_weather_is_a_value():
+def test_weather_is_immutable_and_comparable():
     one = Weather(smog=Smog(visibility=9.0), seed=3)
     assert one == Weather(smog=Smog(visibility=9.0), seed=3) and hash(one) == hash(one)
     assert one != one.with_value("smog.visibility", 8.0) and one.smog.visibility == 9.0

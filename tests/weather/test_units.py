@@ -1,4 +1,4 @@
-"""Units: what is read, what is refused and how, and what the command line shows."""
+"""Units: valid and invalid quantities, ranges, and the help of the command line."""
 
 import math
 import subprocess
@@ -38,7 +38,7 @@ from climatenerf.weather.weather import Weather, check
         ("2 min", units.DURATION, 120),
     ],
 )
-def test_quantities(text, kind, value):
+def test_quantities_are_read_in_si_units(text, kind, value):
     assert units.parse_quantity(text, kind) == pytest.approx(value)
 
 
@@ -54,22 +54,22 @@ def test_quantities(text, kind, value):
         ("20 degC", units.LENGTH),
     ],
 )
-def test_refused(text, kind):
+def test_invalid_quantities_are_refused(text, kind):
     with pytest.raises(UserError) as error:
         units.parse_quantity(text, kind, "--some.flag")
     assert str(error.value).startswith(
-        f'--some.flag wants {kind.name} such as "{kind.example}"; got "{text}"'
+        f'--some.flag must be {kind.name} such as "{kind.example}"; got "{text}"'
     )
 
 
 @pytest.mark.parametrize("kind", [units.LENGTH, units.SPEED, units.ANGLE, units.DURATION])
 @pytest.mark.parametrize("value", [0.0, 0.1, 1 / 3, -2.0, 1e-9, 12345.678, 1e12, math.radians(37)])
-def test_written_and_read_back(kind, value):
+def test_quantities_round_trip(kind, value):
     text = units.format_quantity(value, kind)
     assert units.parse_quantity(text, kind) == pytest.approx(value, rel=1e-15, abs=0)
 
 
-def test_written_as_a_person_would():
+def test_quantities_are_written_without_rounding_noise():
     assert units.format_quantity(0.5, units.LENGTH) == "0.5 m"
     assert units.format_quantity(math.radians(37), units.ANGLE) == "37 deg"
     assert units.format_quantity(3.0, units.SPEED) == "3 m/s"
@@ -81,23 +81,23 @@ class Arguments:
     smog: Smog = Smog()
 
 
-def test_flags():
+def test_flags_have_units():
     seen = tyro.cli(Arguments, args=["--flood.level=-30 cm", "--flood.wind-speed", "10 knots"])
     assert seen.flood.level == pytest.approx(-0.3)
     assert seen.flood.wind_speed == pytest.approx(5.144, abs=1e-3)
     assert tyro.cli(Arguments, args=["--flood.level", "none"]).flood.level is None
 
 
-def test_a_wrong_flag_is_one_clear_message_and_status_2(capsys):
+def test_an_invalid_flag_prints_one_message_with_status_2(capsys):
     with pytest.raises(SystemExit) as stop:
         tyro.cli(Arguments, args=["--flood.level", "3 kg"])
     assert stop.value.code == 2
-    shown = capsys.readouterr().err
-    assert '--flood.level: wants a length such as "0.5 m"; got "3 kg"' in shown
-    assert "Traceback" not in shown
+    printed = capsys.readouterr().err
+    assert '--flood.level: must be a length such as "0.5 m"; got "3 kg"' in printed
+    assert "Traceback" not in printed
 
 
-def test_ranges():
+def test_values_out_of_range_are_refused():
     assert check(Weather()) == Weather()
     check(Weather(sun=Sun(azimuth=math.radians(360)), snow=Snow(slope=math.radians(90))))
     for weather, message in (
@@ -116,29 +116,29 @@ def test_ranges():
 
 def test_every_parameter_has_a_range_and_no_section_is_too_long():
     for effect in EFFECTS:
-        own = effect.fields()
-        assert 0 < len(own) <= 12
-        for parameter in own.values():
+        parameters = effect.fields()
+        assert 0 < len(parameters) <= 12
+        for parameter in parameters.values():
             assert math.isfinite(parameter.low) and parameter.low < parameter.high
 
 
 def test_help_shows_unit_and_range(capsys):
     with pytest.raises(SystemExit):
         tyro.cli(Arguments, args=["--help"])
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert 'LENGTH, e.g. "0.5 m"; -1000 m to 1000 m' in shown
-    assert "FLOAT FLOAT FLOAT; 0 to 1000" in shown
+    printed = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert 'LENGTH, e.g. "0.5 m"; -1000 m to 1000 m' in printed
+    assert "FLOAT FLOAT FLOAT; 0 to 1000" in printed
 
 
-def test_a_triple_is_read_or_none():
-    words = ["--flood.attenuation", "0.1", "0.2", "0.3"]
-    assert tyro.cli(Arguments, args=words).flood.attenuation == (0.1, 0.2, 0.3)
+def test_a_triple_can_be_none():
+    args = ["--flood.attenuation", "0.1", "0.2", "0.3"]
+    assert tyro.cli(Arguments, args=args).flood.attenuation == (0.1, 0.2, 0.3)
     none = ["--flood.attenuation", "none", "none", "none"]
     assert tyro.cli(Arguments, args=none).flood.attenuation is None
 
 
-def test_imports_stay_light():
-    """Help and weather files must not wait for torch."""
+def test_descriptions_do_not_import_torch():
+    """Help and weather files do not need torch, which takes seconds to import."""
     code = (
         "import sys, climatenerf.weather.registry, climatenerf.weather.description\n"
         "assert not {'torch', 'pint', 'numba'} & set(sys.modules)"

@@ -30,7 +30,7 @@ class House:
     pitch: float  # degrees
     ridge_along_front: bool
     corner: tuple[float, float]  # world x, y of local (0, 0)
-    turn: float  # degrees about z
+    rotation: float  # degrees about z
     wall: str  # textures
     gable: str
     roof: str
@@ -39,7 +39,7 @@ class House:
     @property
     def floor(self) -> float:
         """Floor height, world m: 0.25 m above the ground at the middle of the front."""
-        a = np.deg2rad(self.turn)
+        a = np.deg2rad(self.rotation)
         x = self.corner[0] + 0.5 * self.width * np.cos(a)
         y = self.corner[1] + 0.5 * self.width * np.sin(a)
         return float(ground_height(x, y)) + 0.25
@@ -236,6 +236,6 @@ def house_meshes(house: House) -> list[Mesh]:
         if key in ("wall", "gable"):
             size = _TEXTURE_SIZE[texture]
             mesh = mesh.scaled_uv(1 / size[0], 1 / size[1])
-        moved = mesh.moved(house.turn, (*house.corner, ground))
+        moved = mesh.moved(house.rotation, (*house.corner, ground))
         out.append(moved.tagged(f"{house.name}-{key}", texture, "building"))
     return out

@@ -62,15 +62,15 @@ def tree(
     ]
     centre = top + [0, 0, 0.62 * tall]
     clumps = []
-    turn = rng.uniform(0, 2 * np.pi)
+    azimuth = rng.uniform(0, 2 * np.pi)
     rings = ((-0.42, 0.62, 6), (0.0, 0.66, 7), (0.45, 0.48, 5), (0.75, 0.0, 1), (0.1, 0.0, 1))
     for height, radial, number in rings:
         for k in range(number):
-            a = turn + 2 * np.pi * (k + 0.3 * rng.uniform(-1, 1)) / number
+            a = azimuth + 2 * np.pi * (k + 0.3 * rng.uniform(-1, 1)) / number
             r = radial * wide * rng.uniform(0.85, 1.1)
             lift = height * tall + 0.1 * tall * rng.uniform(-1, 1)
             clumps.append(centre + [r * np.cos(a), r * np.sin(a), lift])
-        turn += 1.1
+        azimuth += 1.1
     clumps = np.array(clumps)
     for clump in clumps:
         knee = top + 0.45 * (clump - top) + [0, 0, 0.12 * tall]

@@ -101,7 +101,7 @@ def check_lengths(options: Capture) -> None:
     for name, metres in parse_known_lengths(options.known_length):
         if not name:
             raise UserError(
-                f'--known-length wants a name before the length, "DOOR={metres:g} m"; give the name'
+                f'--known-length needs a name before the length, "DOOR={metres:g} m"; give the name'
                 " that the marks have"
             )
     marks = options.marks or default_marks(options)

@@ -159,7 +159,7 @@ def parse_known_lengths(lengths: tuple[str, ...]) -> list[tuple[str, float]]:
     for text in lengths:
         name, equals, length = text.partition("=")
         if not equals:
-            raise UserError(f'--known-length wants a name and a length, "DOOR=2.0 m"; got "{text}"')
+            raise UserError(f'--known-length needs a name and a length, "DOOR=2.0 m"; got "{text}"')
         metres = parse_quantity(length, LENGTH, "--known-length")
         if not metres > 0:
             raise UserError(f'--known-length must be above 0; got "{text}"')
@@ -300,7 +300,7 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
             weight = -1.0
         if name not in names or not 0 <= weight < 1e6:
             raise UserError(
-                f'--loss wants a name and a weight of 0 or more, such as sky=0; got "{text}".'
+                f'--loss needs a name and a weight of 0 or more, such as sky=0; got "{text}".'
                 f" Names: {', '.join(names)}"
             )
         weights[name] = weight

@@ -135,7 +135,7 @@ def parse_part(text: str | None) -> tuple[int, int] | None:
     number, slash, count = (word.strip() for word in text.partition("/"))
     if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise UserError(
-            f'--part wants a number and a count, from 1/N to N/N such as 3/16; got "{text}"'
+            f'--part must be a number and a count, from 1/N to N/N such as 3/16; got "{text}"'
         )
     return int(number), int(count)
 
@@ -150,5 +150,5 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
         return None
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(p.isdecimal() and 16 <= int(p) <= 8192 for p in parts):
-        raise UserError(f'--size wants width x height such as 480x270, 16 to 8192; got "{text}"')
+        raise UserError(f'--size must be width x height such as 480x270, 16 to 8192; got "{text}"')
     return int(parts[0]), int(parts[1])

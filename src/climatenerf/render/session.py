@@ -84,7 +84,7 @@ class RenderSession:
         self._camera_positions = camera_positions
         self._times = np.zeros(1) if times is None else times
         self._appearance = appearance
-        self._progress = progress or (lambda what, share: None)
+        self._progress = progress or (lambda what, fraction: None)
         self._light: Float[Tensor, 3] | None = None
         self._keys: dict[str, Key] = {}
         self._entities: dict[str, Entity] = {}

@@ -127,10 +127,10 @@ def sky_coverage(scene: Scene) -> float:
     azimuth = np.arange(count) * math.pi * (3 - math.sqrt(5))  # Fibonacci lattice: equal areas
     radius = np.sqrt(1 - z**2)
     directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
-    in_view = np.zeros(count, bool)
+    visible = np.zeros(count, bool)
     for view in scene.views:
-        in_view |= _in_frame(scene, view.camera, directions @ scene.c2w_world(view)[:3, :3])
-    return float(in_view.mean())
+        visible |= _in_frame(scene, view.camera, directions @ scene.c2w_world(view)[:3, :3])
+    return float(visible.mean())
 
 
 def _in_frame(scene: Scene, camera: int, local: Float[np.ndarray, "n 3"]) -> np.ndarray:

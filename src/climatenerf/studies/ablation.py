@@ -87,7 +87,7 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         "no appearance": dataclasses.replace(full, appearance=False),
         "no distortion": without(distortion=0.0),
         "no normals": without(normals=0.0),
-        "no flatness": without(planarity=0.0),
+        "no planarity": without(planarity=0.0),
         "no sky": dataclasses.replace(full, sky_labels=False),
         "no depth": without(sparse_depth=0.0, ground_height=0.0, monocular_depth=0.0),
         "full": full,

@@ -232,15 +232,15 @@ class Objective:
         visible: VisibleSamples,
         progress: float,
     ) -> Float[Tensor, ""]:
-        """Return the terms on classes and normals, on some of the rays."""
+        """Return the terms on classes and normals, on a prefix of the rays."""
         weight = self.settings.losses
         if not (weight.classes or weight.normals or weight.normal_consistency):
             return visible.u.sum() * 0.0
         n = max(batch.rays_o.shape[0] // self.schedule.surface_ray_stride, 1)
-        some = self.buffers.prefix("surface", visible.ray, n)
-        raw = field.surface_raw(visible.u[some].detach())
-        ray, index = visible.ray[some], visible.index[some]
-        weights = visible.weights.detach()[some] * (ray < n)
+        selected = self.buffers.prefix("surface", visible.ray, n)
+        raw = field.surface_raw(visible.u[selected].detach())
+        ray, index = visible.ray[selected], visible.index[selected]
+        weights = visible.weights.detach()[selected] * (ray < n)
         q = target = None
         if (weight.normals or weight.normal_consistency) and self.schedule.surfaces_found(progress):
             t = samples.t[index, None]

@@ -83,7 +83,7 @@ def weather_from_table(
             weather = weather.with_value("seed", _integer(entries))
             continue
         if not isinstance(entries, Mapping):
-            raise UserError(f"[{section}] wants a table of values; got {entries!r}")
+            raise UserError(f"[{section}] must be a table of values; got {entries!r}")
         for key, raw in entries.items():
             item = _nearest(key, list(known[section]), f"key in [{section}]")
             name, parameter = f"{section}.{item}", known[section][item]
@@ -203,7 +203,7 @@ def _read_keyframes(name: str, parameter: Parameter, raw: Mapping[str, Any]) -> 
 
 def _integer(raw: Any) -> int:
     if isinstance(raw, bool) or not isinstance(raw, int):
-        raise UserError(f"seed wants a whole number; got {raw!r}")
+        raise UserError(f"seed must be a whole number; got {raw!r}")
     return raw
 
 
@@ -216,10 +216,3 @@ def _interpolate(frames: Keyframes, time: float) -> Any:
     if isinstance(a, tuple):
         return tuple((1 - fraction) * x + fraction * y for x, y in zip(a, b, strict=True))
     return (1 - fraction) * a + fraction * b
-
-
-def to_toml(table: Mapping[str, Any]) -> str:
-    """Return the text of a weather file for the tables of `weather_to_table`."""
-    import tomli_w
-
-    return tomli_w.dumps(table)

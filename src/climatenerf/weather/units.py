@@ -74,25 +74,25 @@ def parse_quantity(text: str, kind: Kind, where: str = "") -> float:
         UserError: no number, no unit, an unknown unit, another dimension, or a value that is not
             finite.
     """
-    wants = f'{where} wants {kind.name} such as "{kind.example}"; got "{text}"'.lstrip()
+    message = f'{where} must be {kind.name} such as "{kind.example}"; got "{text}"'.lstrip()
     match = _QUANTITY.fullmatch(text)
     if match is None:
-        raise UserError(wants)
+        raise UserError(message)
     number, unit = float(match["number"]), re.sub(r"^(per |/)", "1/", match["unit"])
     if not unit:
-        raise UserError(f"{wants}, which has no unit")
+        raise UserError(f"{message}, which has no unit")
     registry = _registry()
     try:
         units = registry.parse_units(unit)
         if kind is ANGLE and str(units) not in _ANGLE_UNITS:
-            raise UserError(wants)
+            raise UserError(message)
         value = float(registry.Quantity(number, units).to(kind.unit).magnitude) * kind.scale
     except UserError:
         raise
     except Exception as error:  # pint fails in a dozen ways, down to errors of its tokeniser
-        raise UserError(wants) from error
+        raise UserError(message) from error
     if not math.isfinite(value):
-        raise UserError(f"{wants}, which is not finite")
+        raise UserError(f"{message}, which is not finite")
     return value
 
 
@@ -186,15 +186,15 @@ class Parameter(PrimitiveConstructorSpec[Any]):
         if self.kind is not None:
             if not isinstance(raw, str):
                 example = self.kind.example
-                raise UserError(f'{where} wants {self.kind.name} such as "{example}"; got {raw}')
+                raise UserError(f'{where} must be {self.kind.name} such as "{example}"; got {raw}')
             return parse_quantity(raw, self.kind, where)
         if self.count == 1:
             if isinstance(raw, bool) or not isinstance(raw, int | float):
-                raise UserError(f"{where} wants a number; got {raw!r}")
+                raise UserError(f"{where} must be a number; got {raw!r}")
             return float(raw)
         numbers = isinstance(raw, list | tuple) and len(raw) == self.count
         if not numbers or any(isinstance(x, bool) or not isinstance(x, int | float) for x in raw):
-            raise UserError(f"{where} wants three numbers such as [0.5, 0.4, 0.3]; got {raw!r}")
+            raise UserError(f"{where} must be three numbers such as [0.5, 0.4, 0.3]; got {raw!r}")
         return tuple(float(x) for x in raw)
 
     def write(self, value: Any) -> Any:

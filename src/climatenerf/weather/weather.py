@@ -41,7 +41,7 @@ class Weather:
                 )
             if not isinstance(section, known[name].parameters):
                 raise TypeError(
-                    f"{name} wants a {known[name].parameters.__name__}; got {section!r}"
+                    f"{name} must be a {known[name].parameters.__name__}; got {section!r}"
                 )
         defaults = {name: effect.parameters() for name, effect in known.items()}
         object.__setattr__(self, "sections", defaults | sections)

@@ -100,8 +100,8 @@ def test_unposed_images_and_missing_images_give_warnings(tmp_path):
     assert any("1 images have no pose (first: 0_00002.png)" in w for w in scene.warnings)
 
 
-def damage_pose(root, words):
-    (root / "pose/0_00001.txt").write_text(words)
+def damage_pose(root, content):
+    (root / "pose/0_00001.txt").write_text(content)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ DISTORTED = Camera(48, 36, 40.0, 44.0, 20.0, 19.0, k1=-0.2, k2=0.03, p1=0.01)
 
 
 def projected(camera, c2w, x):
-    """Whether any camera shows positions x."""
+    """Whether positions x project into any camera."""
     seen = np.zeros(len(x), bool)
     for pose in c2w:
         local = (x - pose[:3, 3]) @ pose[:3, :3]
@@ -67,7 +67,7 @@ def test_a_ball_intersects_a_frustum_as_soon_as_it_touches_it():
 @pytest.mark.parametrize(
     "camera", [Camera(40, 40, 12.0, 12.0, 20.0, 20.0, fisheye=True), Camera(40, 40, 1, 1, 20, 20)]
 )
-def test_a_camera_too_wide_for_a_frustum_sees_everything(camera):
+def test_a_camera_too_wide_for_a_frustum_contains_everything(camera):
     x = torch.tensor([[0.0, 0.0, -2.0], [9.0, 9.0, 0.0]])
     assert intersects_frustum(x, torch.zeros(2), frustum_planes([camera], np.eye(4)[None])).all()
 

@@ -150,7 +150,7 @@ def test_correlation_matches_the_reference():
         assert tile == 3 * int(3 * y / height) + int(3 * x / width)
         assert tile == multiview_stereo._tiles(np.array([[x / width, y / height]]))[0]
         ours = kernels._correlation(pictures, i, tile, np.float32(x), np.float32(y), s, window)
-        js = [j for j in pictures.others[i, tile] if j >= 0]
+        js = [j for j in pictures.neighbours[i, tile] if j >= 0]
         each = [correlation_in_world_space(cameras, c2w, images, i, j, x, y, s) for j in js]
         best = sorted(value for value in each if np.isfinite(value))[-2:]
         if len(best) < 2:

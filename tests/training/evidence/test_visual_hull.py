@@ -1,4 +1,4 @@
-"""Visual hull from labels: what it carves, what it must keep, and how many votes it needs."""
+"""Visual hull from labels: carved space, protected matter, and minimum votes."""
 
 import numpy as np
 import torch

@@ -37,14 +37,14 @@ class Pictures(NamedTuple):
     """Width and height, px."""
     intrinsics: Float32[np.ndarray, "v 4"]
     """fx, fy, cx, cy, px."""
-    others: Int[np.ndarray, "v tiles k"]
-    """Neighbours with which a tile is compared; -1: none. There are TILES² tiles, row by row."""
-    turn: Float32[np.ndarray, "v tiles k 3 3"]
+    neighbours: Int[np.ndarray, "v tiles k"]
+    """Neighbour views that a tile is compared with; -1: none. TILES² tiles, row by row."""
+    rotation: Float32[np.ndarray, "v tiles k 3 3"]
     """A: rotation from the picture's camera frame to a neighbour's."""
     shift: Float32[np.ndarray, "v tiles k 3"]
-    """b: the picture's camera centre in a neighbour's frame, m."""
-    most: Float32[np.ndarray, "v tiles"]
-    """Largest inverse z-depth that is tried, 1/m; the smallest is 0."""
+    """b: translation, the picture's camera centre in a neighbour's frame, m."""
+    max_inverse_depth: Float32[np.ndarray, "v tiles"]
+    """Largest inverse z-depth of the sweep, 1/m; the smallest is 0."""
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST)
@@ -71,7 +71,7 @@ def match(
             continue
         tile = _tile(pictures, i, x, y)
         steps = _steps(pictures, i, tile, x, y)
-        per_step = pictures.most[i, tile] / (steps - 1)
+        per_step = pictures.max_inverse_depth[i, tile] / (steps - 1)
         correlations = np.empty(steps, np.float32)
         best = 0
         for h in range(steps):
@@ -167,7 +167,7 @@ def _direction(pictures, i, tile, k, x, y, s):
     """Return A d + s b of a pixel of picture i, in the frame of its neighbour k."""
     fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
     dx, dy = (x - pictures.intrinsics[i, 2]) / fx, (y - pictures.intrinsics[i, 3]) / fy
-    a, b = pictures.turn[i, tile, k], pictures.shift[i, tile, k]
+    a, b = pictures.rotation[i, tile, k], pictures.shift[i, tile, k]
     return (
         a[0, 0] * dx + a[0, 1] * dy + a[0, 2] + s * b[0],
         a[1, 0] * dx + a[1, 1] * dy + a[1, 2] + s * b[1],
@@ -179,12 +179,12 @@ def _direction(pictures, i, tile, k, x, y, s):
 def _steps(pictures, i, tile, x, y):
     """Return the number of depths to try, from the length of the projection of the ray."""
     length = 0.0
-    for k in range(pictures.others.shape[2]):
-        j = pictures.others[i, tile, k]
+    for k in range(pictures.neighbours.shape[2]):
+        j = pictures.neighbours[i, tile, k]
         if j < 0:
             continue
         far = _direction(pictures, i, tile, k, x, y, 0.0)
-        near = _direction(pictures, i, tile, k, x, y, pictures.most[i, tile])
+        near = _direction(pictures, i, tile, k, x, y, pictures.max_inverse_depth[i, tile])
         if far[2] <= 1e-3 or near[2] <= 1e-3:  # the ray passes the camera
             return MAX_STEPS
         fx, fy = pictures.intrinsics[j, 0], pictures.intrinsics[j, 1]
@@ -220,12 +220,12 @@ def _correlation(pictures, i, tile, x, y, s, window):
     """Return the mean correlation with the two best neighbours at inverse z-depth s."""
     first, second = np.float32(NONE), np.float32(NONE)
     fx, fy = pictures.intrinsics[i, 0], pictures.intrinsics[i, 1]
-    for k in range(pictures.others.shape[2]):
-        j = pictures.others[i, tile, k]
+    for k in range(pictures.neighbours.shape[2]):
+        j = pictures.neighbours[i, tile, k]
         if j < 0:
             continue
         middle = _direction(pictures, i, tile, k, x, y, np.float32(s))
-        a, lens = pictures.turn[i, tile, k], pictures.intrinsics[j]
+        a, lens = pictures.rotation[i, tile, k], pictures.intrinsics[j]
         turn_u, turn_v = a[2, 0] / fx, a[2, 1] / fy  # along the window's rows and columns
         extent = SIDE * (abs(turn_u) + abs(turn_v))
         # Beside or behind the camera, or tilted too far.

@@ -99,8 +99,8 @@ def confirmed_by_neighbour(
     confirmed = np.zeros(len(view), bool)
     tile = _tiles(_project(pictures, view, x / x[:, 2:]) / pictures.size[view])
     for k in range(2):
-        neighbour = pictures.others[view, tile, k]
-        rotation, shift = pictures.turn[view, tile, k], pictures.shift[view, tile, k]
+        neighbour = pictures.neighbours[view, tile, k]
+        rotation, shift = pictures.rotation[view, tile, k], pictures.shift[view, tile, k]
         there = np.einsum("nij,nj->ni", rotation, x) + shift
         rows = np.flatnonzero(~confirmed & (neighbour >= 0) & (there[:, 2] > 0))
         z = there[rows, 2]
@@ -151,7 +151,7 @@ def _is_distinct(
         matches: From `match`: inverse z-depth, best and second-best correlation.
     """
     inverse, correlation, second = matches.T
-    nearest = pictures.most[view, _tiles(pixel / pictures.size[view])]
+    nearest = pictures.max_inverse_depth[view, _tiles(pixel / pictures.size[view])]
     distinct = (correlation > MIN_CORRELATION) & (correlation - second > MIN_MARGIN)
     return distinct & (inverse > 0) & (inverse < nearest)
 

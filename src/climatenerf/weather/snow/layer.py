@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import RadianceField, observed
 from climatenerf.ops.cpu import metaballs
-from climatenerf.ops.cpu.metaballs import THRESHOLD, Lattice
+from climatenerf.ops.cpu.metaballs import Lattice
 from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid, choose_grid, grow
@@ -122,29 +122,6 @@ class BakedSnow:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
         return to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 0]).clamp(min=0)
 
-    def depth_over(self, ground: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Thickness of the snow over points of the ground (m), m; 0 where it is bare."""
-        # From well above the ground the balls can carry, down to just below it.
-        reach = 1.5 * (self.snow.depth or 0.0) + 2 * float(self.lattice.spacing[0])
-        origin = ground + torch.tensor([0.0, 0.0, reach])
-        down = torch.tensor([0.0, 0.0, -1.0]).expand_as(origin)
-        zero = torch.zeros(len(ground))
-        samples = self.march(origin, down, zero, zero + reach)
-        ray = samples.ray_index()
-        depth = (samples.sigma * samples.dt).double()
-        before = torch.cat([depth.new_zeros(1), depth.cumsum(0)])
-        through = before[:-1] - before[samples.offsets[:-1]][ray]
-        weight = torch.exp(-through) * -torch.expm1(-depth)
-        total = torch.zeros(len(ground), dtype=torch.float64).index_add_(0, ray, weight)
-        moment = torch.zeros_like(total).index_add_(0, ray, weight * samples.t)
-        height = reach - moment / total.clamp(min=1e-9)  # no snow: 0 / 0
-        return torch.where(total > 0.5, height, 0.0).float()
-
-    def covered(self, ground: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Whether points of the ground (m) lie under snow."""
-        sums = to_device(metaballs.evaluate(_array(ground), self.lattice)[0])
-        return (sums > THRESHOLD) & (self.density(ground) > 0)
-
 
 def bake_snow(
     field: RadianceField,
@@ -160,7 +137,7 @@ def bake_snow(
     """Let snow fall on a scene. World frame: metres, z up.
 
     Args:
-        field: the fitted field (unstylised), without geometry that cannot be trusted.
+        field: the fitted field (unstylised), without unobserved geometry.
         snow: depth, fall direction, slope, colour.
         cameras: camera positions of the path, m; the snow is finest around them.
         irradiance_over_pi: linear radiance that a white horizontal surface in the open would have.
@@ -205,7 +182,7 @@ class SnowEntity:
             to_numpy(given.irradiance() / math.pi),
             sun_direction(weather.sun),
             weather.seed,
-            progress=lambda share: given.progress("snowfall", share),
+            progress=lambda fraction: given.progress("snowfall", fraction),
             appearance=given.appearance,
         )
 
