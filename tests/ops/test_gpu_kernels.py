@@ -323,9 +323,8 @@ def test_whole_rays_are_what_their_parts_are(generator, monkeypatch, stop, least
     monkeypatch.setattr(gpu_marching, "march", lambda *given: marched.append(given))
     field = field.to(DEVICE)
     field.occupancy.packed = None  # as the other kernels read it
-    with torch.device(DEVICE):
-        given = o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop, thin, photo.to(DEVICE)
-        found = composited(field, *given)
+    given = o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop, thin, photo.to(DEVICE)
+    found = composited(field, *given)
     assert not marched, "one launch"
     for ours, theirs in zip(found, real, strict=True):
         # Where a step ends on a cell's face, rounding may put it on either side.

@@ -85,21 +85,16 @@ class BakedSnow:
         offsets, t, dt, sigma = metaballs.march(
             _array(rays_o), _array(rays_d), _array(t_min), _array(t_max), self.lattice
         )
-        return Samples(
-            to_device(offsets),
-            to_device(t),
-            to_device(dt),
-            to_device(sigma),
-        )
+        return Samples(*(to_device(each, rays_o.device) for each in (offsets, t, dt, sigma)))
 
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Extinction O of the snow at points (m), 1/m."""
-        density = to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 2])
+        density = to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 2], x.device)
         return density if self.floor_z is None else density * (x[:, 2] >= self.floor_z)
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the analytic gradient of the sum; up where there is none."""
-        gradient = to_device(metaballs.evaluate(_array(x), self.lattice)[1])
+        gradient = to_device(metaballs.evaluate(_array(x), self.lattice)[1], x.device)
         return _normal(gradient)
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -111,38 +106,41 @@ class BakedSnow:
         _, gradient, rest = metaballs.evaluate(_array(x), self.lattice)
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
-        facing = _normal(to_device(gradient)) @ torch.tensor(towards, dtype=torch.float32)
+        towards = torch.tensor(towards, dtype=torch.float32, device=x.device)
+        facing = _normal(to_device(gradient, x.device)) @ towards
         # Negative only for a wrap below 1, on the side that faces away.
         wrap = ((facing + self.snow.wrap) / (1 + self.snow.wrap)).clamp(min=0)
-        shade = to_device(rest[:, 1])
-        white = torch.tensor(self.light.irradiance_over_pi, dtype=torch.float32)
+        shade = to_device(rest[:, 1], x.device)
+        white = self.light.irradiance_over_pi
+        white = torch.tensor(white, dtype=torch.float32, device=x.device)
         return (shade * wrap)[:, None] * white
 
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
-        return to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 0]).clamp(min=0)
+        height = metaballs.evaluate(_array(x), self.lattice)[2][:, 0]
+        return to_device(height, x.device).clamp(min=0)
 
     def depth_over(self, ground: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Thickness of the snow over points of the ground (m), m; 0 where it is bare."""
         # From well above the ground the balls can carry, down to just below it.
         reach = 1.5 * (self.snow.depth or 0.0) + 2 * float(self.lattice.spacing[0])
-        origin = ground + torch.tensor([0.0, 0.0, reach])
-        down = torch.tensor([0.0, 0.0, -1.0]).expand_as(origin)
-        zero = torch.zeros(len(ground))
+        origin = ground + torch.tensor([0.0, 0.0, reach], device=ground.device)
+        down = torch.tensor([0.0, 0.0, -1.0], device=ground.device).expand_as(origin)
+        zero = torch.zeros(len(ground), device=ground.device)
         samples = self.march(origin, down, zero, zero + reach)
         ray = samples.ray_index()
         depth = (samples.sigma * samples.dt).double()
         before = torch.cat([depth.new_zeros(1), depth.cumsum(0)])
         through = before[:-1] - before[samples.offsets[:-1]][ray]
         weight = torch.exp(-through) * -torch.expm1(-depth)
-        total = torch.zeros(len(ground), dtype=torch.float64).index_add_(0, ray, weight)
+        total = depth.new_zeros(len(ground)).index_add_(0, ray, weight)
         moment = torch.zeros_like(total).index_add_(0, ray, weight * samples.t)
         height = reach - moment / total.clamp(min=1e-9)  # no snow: 0 / 0
         return torch.where(total > 0.5, height, 0.0).float()
 
     def covered(self, ground: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether points of the ground (m) lie under snow."""
-        sums = to_device(metaballs.evaluate(_array(ground), self.lattice)[0])
+        sums = to_device(metaballs.evaluate(_array(ground), self.lattice)[0], ground.device)
         return (sums > THRESHOLD) & (self.density(ground) > 0)
 
 
@@ -244,7 +242,7 @@ def _array(x: Tensor) -> np.ndarray:
 
 def _normal(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     length = gradient.norm(dim=-1, keepdim=True)
-    up = torch.tensor([0.0, 0.0, 1.0])
+    up = torch.tensor([0.0, 0.0, 1.0], device=gradient.device)
     return torch.where(length > 1e-6, -gradient / length.clamp(min=1e-6), up)
 
 
