@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.classes import SOLID
-from climatenerf.core.device import uniform
+from climatenerf.core.device import CPU, uniform
 from climatenerf.core.samples import Samples
 from climatenerf.core.vectors import unit
 from climatenerf.evaluation.heldout import evaluate
@@ -57,7 +57,9 @@ STEPS = 5  # steps of our kernels per step of a twin
 
 
 def ray_of(offsets: Int[Tensor, "rays+1"]) -> Int[Tensor, "s"]:
-    return torch.repeat_interleave(torch.arange(offsets.shape[0] - 1), offsets.diff())
+    return torch.repeat_interleave(
+        torch.arange(len(offsets) - 1, device=offsets.device), offsets.diff()
+    )
 
 
 def before_each(values: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]) -> Float[Tensor, "s"]:
@@ -147,9 +149,9 @@ def draw_batch(trainer: Trainer, samples: int) -> RayBatch:
     field, rays = trainer.field, 512
     for _ in range(50):  # the number of samples varies per ray, so the target may be missed
         batch = trainer.pixels.draw(rays, trainer.generator)
-        n = batch.rays_o.shape[0]
-        near, far = torch.full((n,), field.near), torch.full((n,), 1e9)
-        jitter = uniform(trainer.generator, n)
+        near = torch.full_like(batch.rays_o[:, 0], field.near)
+        far = torch.full_like(near, 1e9)
+        jitter = uniform(trainer.generator, len(near), device=near.device)
         found = field.march(batch.rays_o, batch.rays_d, near, far, 1.0, jitter, stop=1e-4)
         if 0.9 * samples < found.t.shape[0] < 1.1 * samples or rays > 2**16:
             break
@@ -179,8 +181,9 @@ def loss_of(field: Field, at: RayBatch) -> Float[Tensor, ""]:
     logits, distance = compositing.surface(
         weights.detach(), field.surface_raw(u), density_normal, samples.offsets
     )
-    target = torch.arange(n) % len(SOLID)  # any classes: the cost does not depend on them
-    loss = loss + 4e-2 * losses.class_loss(logits, target, torch.ones(n, dtype=torch.bool))
+    # Any classes: the cost does not depend on them.
+    target = torch.arange(n, device=u.device) % len(SOLID)
+    loss = loss + 4e-2 * losses.class_loss(logits, target, target >= 0)
     return loss + 4e-2 * distance.sum() / n
 
 
@@ -265,11 +268,12 @@ def time_to_psnr(
     downscale: int,
     every: float,
     goals: tuple[int, ...] = GOALS,
+    device: torch.device = CPU,
 ) -> dict[str, object]:
     """Fit a capture; return the seconds to reach each PSNR of `goals` (dB), and the curve."""
     scene = read_scene(capture)
     start = time.perf_counter()
-    trainer = begin(scene, settings, downscale)
+    trainer = begin(scene, settings, downscale, device)
     prepared = time.perf_counter() - start
     curve: list[dict[str, float]] = []
 

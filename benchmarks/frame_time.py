@@ -17,8 +17,10 @@ from typing import Any
 
 import common
 import numpy as np
+import torch
 
 from climatenerf.cli.render import parse_size
+from climatenerf.core.device import CPU
 from climatenerf.field.checkpoint import load_field
 from climatenerf.paths.camera_path import CameraPath, camera_path
 from climatenerf.render.frame import render_frame
@@ -47,10 +49,16 @@ WEATHERS = ("clean", "flood", "smog", "snow")
 
 
 def frames(
-    run: Path, size: str, view: str, repeats: int, seed: int, names: tuple[str, ...] = WEATHERS
+    run: Path,
+    size: str,
+    view: str,
+    repeats: int,
+    seed: int,
+    names: tuple[str, ...] = WEATHERS,
+    device: torch.device = CPU,
 ) -> dict[str, Any]:
     """Time the first frame of the camera path `view` in each weather."""
-    field, scene = load_field(run), load_scene(run)
+    field, scene = load_field(run, device), load_scene(run)
     path = camera_path(view, scene, 1, parse_size(size))
     level = water_level(field, scene, path)
     weathers = {

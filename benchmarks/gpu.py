@@ -27,7 +27,7 @@ from engine import draw_batch, our_step, time_to_psnr, twin_step
 from frame_time import frames
 
 from climatenerf.cli.render import parse_size
-from climatenerf.core.device import on
+from climatenerf.core.device import resolve_device
 from climatenerf.core.errors import UserError
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.compositing import RENDER_STEP, rays_at_once
@@ -42,21 +42,21 @@ GOALS = (20, 22, 24, 25)  # dB
 WEATHERS = ("clean", "flood")
 
 
-def synchronised(job: Callable[[], None], device: str) -> Callable[[], None]:
+def synchronised(job: Callable[[], None], device: torch.device) -> Callable[[], None]:
     """Return the job followed by a synchronisation with the device."""
 
     def run() -> None:
         job()
-        if device == "cuda":
+        if device.type == "cuda":
             torch.cuda.synchronize()
 
     return run
 
 
-def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict[str, Any]:
+def steps(run: Path, samples: int, repeats: int, device: torch.device, seed: int) -> dict[str, Any]:
     """Measure samples per second of a step, ours and eager PyTorch's, on the same rays."""
-    trainer = begin(load_scene(run), FitSettings(seed=seed, multiview_stereo=False), 1)
-    trainer.field = load_field(run).requires_grad_()
+    trainer = begin(load_scene(run), FitSettings(seed=seed, multiview_stereo=False), 1, device)
+    trainer.field = load_field(run, device).requires_grad_()
     at = draw_batch(trainer, samples)
     size, found = at.samples.t.shape[0], {}
     makers = {"ours": our_step, "eager": lambda field, at: twin_step(field, at, False)}
@@ -67,39 +67,42 @@ def steps(run: Path, samples: int, repeats: int, device: str, seed: int) -> dict
     return {"samples": size, **found}
 
 
-def frames_per_s(run: Path, sizes: list[str], view: str, repeats: int, seed: int) -> dict[str, Any]:
+def frames_per_s(
+    run: Path, sizes: list[str], view: str, repeats: int, seed: int, device: torch.device
+) -> dict[str, Any]:
     """Measure frames per second in each size and weather."""
     rows: dict[str, Any] = {}
     for size in sizes:
-        found = frames(run, size, view, repeats, seed, WEATHERS)["frames"]
+        found = frames(run, size, view, repeats, seed, WEATHERS, device)["frames"]
         rows[size] = {
             name: {**found[name], "frames_per_s": 1 / found[name]["seconds"]["median"]}
             for name in WEATHERS
         }
-        count, clean = samples_of_frame(run, size, view), rows[size]["clean"]
+        count, clean = samples_of_frame(run, size, view, device), rows[size]["clean"]
         clean["samples"] = count
         clean["samples_per_s"] = count * clean["frames_per_s"]
     return rows
 
 
-def samples_of_frame(run: Path, size: str, view: str) -> int:
+def samples_of_frame(run: Path, size: str, view: str, device: torch.device) -> int:
     """Count the samples of all rays of a clean frame."""
-    field = load_field(run)
+    field = load_field(run, device)
     path = camera_path(view, load_scene(run), 1, parse_size(size))
-    rays_o, rays_d = camera_rays(path.cameras[0], path.c2w[0])
+    rays_o, rays_d = camera_rays(path.cameras[0], path.c2w[0], device)
     count, chunk = 0, rays_at_once(rays_o)
     for o, d in zip(rays_o.split(chunk), rays_d.split(chunk), strict=True):
-        near = torch.full((o.shape[0],), field.near)
+        near = torch.full_like(o[:, 0], field.near)
         samples = field.march(o, d, near, torch.full_like(near, 1e9), RENDER_STEP)
         count += samples.t.shape[0]
     return count
 
 
 def count_syncs(
-    capture: Path, settings: FitSettings, downscale: int, steps: int = 300
+    capture: Path, settings: FitSettings, downscale: int, device: torch.device, steps: int = 300
 ) -> dict[str, Any]:
     """Count synchronisations with the device per step in the last third of a fit, by line."""
-    trainer = begin(read_scene(capture), replace(settings, minutes=None, steps=steps), downscale)
+    settings = replace(settings, minutes=None, steps=steps)
+    trainer = begin(read_scene(capture), settings, downscale, device)
     ends = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -115,9 +118,9 @@ def count_syncs(
     return {"per_step": (ends[-1] - last_third) / (len(ends) / 3), "lines": dict(common_lines)}
 
 
-def measured(part: Callable[[], Any], device: str) -> dict[str, Any]:
+def measured(part: Callable[[], Any], device: torch.device) -> dict[str, Any]:
     """Run a part; return its results and peak device memory, or its failure."""
-    if device == "cuda":
+    if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
     try:
         found = part()
@@ -125,7 +128,7 @@ def measured(part: Callable[[], Any], device: str) -> dict[str, Any]:
         raise
     except Exception as error:  # too little memory, or a kernel that the driver rejects
         return {"failed": f"{type(error).__name__}: {error}"[:300]}
-    if device == "cuda":
+    if device.type == "cuda":
         found["peak_gb"] = torch.cuda.max_memory_allocated() / 1e9
     return found
 
@@ -145,28 +148,36 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"))
     options = parser.parse_args()
-    device, seed = options.device, options.seed
+    seed = options.seed
+    try:
+        device = resolve_device(options.device)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
     found: dict[str, Any] = {"run": options.run.name, "device": "CPU"}
     parts: dict[str, Callable[[], Any]] = {
         "frames": lambda: frames_per_s(
-            options.run, options.sizes, options.path, options.repeats, seed
+            options.run, options.sizes, options.path, options.repeats, seed, device
         ),
         "step": lambda: steps(options.run, options.samples, options.repeats, device, seed),
     }
     if options.capture:
-        settings = replace(settings_of(options.preset, device), minutes=options.minutes, seed=seed)
-        if device == "cuda":
-            parts["waits"] = lambda: count_syncs(options.capture, settings, options.downscale)
+        settings = replace(
+            settings_of(options.preset, options.device), minutes=options.minutes, seed=seed
+        )
+        if device.type == "cuda":
+            parts["waits"] = lambda: count_syncs(
+                options.capture, settings, options.downscale, device
+            )
         parts["fit"] = lambda: time_to_psnr(
-            options.capture, settings, options.downscale, options.every, GOALS
+            options.capture, settings, options.downscale, options.every, GOALS, device
         )
     try:
-        with on(device):
-            if device == "cuda":
-                found["device"] = torch.cuda.get_device_name()
-                found["cuda"] = torch.version.cuda
-            for name, part in parts.items():
-                found[name] = measured(part, device)
+        if device.type == "cuda":
+            found["device"] = torch.cuda.get_device_name()
+            found["cuda"] = torch.version.cuda
+        for name, part in parts.items():
+            found[name] = measured(part, device)
     except UserError as error:
         print(error, file=sys.stderr)
         sys.exit(2)

@@ -1,4 +1,7 @@
-"""Fits and frames on another device than the CPU: a toy one that computes as the CPU does."""
+"""Fits and frames on another device than the CPU: a toy one that computes as the CPU does.
+
+A tensor that is created on the CPU by mistake raises an error where it meets one of the toy device.
+"""
 
 import contextlib
 from dataclasses import replace
@@ -11,7 +14,8 @@ from support.toy_photos import DISTORTED, pattern, photos
 from support.toy_scene import CAMERA, TINY, make_scene
 
 from climatenerf import cli
-from climatenerf.core.device import check_triton, on, to_numpy
+from climatenerf.api import load_run
+from climatenerf.core.device import CPU, check_triton, resolve_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import read_json
 from climatenerf.field.checkpoint import load_field
@@ -37,10 +41,7 @@ WEATHER = {
 }
 
 
-@contextlib.contextmanager
-def on_toy():
-    with kernels_for_toys(), TOY:
-        yield
+DEVICES = {"cpu": (CPU, contextlib.nullcontext), "toy": (TOY, kernels_for_toys)}
 
 
 def nothing(*_):
@@ -52,8 +53,8 @@ def runs(tmp_path_factory):
     """A run of each device, both stopped and resumed."""
     folder = tmp_path_factory.mktemp("runs")
     scene = make_scene(folder)
-    for name, device in (("cpu", contextlib.nullcontext()), ("toy", on_toy())):
-        with device:
+    for name, (device, kernels) in DEVICES.items():
+        with kernels():
             # Few: sooner or later a rounding decides whether a ray has one sample more, and
             # Adam, whose steps know no size of gradients, makes another fit of it.
             for steps in (12, 24):
@@ -67,14 +68,14 @@ def runs(tmp_path_factory):
                     steps > 12,
                     lambda _: None,
                     lambda *_: None,
+                    device,
                 )
     return scene, folder
 
 
 def test_the_toy_device_refuses_to_meet_the_cpu():
-    with TOY:
-        there = torch.arange(3)
-        assert there.device == TOY and (there + 1).cpu().tolist() == [1, 2, 3]
+    there = torch.arange(3, device=TOY)
+    assert there.device == TOY and (there + 1).cpu().tolist() == [1, 2, 3]
     with pytest.raises(RuntimeError, match="of the CPU"):
         there + torch.ones(3)
 
@@ -99,7 +100,7 @@ def test_a_step_with_every_loss_stays_on_its_device(runs):
     points = np.concatenate([place, np.zeros((200, 1))], axis=1)
     views = [replace(view, seen=np.arange(200)) for view in scene.views]
     scene = replace(scene, views=tuple(views), points=points)
-    with on_toy():
+    with kernels_for_toys():
         train = scene.of_split("train")
         images = [load_image(view, scene) for view in train]
         labels = [np.where(np.arange(36)[:, None] < 12, 10, 9) for _ in train]  # sky over terrain
@@ -107,7 +108,7 @@ def test_a_step_with_every_loss_stays_on_its_device(runs):
         relative = [np.random.default_rng(i).random((36, 48)) for i in range(len(train))]
         poses = np.stack([scene.c2w_world(view) for view in train])
         pixels = TrainingPixels(
-            scene.cameras, [0] * len(train), poses, images, labels, None, relative
+            scene.cameras, [0] * len(train), poses, images, labels, None, relative, TOY
         )
         settings = FitSettings(
             size=TINY,
@@ -118,7 +119,7 @@ def test_a_step_with_every_loss_stays_on_its_device(runs):
             refine_poses=True,
         )
         extent = find_extent(poses, None)
-        trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene))
+        trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene, TOY))
         assert trainer.evidence.knows_sky and trainer.evidence.free_space.ground is not None
         trainer.run(nothing)
         assert trainer.field.embeddings.device == TOY and trainer.poses.shift.device == TOY
@@ -127,12 +128,12 @@ def test_a_step_with_every_loss_stays_on_its_device(runs):
 def test_photos_are_matched_alike_on_both():
     """And what is nearer to cameras than the points so found is the same."""
     grey, found, empty = pattern(), [], []
-    for device in (contextlib.nullcontext(), on_toy()):
-        with device:
-            pixels = photos(DISTORTED, lambda i, t, x: grey(x))
+    for device, kernels in DEVICES.values():
+        with kernels():
+            pixels = photos(DISTORTED, lambda i, t, x: grey(x), device=device)
             matched = plane_sweep_depth(pixels, None, (1.5, 4.0), 0)
             assert matched is not None
-            field = Field(TINY, 5, np.array([0.0, 3.0, 0.0]), 3.0, 0.1)
+            field = Field(TINY, 5, np.array([0.0, 3.0, 0.0]), 3.0, 0.1).to(device)
             carving = FreeSpace(field, pixels, matched, FitSettings())
             place = matched.rays_o + 0.3 * matched.depth[:, None] * matched.rays_d
             before = carving.too_near_camera(place, torch.full_like(matched.depth, 0.01))
@@ -147,9 +148,9 @@ def test_a_frame_in_all_weathers_is_the_same_on_both(runs):
     scene, folder = runs
     pose = scene.c2w_world(scene.views[0])
     frames = []
-    for device in (contextlib.nullcontext(), on_toy()):
-        with device, torch.no_grad():
-            field = load_field(folder / "cpu")
+    for device, kernels in DEVICES.values():
+        with kernels(), torch.no_grad():
+            field = load_field(folder / "cpu", device)
             field.occupancy.seen.fill_(1)
             weather = weather_from_table(WEATHER)
             session = RenderSession(field, scene, weather, pose[None, :3, 3])
@@ -169,6 +170,8 @@ def test_a_gpu_that_is_not_there_is_refused(tmp_path, capsys):
         assert cli.main([*words, "--device", "cuda"]) == 2
         said = capsys.readouterr().err
         assert "NVIDIA GPU" in said and "Traceback" not in said
+    with pytest.raises(UserError, match="NVIDIA GPU"):
+        load_run(tmp_path, device="cuda")
 
 
 def test_what_a_gpu_needs_beside_it_is_asked_for(monkeypatch, tmp_path):
@@ -187,5 +190,5 @@ def test_what_a_gpu_needs_beside_it_is_asked_for(monkeypatch, tmp_path):
         check_triton()
     for version in ("3.3.1", "2.9", "0"):
         monkeypatch.setattr("importlib.metadata.version", lambda name, own=version: own)
-        with pytest.raises(UserError, match=r"needs Triton 3\.4"), on("cuda"):
-            pass
+        with pytest.raises(UserError, match=r"needs Triton 3\.4"):
+            resolve_device("cuda")

@@ -1,4 +1,4 @@
-"""Dependencies point one way: a part imports only the parts of its row, without exemption."""
+"""Dependencies point one way, and every tensor is created on a device that the code names."""
 
 import ast
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import climatenerf
 
 ROOT = Path(climatenerf.__file__).parent
+REPOSITORY = Path(__file__).parents[1]
 BELOW_RENDER = {"climatenerf", "core", "ops", "field", "weather", "scene"}
 BELOW_TRAINING = BELOW_RENDER | {"render", "paths", "evaluation"}
 BELOW_STUDIES = BELOW_TRAINING | {"training", "output"}
@@ -65,3 +66,74 @@ def test_dependencies_have_no_cycle():
         free = [part for part, below in MAY_IMPORT.items() if part not in done and below <= done]
         assert free, set(MAY_IMPORT) - done
         done.update(free)
+
+
+CREATORS = {
+    "Generator",
+    "arange",
+    "as_tensor",
+    "empty",
+    "eye",
+    "full",
+    "linspace",
+    "logspace",
+    "normal",
+    "ones",
+    "rand",
+    "randint",
+    "randn",
+    "randperm",
+    "scalar_tensor",
+    "tensor",
+    "zeros",
+}
+"""Functions of torch that create on the default device unless they are given one."""
+
+
+def torch_name(node: ast.expr) -> str:
+    """The NAME of an expression `torch.NAME`; empty for others."""
+    of_torch = isinstance(node, ast.Attribute) and ast.unparse(node.value) == "torch"
+    return node.attr if of_torch else ""
+
+
+def unnamed_devices(tree: ast.AST) -> set[int]:
+    """The lines of calls that create a tensor without naming its device."""
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    creating = [call for call in calls if torch_name(call.func) in CREATORS]
+    return {c.lineno for c in creating if all(word.arg != "device" for word in c.keywords)}
+
+
+def default_devices(tree: ast.AST) -> set[int]:
+    """The lines that set or ask for torch's default device."""
+    lines = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and node.attr.endswith("et_default_device"):
+            lines.add(node.lineno)
+        if isinstance(node, ast.With):
+            for context in (item.context_expr for item in node.items):
+                if isinstance(context, ast.Call) and torch_name(context.func) == "device":
+                    lines.add(node.lineno)
+                if ast.unparse(context).split(".")[-1] == "device":
+                    lines.add(node.lineno)
+    return lines
+
+
+def test_every_tensor_is_created_on_a_device_that_the_code_names():
+    wrong = []
+    for path in sorted(ROOT.rglob("*.py")):
+        lines = unnamed_devices(ast.parse(path.read_text()))
+        wrong += [f"{path.relative_to(ROOT)}:{line}" for line in sorted(lines)]
+    assert not wrong, wrong
+    given = "torch.zeros(3)\ntorch.zeros(3, device=x.device)\ntorch.zeros_like(x)"
+    assert unnamed_devices(ast.parse(given)) == {1}
+
+
+def test_nothing_depends_on_the_default_device():
+    wrong = []
+    for folder in (ROOT, *(REPOSITORY / name for name in ("tests", "benchmarks", "tools"))):
+        for path in sorted(folder.rglob("*.py")):
+            lines = default_devices(ast.parse(path.read_text()))
+            wrong += [f"{path}:{line}" for line in sorted(lines)]
+    assert not wrong, wrong
+    given = "with torch.device('cuda'): pass\nwith x.device: pass\ntorch.get_default_device()"
+    assert default_devices(ast.parse(given)) == {1, 2, 3}

@@ -143,7 +143,7 @@ def fit(
         UserError: a value is out of range, the folder holds a run (without `resume`) or none (with
             it), or the photos cannot be fitted.
     """
-    from climatenerf.core.device import on
+    from climatenerf.core.device import resolve_device
     from climatenerf.training.run import fit_scene
     from climatenerf.training.settings import Losses, settings_of
 
@@ -161,34 +161,38 @@ def fit(
     )
     scene = scene if isinstance(scene, Scene) else open_scene(scene)
     report = progress or (lambda what, fraction: None)
-    with on(device):
-        fit_scene(
-            scene,
-            Path(folder),
-            settings,
-            downscale,
-            resume,
-            lambda state: report("fit", state.progress),
-            lambda done, total: report("held-out photos", done / total),
-        )
-    return load_run(folder)
+    fit_scene(
+        scene,
+        Path(folder),
+        settings,
+        downscale,
+        resume,
+        lambda state: report("fit", state.progress),
+        lambda done, total: report("held-out photos", done / total),
+        resolve_device(device),
+    )
+    return load_run(folder, device=device)
 
 
-def load_run(folder: PathText) -> Run:
+def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run:
     """Read a run folder that `fit` made.
 
     Args:
         folder: the run folder.
+        device: where the field computes, and what is rendered of it.
 
     Raises:
-        UserError: the folder holds no run, a damaged one, or one of a newer version.
+        UserError: the folder holds no run, a damaged one, or one of a newer version, or the device
+            cannot be used.
     """
+    from climatenerf.core.device import resolve_device
     from climatenerf.field.checkpoint import load_field
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
 
+    where = resolve_device(device)
     folder = Path(folder)
-    field = load_field(folder)
+    field = load_field(folder, where)
     check_config(folder)
     return Run(folder, field, load_scene(folder))
 

@@ -327,9 +327,8 @@ def test_the_fused_kernel_matches_separate_operations(
     monkeypatch.setattr(gpu_marching, "march", lambda *given: marched.append(given))
     field = field.to(DEVICE)
     field.occupancy.packed = None  # pack again for the other backend
-    with torch.device(DEVICE):
-        given = o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop, threshold, photo.to(DEVICE)
-        found = composited(field, *given)
+    given = o.to(DEVICE), d.to(DEVICE), near.to(DEVICE), 4.0, stop, threshold, photo.to(DEVICE)
+    found = composited(field, *given)
     assert not marched, "marching is part of the fused kernel"
     for ours, theirs in zip(found, real, strict=True):
         # Rounding can move a step that ends on a cell face into either cell.

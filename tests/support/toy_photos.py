@@ -3,6 +3,7 @@
 import numpy as np
 
 from climatenerf.core.cameras import Camera
+from climatenerf.core.device import CPU
 from climatenerf.training.dataset import TrainingPixels
 
 PINHOLE = Camera(96, 72, 90.0, 90.0, 48.0, 36.0)
@@ -40,11 +41,11 @@ def wall(camera, pose, tilt=0.3):
     return t, x[..., [0, 2]]
 
 
-def photos(camera, texture, c2w=None, labels=None, masks=None, exposure=lambda i: 1.0):
+def photos(camera, texture, c2w=None, labels=None, masks=None, exposure=lambda i: 1.0, device=CPU):
     """Return training pixels; `texture(i, t, x)` maps ray lengths and plane coordinates to grey."""
     c2w = rows_of_cameras() if c2w is None else c2w
     images = []
     for i, pose in enumerate(c2w):
         grey = texture(i, *wall(camera, pose)) * exposure(i)
         images.append(np.repeat((255 * grey + 0.5).astype(np.uint8)[..., None], 3, -1))
-    return TrainingPixels([camera], [0] * len(c2w), c2w, images, labels, masks)
+    return TrainingPixels([camera], [0] * len(c2w), c2w, images, labels, masks, device=device)

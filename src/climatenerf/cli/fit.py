@@ -122,10 +122,9 @@ def run(options: Fit) -> int:
 def check_device(device: str) -> None:
     """Refuse a device that is absent; torch is imported only for devices other than the CPU."""
     if device != "cpu":
-        from climatenerf.core.device import on
+        from climatenerf.core.device import resolve_device
 
-        with on(device):
-            pass
+        resolve_device(device)
 
 
 def with_perception(scene: Scene, options: Fit) -> Scene:
@@ -230,12 +229,12 @@ def fit_with_bars(scene, options: Fit) -> dict:
         "Preparing: matching photos takes up to half a minute; compiling kernels takes as long,"
         " once per machine"
     )
-    from climatenerf.core.device import on
+    from climatenerf.core.device import resolve_device
     from climatenerf.training.run import fit_scene
     from climatenerf.training.trainer import Report
 
-    settings = fit_settings(options)
-    with on(options.device), progress.Bar("fit", 1.0) as bar:
+    settings, device = fit_settings(options), resolve_device(options.device)
+    with progress.Bar("fit", 1.0) as bar:
         begun = False
 
         def report(state: Report) -> None:
@@ -257,7 +256,14 @@ def fit_with_bars(scene, options: Fit) -> dict:
             bar.update(1.0, {"held-out": f"{done}/{total}"})
 
         return fit_scene(
-            scene, options.out, settings, options.downscale, options.resume, report, evaluated
+            scene,
+            options.out,
+            settings,
+            options.downscale,
+            options.resume,
+            report,
+            evaluated,
+            device,
         )
 
 

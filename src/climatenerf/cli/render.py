@@ -97,12 +97,12 @@ def run(
     for name, absent in without_effect(weather, given, used).items():
         progress.warn(f"--{name} changes nothing without {absent}")
 
-    from climatenerf.api import render_movie
-    from climatenerf.core.device import on
+    from climatenerf.api import load_run, render_movie
 
-    with on(options.device), progress.StageBars() as bars:
+    run = load_run(options.run, device=options.device)
+    with progress.StageBars() as bars:
         made = render_movie(
-            options.run,
+            run,
             options.out,
             weather,
             path=options.path,

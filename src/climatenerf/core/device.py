@@ -1,18 +1,16 @@
-"""The device in use, and transfers to and from it.
+"""The device on which a fit or a render computes, and transfers to and from it.
 
-Work runs on the device of the `with torch.device(...)` block around it (`on`): torch creates new
-tensors there, and `to_device` and `upload` move the rest. A fit draws its random numbers on the
-CPU, except the initial values of networks and the order of occupied cells, so that one seed gives
-much the same fit on every device.
+`resolve_device` turns the user's choice into a device, which goes to what is made first: a field
+that is loaded, the pixels of a fit. All else takes the device of a tensor at hand, so every call
+that creates a tensor names its device. A fit draws its random numbers on the CPU, except the order
+of occupied cells, so that one seed gives much the same fit on every device.
 """
 
-import contextlib
 import importlib.metadata
 import os
 import re
 import shutil
 import sysconfig
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +21,12 @@ from torch import Tensor
 from climatenerf.core.errors import UserError
 
 MIN_TRITON = (3, 4)  # the first version that compiles these kernels; PyTorch 2.8 includes it
+CPU = torch.device("cpu")
 
 
-def to_device(array: np.ndarray) -> Tensor:
-    """Return an array as a tensor on the device in use; on a CPU it shares the array's memory."""
-    return torch.from_numpy(array).to(torch.get_default_device())
+def to_device(array: np.ndarray, device: torch.device) -> Tensor:
+    """Return an array as a tensor on a device; on a CPU it shares the array's memory."""
+    return torch.from_numpy(array).to(device)
 
 
 def to_numpy(tensor: Tensor) -> np.ndarray:
@@ -35,23 +34,24 @@ def to_numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy()
 
 
-def upload(tensor: Tensor) -> Tensor:
-    """Copy a tensor of the CPU to the device in use; to a GPU without waiting for the copy."""
-    device = torch.get_default_device()
+def upload(tensor: Tensor, device: torch.device) -> Tensor:
+    """Copy a tensor of the CPU to a device; to a GPU without waiting for the copy."""
     if device.type != "cuda":
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-def uniform(generator: torch.Generator, *shape: int) -> Float[Tensor, "..."]:
-    """Return random numbers in [0,1) on the device in use, drawn on the CPU."""
-    return upload(torch.rand(shape, generator=generator, device="cpu"))
+def uniform(generator: torch.Generator, *shape: int, device: torch.device) -> Float[Tensor, "..."]:
+    """Return random numbers in [0,1) on a device, drawn on the CPU."""
+    return upload(torch.rand(shape, generator=generator, device="cpu"), device)
 
 
-def integers(generator: torch.Generator, low: int, high: int, *shape: int) -> Int[Tensor, "..."]:
-    """Return random integers from low to high - 1 on the device in use, drawn on the CPU."""
+def integers(
+    generator: torch.Generator, low: int, high: int, *shape: int, device: torch.device
+) -> Int[Tensor, "..."]:
+    """Return random integers from low to high - 1 on a device, drawn on the CPU."""
     drawn = torch.randint(low, high, shape, generator=generator, device="cpu")
-    return upload(drawn)
+    return upload(drawn, device)
 
 
 def check_triton() -> None:
@@ -79,21 +79,18 @@ def check_triton() -> None:
         )
 
 
-@contextlib.contextmanager
-def on(device: str) -> Iterator[None]:
-    """Make `device`, "cpu" or "cuda", the default device of torch within the block.
+def resolve_device(name: str) -> torch.device:
+    """Return the device of a name, "cpu" or "cuda", after a check that it can be used.
 
     Raises:
         UserError: there is no such device, or something that its kernels need is missing.
     """
-    if device == "cpu":
-        yield
-        return
+    if name == "cpu":
+        return CPU
     if not torch.cuda.is_available():
         raise UserError(
             "PyTorch finds no NVIDIA GPU; install the card's driver and PyTorch with CUDA, or leave"
             " --device out"
         )
     check_triton()
-    with torch.device(device):
-        yield
+    return torch.device(name)

@@ -29,5 +29,5 @@ def nearby_appearance(
     length = np.linalg.norm(photos[:, :3, 3] - c2w[:3, 3], axis=-1) / field.unit
     # 1e-3: at the pose of a photo the distance is 0, and the weight would be 1/0.
     weight = (1e-3 + np.hypot(angle, length)) ** -POWER
-    weight = to_device((weight / weight.sum()).astype(np.float32))
+    weight = to_device((weight / weight.sum()).astype(np.float32), field.embeddings.device)
     return (weight @ field.embeddings)[None].detach()

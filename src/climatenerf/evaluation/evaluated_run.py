@@ -12,7 +12,7 @@ from climatenerf.core.srgb import to_display
 from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, world_rays
 from climatenerf.field.compositing import RENDER_STEP
-from climatenerf.field.protocol import RadianceField
+from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.ops import compositing
 from climatenerf.render.frame import FrameOptions, see_frame
 from climatenerf.render.session import RenderSession
@@ -117,7 +117,7 @@ def transmittance_to(
     t_max: Float[torch.Tensor, "n"],
 ) -> Float[torch.Tensor, "n"]:
     """Return the transmittance of each pixel's ray up to a ray length, m."""
-    rays_o, rays_d = camera_rays(camera, c2w)
+    rays_o, rays_d = camera_rays(camera, c2w, t_max.device)
     start = torch.full_like(t_max, field.near)
     samples = field.march(rays_o, rays_d, start, t_max.clamp_min(field.near), RENDER_STEP)
     return compositing.render_weights(samples.sigma * samples.dt, samples.offsets)[1]
@@ -132,8 +132,8 @@ def depth_spread(
     0 is a sharp surface. Haze around a surface does not change the depth, but it attenuates snow
     and smog. Pixels with an opacity up to 0.5 give NaN.
     """
-    rays_o, rays_d = camera_rays(camera, c2w)
-    near = torch.full((rays_o.shape[0],), field.near)
+    rays_o, rays_d = camera_rays(camera, c2w, device_of(field))
+    near = torch.full((rays_o.shape[0],), field.near, device=rays_o.device)
     samples = field.march(rays_o, rays_d, near, torch.full_like(near, ENDLESS), RENDER_STEP)
     weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     # 1e-6: rays that meet no density, 0/0.

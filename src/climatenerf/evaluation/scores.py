@@ -36,6 +36,7 @@ from climatenerf.evaluation.metrics import psnr, ssim
 from climatenerf.evaluation.reference import Truth, WeatherTruth
 from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.compositing import RENDER_STEP
+from climatenerf.field.protocol import device_of
 from climatenerf.ops import compositing
 from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import see_frame
@@ -159,8 +160,10 @@ def open_sky(run: EvaluatedRun) -> float:
     points = c2w[:3, 3] + frame_scores(run)["scale"] * local @ c2w[:3, :3].T
     rays_o = torch.from_numpy(points.astype(np.float32))
     rays_o[:, 2] += START_HEIGHT
-    up = torch.tensor([0.0, 0.0, 1.0]).expand(len(ground), 3).contiguous()
-    start, end = torch.zeros(len(ground)), torch.full((len(ground),), ENDLESS)
+    up = torch.zeros_like(rays_o)
+    up[:, 2] = 1.0
+    start = torch.zeros_like(rays_o[:, 0])
+    end = torch.full_like(start, ENDLESS)
     samples = run.field.march(rays_o, up, start, end, RENDER_STEP, pruning_threshold=MIN_TAU)
     _, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     return float(transmittance.mean())
@@ -172,7 +175,7 @@ def label_scores(run: EvaluatedRun) -> dict[str, float]:
         return {"miou": float("nan")}
     labels = []
     for truth in run.reference.truths:
-        _, label = see_surface(run.field, *camera_rays(*run.camera(truth)))
+        _, label = see_surface(run.field, *camera_rays(*run.camera(truth), device_of(run.field)))
         labels.append(label.view(truth.depth.shape).numpy())
     return geometry.label_scores(labels, run.reference.truths)
 

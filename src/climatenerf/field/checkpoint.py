@@ -5,8 +5,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from climatenerf.core.device import to_device
+from climatenerf.core.device import CPU, to_device
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU
 from climatenerf.core.storage import check_schema, read_safetensors, write_safetensors
@@ -31,8 +32,12 @@ def save_field(field: Field, run: Path) -> None:
     write_safetensors(run / FILE_NAME, tensors, {"climatenerf": json.dumps(about)})
 
 
-def load_field(run: Path) -> Field:
+def load_field(run: Path, device: torch.device = CPU) -> Field:
     """Read the field of a run folder.
+
+    Args:
+        run: the run folder.
+        device: where the field computes.
 
     Raises:
         UserError: there is none, it is damaged, or a newer version of the program wrote it.
@@ -60,7 +65,7 @@ def load_field(run: Path) -> Field:
         )
         field.pruning_threshold = float(threshold)
         field.occupancy = Occupancy(size.cascades, arrays["occupancy.density"].shape[1])
-        tensors = {k: to_device(v) for k, v in arrays.items()}
+        tensors = {k: to_device(v, CPU) for k, v in arrays.items()}
         if about["schema_version"] == 1:  # without a surface head: keep the untrained one
             fresh = field.state_dict()
             tensors |= {k: fresh[k] for k in fresh if k.startswith(("surface_", "learned"))}
@@ -69,4 +74,4 @@ def load_field(run: Path) -> Field:
         raise UserError(
             f"{path} is damaged ({type(error).__name__}: {error}); fit the scene again"
         ) from error
-    return field.eval().requires_grad_(False)
+    return field.to(device).eval().requires_grad_(False)

@@ -52,7 +52,7 @@ class Field(nn.Module):
         near: float = 0.0,
         generator: torch.Generator | None = None,
     ):
-        """Make an untrained field.
+        """Make an untrained field on the CPU; `.to(device)` moves it.
 
         Args:
             size: sizes of grids and networks.
@@ -68,7 +68,7 @@ class Field(nn.Module):
         self.near = near
         self.pruning_threshold = MIN_TAU
         """Optical depth below which a sample of a camera ray counts as empty; a fit raises it."""
-        self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32))
+        self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32, device="cpu"))
         self.register_buffer(
             "geometry_resolutions",
             level_resolutions(size.coarsest, size.geometry_finest, size.geometry_levels),
@@ -108,9 +108,9 @@ class Field(nn.Module):
         )
         inputs = 16 + 2 * size.sky_levels + size.embedding
         self.sky_net = dense_layers(generator, inputs, size.sky_hidden, size.sky_hidden, 3)
-        self.embeddings = nn.Parameter(torch.zeros(images, size.embedding))
+        self.embeddings = nn.Parameter(torch.zeros(images, size.embedding, device="cpu"))
         # Whether the normals and the classes of the surface head were trained.
-        self.register_buffer("learned", torch.zeros(2, dtype=torch.bool))
+        self.register_buffer("learned", torch.zeros(2, dtype=torch.bool, device="cpu"))
         # Coarse at first; `Occupancy.refine` halves the cells later.
         self.occupancy = Occupancy(size.cascades, size.occupancy_side // 2)
 
@@ -268,7 +268,7 @@ class Field(nn.Module):
 
         Four densities at the corners of a tetrahedron give the slope. q and step: grid units.
         """
-        k = torch.arange(4)
+        k = torch.arange(4, device=q.device)
         x, y = 1.0 - 2.0 * (k // 2), 1.0 - 2.0 * (k % 2)
         corners = torch.stack([x, y, x * y], dim=-1)
         around = q[:, None] + step[:, None, None] * corners
@@ -384,7 +384,7 @@ class Field(nn.Module):
         The colour depends on the position; `ids` is not used.
         """
         u = reference.contract(self.to_grid(x))
-        rows = torch.arange(x.shape[0]) if ray is None else ray
+        rows = torch.arange(x.shape[0], device=x.device) if ray is None else ray
         return self.colour_at(u, rows, d, self._appearance(appearance, d.shape[0]))
 
     @torch.no_grad()

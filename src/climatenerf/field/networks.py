@@ -1,4 +1,7 @@
-"""Initial values of hash grids and of their fully connected networks."""
+"""Initial values of hash grids and of their fully connected networks.
+
+They are made on the CPU, so that a seed gives the same values on every device.
+"""
 
 import math
 
@@ -10,18 +13,16 @@ from torch import Tensor, nn
 def level_resolutions(coarsest: int, finest: int, levels: int) -> Int[Tensor, "levels"]:
     """Return the cells per side of each level, in geometric progression."""
     growth = math.log(finest / coarsest) / max(levels - 1, 1)
-    return torch.tensor([int(coarsest * math.exp(growth * i) + 1e-6) for i in range(levels)])
+    sides = [int(coarsest * math.exp(growth * i) + 1e-6) for i in range(levels)]
+    return torch.tensor(sides, device="cpu")
 
 
 def uniform_parameter(
     shape: tuple[int, ...], bound: float, generator: torch.Generator | None
 ) -> nn.Parameter:
-    """Return a parameter drawn from (-bound, bound).
-
-    It is drawn on the CPU, so that a seed gives the same values on every device.
-    """
+    """Return a parameter drawn from (-bound, bound)."""
     drawn = torch.empty(shape, device="cpu").uniform_(-bound, bound, generator=generator)
-    return nn.Parameter(drawn.to(torch.get_default_device()))
+    return nn.Parameter(drawn)
 
 
 def dense_layers(generator: torch.Generator | None, *widths: int) -> nn.ParameterList:
@@ -29,7 +30,7 @@ def dense_layers(generator: torch.Generator | None, *widths: int) -> nn.Paramete
     parameters = []
     for i, o in zip(widths[:-1], widths[1:], strict=True):
         parameters += [uniform_parameter((i, o), math.sqrt(6.0 / i), generator)]
-        parameters += [nn.Parameter(torch.zeros(o))]
+        parameters += [nn.Parameter(torch.zeros(o, device="cpu"))]
     return nn.ParameterList(parameters)
 
 

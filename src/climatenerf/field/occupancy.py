@@ -34,12 +34,13 @@ class Occupancy(torch.nn.Module):
     """Cells that the photos show to be empty and that never become occupied; not stored."""
 
     def __init__(self, cascades: int, side: int):
+        """Make cells that are all occupied, on the CPU; `.to(device)` moves them."""
         super().__init__()
         shape = (cascades, side, side, side)
-        self.register_buffer("density", torch.zeros(shape))
-        self.register_buffer("occupied", torch.ones(shape, dtype=torch.uint8))
-        self.register_buffer("seen", torch.zeros(shape, dtype=torch.uint8))
-        forced_empty = torch.zeros(shape, dtype=torch.bool)
+        self.register_buffer("density", torch.zeros(shape, device="cpu"))
+        self.register_buffer("occupied", torch.ones(shape, dtype=torch.uint8, device="cpu"))
+        self.register_buffer("seen", torch.zeros(shape, dtype=torch.uint8, device="cpu"))
+        forced_empty = torch.zeros(shape, dtype=torch.bool, device="cpu")
         self.register_buffer("forced_empty", forced_empty, persistent=False)
         self.packed: tuple[Tensor, int, marching.Cells] | None = None
 
@@ -108,7 +109,7 @@ class Occupancy(torch.nn.Module):
 
     def observed_only(self) -> "Occupancy":
         """Return an occupancy of the occupied cells that were seen or touch a seen cell."""
-        observed = Occupancy(self.cascades, self.side)
+        observed = Occupancy(self.cascades, self.side).to(self.density.device)
         observed.occupied = self.occupied * dilated(self.seen).to(torch.uint8)
         return observed
 
@@ -126,7 +127,7 @@ class Occupancy(torch.nn.Module):
         total = self.density.numel()
         flat, occupied = self.density.view(-1), self.occupied.view(-1)
         if fraction >= 1:
-            cells = torch.arange(total)
+            cells = torch.arange(total, device=flat.device)
         else:
             # Half anywhere, half occupied ones out of a larger sample: a list of all occupied
             # cells would cost more than evaluating these.
@@ -136,10 +137,11 @@ class Occupancy(torch.nn.Module):
             selected = (self._occupied_of_static if sampled.is_cuda else self._occupied_of)(
                 sampled, count
             )
-            half = integers(generator, 0, max(1, selected.shape[0]), selected.shape[0] // 2)
+            found = selected.shape[0]
+            half = integers(generator, 0, max(1, found), found // 2, device=flat.device)
             cells = torch.cat([anywhere, selected, self._neighbours(selected[half], generator)])
         centre, size = self.cell_centres(cells)
-        offset = uniform(generator, *centre.shape) - 0.5
+        offset = uniform(generator, *centre.shape, device=centre.device) - 0.5
         evaluated = density_at(centre + offset * size[:, None])
         flat[cells] = torch.maximum(flat[cells] * decay, evaluated)
         if fraction >= 1:
@@ -169,14 +171,15 @@ class Occupancy(torch.nn.Module):
 
         Ascending order: random access to hundreds of megabytes misses the cache nearly each time.
         """
-        total = self.density.numel()
+        total, device = self.density.numel(), self.density.device
         step = max(1, total // count)
-        return torch.arange(0, total - step + 1, step) + integers(generator, 0, step, 1)
+        first = integers(generator, 0, step, 1, device=device)
+        return torch.arange(0, total - step + 1, step, device=device) + first
 
     def _neighbours(self, cells: Int[Tensor, "n"], generator: torch.Generator) -> Int[Tensor, "n"]:
         """Return a random neighbour of each cell: holes in surfaces lie next to occupied cells."""
         side = self.side
-        shift = integers(generator, -1, 2, 3, cells.shape[0])
+        shift = integers(generator, -1, 2, 3, cells.shape[0], device=cells.device)
         index = [cells // side**2 % side, cells // side % side, cells % side]
         x, y, z = ((i + s).clamp(0, side - 1) for i, s in zip(index, shift, strict=True))
         return ((cells // side**3 * side + x) * side + y) * side + z
@@ -189,13 +192,14 @@ class Occupancy(torch.nn.Module):
         """
         cascade = cells // self.side**3
         depth = self.density.view(-1)[cells] * 2.0 ** (cascade + 1) / self.side
-        total = torch.zeros(self.cascades).index_add(0, cascade, depth)
-        number = torch.zeros(self.cascades).index_add(0, cascade, torch.ones_like(depth))
+        zeros = depth.new_zeros(self.cascades)
+        total = zeros.index_add(0, cascade, depth)
+        number = zeros.index_add(0, cascade, torch.ones_like(depth))
         return (total / number.clamp_min(1)).clamp_max(MAX_THRESHOLD)
 
     def _apply_threshold(self) -> None:
         """Decide for every cell whether it is occupied."""
-        cascades = torch.arange(self.cascades)
+        cascades = torch.arange(self.cascades, device=self.density.device)
         depth = self.density * (2.0 ** (cascades + 1) / self.side)[:, None, None, None]
         threshold = depth.mean((1, 2, 3), keepdim=True).clamp_max(MAX_THRESHOLD)
         self.occupied = ((depth > threshold) & ~self.forced_empty).to(torch.uint8)

@@ -2,11 +2,13 @@
 
 Renderer, weather and scores use this protocol alone and never ask for a field's class. A field
 states in `capabilities` which of the optional methods it answers; whoever needs one checks that
-first. Lengths are world metres, radiance is linear, and no method computes gradients.
+first. Lengths are world metres, radiance is linear, and no method computes gradients. A field
+computes on one device, that of its bounds; rays come and results leave on it.
 """
 
 from typing import Protocol
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -128,6 +130,11 @@ class RadianceField(Protocol):
 def observed(field: RadianceField) -> RadianceField:
     """The field without density that no photo shows, if it can leave that out; else the field."""
     return field.observed_only() if OBSERVED in field.capabilities else field
+
+
+def device_of(field: RadianceField) -> torch.device:
+    """The device on which a field computes: that of its bounds."""
+    return field.bounds[0].device
 
 
 def require(field: RadianceField, needs: frozenset[str], what: str) -> None:

@@ -113,8 +113,8 @@ class Sampler:
         self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"], min_weight: float = 0.02
     ) -> None:
         """Mark the cells that training rays (world m) see: samples of at least `min_weight`."""
-        n = rays_o.shape[0]
-        samples = self.march(rays_o, rays_d, torch.full((n,), self.near), torch.full((n,), 1e9))
+        near = torch.full_like(rays_o[:, 0], self.near)
+        samples = self.march(rays_o, rays_d, near, torch.full_like(near, 1e9))
         weights, _ = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
         keep = (weights > min_weight).nonzero()[:, 0]
         ray = samples.ray_index()[keep]

@@ -49,7 +49,8 @@ def metaball_sums(
     Returns:
         s and the means, which are 0 where no vertex within the support is filled.
     """
-    axes = [origin[i] + spacing * torch.arange(n).to(points) for i, n in enumerate(fractions.shape)]
+    steps = [torch.arange(n, dtype=points.dtype, device=points.device) for n in fractions.shape]
+    axes = [origin[i] + spacing * each for i, each in enumerate(steps)]
     vertices = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     # Squared distances: the root's gradient at 0 would be NaN.
     squared = ((points[:, None] - vertices) ** 2).sum(-1)

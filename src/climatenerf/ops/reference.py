@@ -192,7 +192,7 @@ def march(
             t, end = max(t, near_face), min(end, far_face)
     t += jitter * max(steps[0], steps[1] * t)
     samples, tau = [], 0.0
-    while t < end and tau < -torch.log(torch.tensor(stop)).item():
+    while t < end and tau < -torch.log(torch.tensor(stop, device="cpu")).item():
         dt = min(max(steps[0], steps[1] * t), end - t)
         middle = t + dt / 2
         q = ray_o + middle * ray_d
@@ -229,8 +229,8 @@ def merge_order(
     """Return the order that merges two packed lists of samples by t, and the merged offsets."""
     order = []
     for r in range(offsets_a.shape[0] - 1):
-        a = torch.arange(int(offsets_a[r]), int(offsets_a[r + 1]))
-        b = torch.arange(int(offsets_b[r]), int(offsets_b[r + 1]))
+        a = torch.arange(int(offsets_a[r]), int(offsets_a[r + 1]), device=t_a.device)
+        b = torch.arange(int(offsets_b[r]), int(offsets_b[r + 1]), device=t_b.device)
         t = torch.cat([t_a[a], t_b[b]])
         order.append(torch.cat([a, b + t_a.shape[0]])[torch.argsort(t, stable=True)])
     return torch.cat(order), offsets_a + offsets_b

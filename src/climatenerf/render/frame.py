@@ -10,10 +10,10 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
-from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.core.layer_table import Layer
 from climatenerf.field.capabilities import CLASSES, NORMALS
-from climatenerf.field.protocol import RadianceField
+from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
@@ -55,19 +55,21 @@ def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> Picture:
 
 
 def traced_rays(
-    camera: Camera, c2w: Float[np.ndarray, "4 4"]
+    camera: Camera, c2w: Float[np.ndarray, "4 4"], device: torch.device = CPU
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """The arguments of `trace` for a camera's pixels (c2w: world m), row by row.
+    """The arguments of `trace` for a camera's pixels (c2w: world m), row by row, on `device`.
 
     Returns:
         Origins (world m), unit directions, the angle that each pixel spans, and the angle that
         rotates its glossy sample set (both rad).
     """
-    rays_o, rays_d = camera_rays(camera, c2w)
+    rays_o, rays_d = camera_rays(camera, c2w, device)
     # Side of the solid angle at the image centre; towards the corners pixels span a little less.
-    angle = torch.full((rays_o.shape[0],), 1.0 / camera.fx)
+    angle = torch.full((rays_o.shape[0],), 1.0 / camera.fx, device=device)
     row, column = torch.meshgrid(
-        torch.arange(camera.height), torch.arange(camera.width), indexing="ij"
+        torch.arange(camera.height, device=device),
+        torch.arange(camera.width, device=device),
+        indexing="ij",
     )
     rotation = pixel_rotation(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
     return rays_o, rays_d, angle, rotation
@@ -94,7 +96,7 @@ def see_frame(
     options = options or FrameOptions()
     height, width, fine = camera.height, camera.width, options.supersample
     fine_camera = camera.resized(width * fine, height * fine)
-    rays = traced_rays(fine_camera, c2w)
+    rays = traced_rays(fine_camera, c2w, device_of(world.field))
     shape = (height, fine, width, fine)
 
     def averaged(rgb: Tensor) -> Float[Tensor, "h w 3"]:
@@ -139,8 +141,9 @@ def _surface(
     """Learned normals and classes for a picture's rays; None for those that were not learned."""
     if not field.capabilities & {NORMALS, CLASSES}:
         return None, None
-    rays_d = to_device(directions.reshape(-1, 3))
-    origin = to_device(np.asarray(eye, np.float32)).expand(rays_d.shape[0], 3)
+    device = device_of(field)
+    rays_d = to_device(directions.reshape(-1, 3), device)
+    origin = to_device(np.asarray(eye, np.float32), device).expand(rays_d.shape[0], 3)
     normal, label = see_surface(field, origin, rays_d, cancelled)
     return (
         to_numpy(normal.view(directions.shape)) if NORMALS in field.capabilities else None,

@@ -36,7 +36,8 @@ def see_surface(
     normals, labels = [], []
     for chunk in chunks(rays_o, Checkpoints(cancelled)):
         o, d = rays_o[chunk], rays_d[chunk]
-        near, far = torch.full((len(o),), field.near), torch.full((len(o),), 1e9)
+        near = torch.full((len(o),), field.near, device=o.device)
+        far = torch.full_like(near, 1e9)
         samples = field.march(o, d, near, far, RENDER_STEP)
         weights, transmittance = compositing.render_weights(
             samples.sigma * samples.dt, samples.offsets
@@ -50,6 +51,6 @@ def see_surface(
         away = (mean * d).sum(-1, keepdim=True) > 0
         normals.append(torch.where(away, -mean, mean))
         best = compositing.accumulate(weights, logits, offsets).argmax(-1)
-        kind = to_device(SOLID)[best].to(torch.uint8)
+        kind = to_device(SOLID, best.device)[best].to(torch.uint8)
         labels.append(torch.where(solid, kind, torch.full_like(kind, SKY)))
     return torch.cat(normals), torch.cat(labels)

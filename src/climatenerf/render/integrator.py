@@ -84,12 +84,12 @@ def _trace(
     checkpoint: Checkpoints = NEVER,
 ) -> RenderOutput:
     """See `trace`; at most `bounces` more hits on surfaces."""
-    n = rays_o.shape[0]
+    n, device = rays_o.shape[0], rays_o.device
     surfaces = world.surfaces if bounces > 0 else ()
     step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
     if not world.media and not world.matters:
         # Most reflected rays rise, and see what they would without weather.
-        meets = torch.zeros(n, dtype=torch.bool)
+        meets = torch.zeros(n, dtype=torch.bool, device=device)
         for surface in surfaces:
             meets |= (surface.distance(rays_o, rays_d) < torch.inf) | surface.inside(rays_o)
         if not bool(meets.all()):
@@ -108,8 +108,8 @@ def _trace(
     checkpoint()
 
     # --- Which fraction of the light comes from behind a surface? ---------------------------------
-    t_surface = torch.full((n,), torch.inf)
-    nearest = torch.full((n,), -1)
+    t_surface = torch.full((n,), torch.inf, device=device)
+    nearest = torch.full((n,), -1, device=device)
     for index, surface in enumerate(surfaces):
         t = surface.distance(rays_o, rays_d)
         nearest = torch.where(t < t_surface, index, nearest)
@@ -133,7 +133,7 @@ def _trace(
     rgb = compositing.accumulate(front[keep], colour, offsets)
 
     # --- Sky ----------------------------------------------------------------------------------
-    endless = torch.full((n,), torch.inf)
+    endless = torch.full((n,), torch.inf, device=device)
     skyward = (sky_weight > MIN_WEIGHT).nonzero()[:, 0]
     sky = world.field.sky(rays_d[skyward], world.appearance)
     sky = arrive(sky, skyward, endless[skyward])
@@ -141,8 +141,8 @@ def _trace(
 
     checkpoint()
     # --- Surfaces -----------------------------------------------------------------------------
-    layers = {name: torch.zeros(n) for name in world.layer_names}
-    normal = torch.tensor([0.0, 0.0, 1.0]).expand(n, 3)
+    layers = {name: torch.zeros(n, device=device) for name in world.layer_names}
+    normal = torch.tensor([0.0, 0.0, 1.0], device=device).expand(n, 3)
     t_bottom = None
     for index, surface in enumerate(surfaces):
         own_weight = torch.where(nearest == index, surface_weight, 0.0)
@@ -180,7 +180,7 @@ def _radiance(
     pixel_angle: Float[Tensor, "n"],
 ) -> Float[Tensor, "n 3"]:
     """Radiance along secondary rays, for surfaces."""
-    start = torch.zeros(rays_o.shape[0])
+    start = torch.zeros(rays_o.shape[0], device=rays_o.device)
     checkpoint()
     rgb = _trace(world, rays_o, rays_d, pixel_angle, None, start, bounces, checkpoint).rgb
     checkpoint()
@@ -189,7 +189,7 @@ def _radiance(
 
 def _radiance_alone(rgb: Float[Tensor, "n 3"]) -> RenderOutput:
     """Output of secondary rays, of which only the radiance is used."""
-    nothing = torch.zeros(rgb.shape[0])
+    nothing = torch.zeros(rgb.shape[0], device=rgb.device)
     return RenderOutput(rgb, nothing, torch.zeros_like(rgb), nothing)
 
 
@@ -197,7 +197,6 @@ def _trace_field(
     world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, bounces: int
 ) -> RenderOutput:
     """What rays see of the scene without weather: as `_trace`, in one launch on a GPU."""
-    n = t_min.shape[0]
     step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
     rgb, transmittance, length = composited(
         world.field, rays_o, rays_d, t_min, step_scale, appearance=world.appearance
@@ -208,12 +207,12 @@ def _trace_field(
     if bounces < BOUNCES:
         return _radiance_alone(rgb)
     depth = length / (1 - transmittance).clamp_min(TINY)
-    nothing = torch.zeros(n)
+    nothing = torch.zeros_like(depth)
     return RenderOutput(
         rgb,
         torch.where(transmittance < SKY_OPACITY, depth, torch.full_like(depth, torch.inf)),
-        torch.zeros(n, 3),
-        torch.ones(n),
+        torch.zeros_like(rgb),
+        torch.ones_like(depth),
         dict.fromkeys(world.layer_names, nothing),
     )
 
@@ -224,7 +223,7 @@ def _all_samples(
     """Samples of field and matter, merged, and the kind of each: 0 field, k the k-th matter."""
     endless = torch.full_like(t_min, 1e9)
     merged = world.field.march(rays_o, rays_d, t_min, endless, step_scale)
-    kind = torch.zeros(merged.t.shape[0], dtype=torch.long)
+    kind = torch.zeros_like(merged.t, dtype=torch.long)
     for index, matter in enumerate(world.matters, start=1):
         own = matter.march(rays_o, rays_d, t_min, _opaque_from(merged))
         order, offsets = compositing.merge_order(merged.t, merged.offsets, own.t, own.offsets)
@@ -235,7 +234,7 @@ def _all_samples(
         ids = merged.ids
         if ids is not None:
             ids = torch.cat([ids, ids.new_full(own.t.shape, -1)])[order]
-        kind = torch.cat([kind, torch.full((own.t.shape[0],), index)])[order]
+        kind = torch.cat([kind, torch.full_like(own.t, index, dtype=torch.long)])[order]
         merged = Samples(offsets, **both, ids=ids)
     return merged, kind
 
@@ -265,7 +264,7 @@ def _sample_colour(
     ids = None if samples.ids is None else samples.ids[keep]
     if not world.matters:
         return world.field.colour(x, rays_d, ray[keep], ids=ids, appearance=world.appearance)
-    colour = torch.empty(keep.shape[0], 3)
+    colour = torch.empty(keep.shape[0], 3, device=x.device)
     for index, matter in enumerate(world.matters, start=1):
         mine = kind[keep] == index
         colour[mine] = matter.colour(x[mine])

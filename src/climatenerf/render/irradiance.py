@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.colour import luma
-from climatenerf.field.protocol import RadianceField
+from climatenerf.core.device import to_device
+from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.render.integrator import trace
 from climatenerf.render.volume import camera_rays
 from climatenerf.scene.scene import Scene, View
@@ -39,12 +40,14 @@ def scene_irradiance(
     """
     views = scene.of_split("train")
     chosen = views[:: max(1, len(views) // CAMERAS)][:CAMERAS]
-    up = _cosine_directions(DIRECTIONS)
-    eyes = torch.tensor(np.stack([scene.c2w_world(view)[:3, 3] for view in chosen])).float()
+    device = device_of(field)
+    up = _cosine_directions(DIRECTIONS, device)
+    eyes = np.stack([scene.c2w_world(view)[:3, 3] for view in chosen])
+    eyes = to_device(eyes, device).float()
     world = World(field, appearance=appearance)
     above = _radiance(world, eyes.repeat_interleave(DIRECTIONS, 0), up.repeat(len(chosen), 1))
     above = above.mean(0)
-    ground_o, ground_d = _photographed_ground(scene, chosen)
+    ground_o, ground_d = _photographed_ground(scene, chosen, device)
     if not ground_d.shape[0]:
         return math.pi * above / luma(above).clamp_min(1.0)
     lit = luma(_radiance(world, ground_o, ground_d)).mean() / GROUND_ALBEDO
@@ -57,24 +60,27 @@ def scene_irradiance(
 
 
 def _radiance(world: World, o: Tensor, d: Tensor) -> Float[Tensor, "n 3"]:
-    return trace(world, o, d, torch.full((o.shape[0],), 0.05)).rgb
+    return trace(world, o, d, torch.full((o.shape[0],), 0.05, device=o.device)).rgb
 
 
-def _photographed_ground(scene: Scene, views: tuple[View, ...]) -> tuple[Tensor, Tensor]:
+def _photographed_ground(
+    scene: Scene, views: tuple[View, ...], device: torch.device
+) -> tuple[Tensor, Tensor]:
     """Origins (m) and unit directions of a coarse grid of the views' pixels that look down."""
-    origins, directions = [torch.empty(0, 3)], [torch.empty(0, 3)]
+    nothing = torch.empty(0, 3, device=device)
+    origins, directions = [nothing], [nothing]
     for view in views:
         camera = scene.cameras[view.camera]
         small = camera.resized(16, max(1, round(16 * camera.height / camera.width)))
-        o, d = camera_rays(small, scene.c2w_world(view))
+        o, d = camera_rays(small, scene.c2w_world(view), device)
         down = d[:, 2] < MAX_DZ
         origins.append(o[down])
         directions.append(d[down])
     return torch.cat(origins), torch.cat(directions)
 
 
-def _cosine_directions(n: int) -> Float[Tensor, "n 3"]:
+def _cosine_directions(n: int, device: torch.device) -> Float[Tensor, "n 3"]:
     """Upward unit directions, cosine-distributed (Malley's method on a spiral)."""
-    i = torch.arange(n) + 0.5
+    i = torch.arange(n, device=device) + 0.5
     radius, angle = (i / n).sqrt(), i * (math.pi * (3 - math.sqrt(5)))
     return torch.stack([radius * angle.cos(), radius * angle.sin(), (1 - i / n).sqrt()], dim=-1)

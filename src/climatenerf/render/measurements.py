@@ -47,8 +47,8 @@ def measure(
     depth = total(shares.front * samples.t, samples.offsets) / matter_weight.clamp_min(TINY)
     depth = torch.where(shares.surface > matter_weight, shares.t_surface, depth)
     depth = torch.where(shares.sky < SKY_OPACITY, depth, torch.inf)
-    normal = torch.where((shares.surface > 0.5)[:, None], surface_normal, torch.zeros(n, 3))
-    passed = torch.ones(n)
+    normal = torch.where((shares.surface > 0.5)[:, None], surface_normal, torch.zeros_like(rgb))
+    passed = torch.ones_like(depth)
     for medium in world.media:
         own = media.transmittance([medium], rays_o, rays_d, depth)
         layers[medium.mask] = 1 - own
@@ -69,4 +69,5 @@ def measure(
 
 def total(values: Float[Tensor, "s"], offsets: Int[Tensor, "n+1"]) -> Float[Tensor, "n"]:
     """Sum of the samples' values along each ray."""
-    return compositing.accumulate(values.float(), torch.ones(values.shape[0], 1), offsets)[:, 0]
+    values = values.float()
+    return compositing.accumulate(values, torch.ones_like(values)[:, None], offsets)[:, 0]

@@ -35,9 +35,10 @@ def trace_coarse_first(
             the nearest traced one above and left of it.
         cancelled: asked between chunks of rays; see `trace`.
     """
-    n = rays[0].shape[0]
-    row, column = torch.arange(n) // width, torch.arange(n) % width
-    linear, traced = torch.zeros(n, 3), torch.zeros(n, dtype=torch.bool)
+    n, device = rays[0].shape[0], rays[0].device
+    index = torch.arange(n, device=device)
+    row, column = index // width, index % width
+    linear, traced = torch.zeros(n, 3, device=device), torch.zeros_like(index, dtype=torch.bool)
     order, parts = [], []
     for spacing in SPACINGS:
         pending = ((row % spacing == 0) & (column % spacing == 0) & ~traced).nonzero()[:, 0]

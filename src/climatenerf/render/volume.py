@@ -7,17 +7,17 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
-from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.field.compositing import chunks, composited
-from climatenerf.field.protocol import RadianceField
+from climatenerf.field.protocol import RadianceField, device_of
 
 
 def camera_rays(
-    camera: Camera, c2w: Float[np.ndarray, "4 4"]
+    camera: Camera, c2w: Float[np.ndarray, "4 4"], device: torch.device = CPU
 ) -> tuple[Float[Tensor, "hw 3"], Float[Tensor, "hw 3"]]:
-    """Origins (world m) and unit directions of all pixels, row by row."""
-    directions = to_device(camera.directions().reshape(-1, 3).astype(np.float32))
-    pose = to_device(np.asarray(c2w, np.float32))
+    """Origins (world m) and unit directions of all pixels, row by row, on `device`."""
+    directions = to_device(camera.directions().reshape(-1, 3).astype(np.float32), device)
+    pose = to_device(np.asarray(c2w, np.float32), device)
     rays_d = directions @ pose[:3, :3].T
     return pose[:3, 3].expand(rays_d.shape[0], 3).contiguous(), rays_d.contiguous()
 
@@ -33,7 +33,7 @@ def field_radiance(
     out = []
     for chunk in chunks(rays_o):
         o, d = rays_o[chunk], rays_d[chunk]
-        near = torch.full((o.shape[0],), field.near)
+        near = torch.full((o.shape[0],), field.near, device=o.device)
         matter, transmittance, _ = composited(field, o, d, near, appearance=appearance)
         out.append(matter + transmittance[:, None] * field.sky(d, appearance))
     return torch.cat(out)
@@ -46,5 +46,5 @@ def render_view(
     appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """Display picture in [0,1] of the clean scene from one camera (c2w in world metres)."""
-    linear = field_radiance(field, *camera_rays(camera, c2w), appearance)
+    linear = field_radiance(field, *camera_rays(camera, c2w, device_of(field)), appearance)
     return to_numpy(encode_srgb(linear).clamp(0, 1).reshape(camera.height, camera.width, 3))

@@ -23,16 +23,16 @@ def checkpoint(trainer: Trainer, run: Path) -> None:
     save_field(trainer.field, run)
     state = {f"grid.{k}": v for k, v in trainer.grid_adam.state().items()}
     for index, moments in trainer.net_adam.state_dict()["state"].items():
-        state |= {f"net.{index}.{k}": torch.as_tensor(v) for k, v in moments.items()}
+        state |= {f"net.{index}.{k}": torch.as_tensor(v, device="cpu") for k, v in moments.items()}
     for name, module in (("masks", trainer.masks), ("poses", trainer.poses)):
         state |= {f"{name}.{k}": v.detach() for k, v in module.state_dict().items()}
     state["relative"] = trainer.objective.depth_alignment.sums
     state["barred"] = torch.from_numpy(np.packbits(to_numpy(trainer.field.occupancy.forced_empty)))
     state["generator"] = trainer.generator.get_state()
     counters = [trainer.steps, trainer.samples, trainer.rays]
-    state["counters"] = torch.tensor(counters)
+    state["counters"] = torch.tensor(counters, device="cpu")
     floats = [trainer.seconds, trainer.step_scale, trainer.error, trainer.progress]
-    state["floats"] = torch.tensor(floats, dtype=torch.float64)
+    state["floats"] = torch.tensor(floats, dtype=torch.float64, device="cpu")
     write_safetensors(run / OPTIMISER, state, {})
 
 
@@ -54,7 +54,7 @@ def restore(trainer: Trainer, run: Path) -> None:
     Raises:
         UserError: the checkpoint is of another fit, or damaged.
     """
-    saved, field = load_field(run), trainer.field
+    saved, field = load_field(run, trainer.pixels.device), trainer.field
     if saved.embeddings.shape != field.embeddings.shape or saved.size != field.size:
         raise UserError(
             f"{run / 'field.safetensors'} is of another fit than its config.json; fit anew into"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import GROUND, MERGED, SKY, STANDING, UNKNOWN
-from climatenerf.core.device import integers, to_device, to_numpy, upload
+from climatenerf.core.device import CPU, integers, to_device, to_numpy, upload
 from climatenerf.core.errors import UserError
 from climatenerf.training.evidence.frusta import frustum_planes
 from climatenerf.training.evidence.visual_hull import VisualHull
@@ -75,6 +75,7 @@ class TrainingPixels:
         labels: Iterable[UInt8[np.ndarray, "h w"] | None] | None = None,
         masks: Iterable[Shaped[np.ndarray, "h w"] | None] | None = None,
         relative: Iterable[Float[np.ndarray, "h w"] | None] | None = None,
+        device: torch.device = CPU,
     ):
         """Read all images.
 
@@ -88,30 +89,31 @@ class TrainingPixels:
             labels: class ids of each image; None: unlabelled.
             masks: 0 where pixels are never drawn and count as unlabelled; None: all are usable.
             relative: relative inverse z-depth of each image, NaN where unknown; None: unknown.
+            device: where the pixels are stored, and a fit to them computes.
         """
-        self.c2w = to_device(np.asarray(c2w, np.float32))
+        self.c2w = to_device(np.asarray(c2w, np.float32), device)
         self.cameras = [cameras[i] for i in camera_of]
-        self.directions = Directions(cameras)
-        self.camera = torch.as_tensor(list(camera_of))
-        self.frusta = frustum_planes(self.cameras, c2w)
-        self.width = torch.tensor([camera.width for camera in self.cameras])
-        self.height = torch.tensor([camera.height for camera in self.cameras])
+        self.directions = Directions(cameras, device)
+        self.camera = torch.tensor(list(camera_of), device=device)
+        self.frusta = frustum_planes(self.cameras, c2w, device)
+        self.width = torch.tensor([camera.width for camera in self.cameras], device=device)
+        self.height = torch.tensor([camera.height for camera in self.cameras], device=device)
         counts = self.width * self.height
-        self.pixel_start = torch.cat([torch.zeros(1, dtype=torch.long), counts.cumsum(0)])
+        self.pixel_start = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
         shapes = [(camera.height, camera.width) for camera in self.cameras]
         rgb, _ = in_one_row(shapes, images, np.uint8, 0, channels=3)
-        self.rgb = to_device(rgb)
+        self.rgb = to_device(rgb, device)
         self.usable, self.drawable, self.usable_fraction = None, None, 1.0
-        self.spacings = torch.tensor(SPACINGS)
-        self.axes = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]])
+        self.spacings = torch.tensor(SPACINGS, device=device)
+        self.axes = torch.tensor([[1, 0], [0, 1], [1, 1], [1, -1]], device=device)
         usable = (None if mask is None else mask > 0 for mask in masks or ())
         flat, unmasked = in_one_row(shapes, usable, np.bool_, True)
         if flat.size:
-            self.usable, self.drawable = to_device(flat), torch.from_numpy(flat)
+            self.usable, self.drawable = to_device(flat, device), torch.from_numpy(flat)
             self.usable_fraction = int(flat.sum()) / flat.size
         self.label = None
         self.sky_hull = None
-        self.edge = torch.zeros(0, dtype=torch.long)
+        self.edge = self.pixel_start[:0]
         classes = (None if label is None else MERGED[label] for label in labels or ())
         flat, merged = in_one_row(shapes, classes, np.uint8, UNKNOWN)
         for image, label in enumerate(merged):
@@ -120,25 +122,31 @@ class TrainingPixels:
             # Networks label puddles and wet walls as the sky that they mirror.
             row, column = np.nonzero(label == SKY)
             camera = self.camera[image].expand(len(row))
-            d = self.directions.of(camera, to_device(column), to_device(row))
+            d = self.directions.of(camera, *(to_device(each, device) for each in (column, row)))
             low = to_numpy(d @ self.c2w[image, 2, :3] < HORIZON)
             label[row[low], column[low]] = UNKNOWN
         if (flat != UNKNOWN).any():
-            self.label = to_device(flat)
+            self.label = to_device(flat, device)
         if self.label is not None and bool((self.label == SKY).any()):
             at = [np.flatnonzero(sky_edge(each)) for each in merged]
             starts = to_numpy(self.pixel_start)[:-1]
-            self.edge = to_device(np.concatenate([e + s for e, s in zip(at, starts, strict=True)]))
-            self.sky_hull = VisualHull(self.cameras, c2w, merged, [SKY], SKY_CONSENSUS)
+            edge = np.concatenate([e + s for e, s in zip(at, starts, strict=True)])
+            self.edge = to_device(edge, device)
+            self.sky_hull = VisualHull(self.cameras, c2w, merged, [SKY], SKY_CONSENSUS, device)
         self.ground_hull = self.obstacle_hull = None
-        if self.label is not None and bool(
-            torch.isin(self.label, torch.tensor(GROUND, dtype=torch.uint8)).any()
-        ):
-            self.ground_hull = VisualHull(self.cameras, c2w, merged, GROUND, GROUND_CONSENSUS)
-            self.obstacle_hull = VisualHull(self.cameras, c2w, merged, STANDING, OBSTACLE_CONSENSUS)
+        ground = torch.tensor(GROUND, dtype=torch.uint8, device=device)
+        if self.label is not None and bool(torch.isin(self.label, ground).any()):
+            of = self.cameras, c2w, merged
+            self.ground_hull = VisualHull(*of, GROUND, GROUND_CONSENSUS, device)
+            self.obstacle_hull = VisualHull(*of, STANDING, OBSTACLE_CONSENSUS, device)
         scaled = (None if depth is None else in_units(depth) for depth in relative or ())
         flat, _ = in_one_row(shapes, scaled, np.float16, np.nan)
-        self.relative = to_device(flat) if flat.size else None
+        self.relative = to_device(flat, device) if flat.size else None
+
+    @property
+    def device(self) -> torch.device:
+        """Where the pixels are stored, and a fit to them computes."""
+        return self.c2w.device
 
     def without_sky(self) -> "TrainingPixels":
         """Return the same pixels, with those labelled sky unlabelled."""
@@ -152,7 +160,7 @@ class TrainingPixels:
         self, image: Int[Tensor, "n"], rays_d: Float[Tensor, "n 3"]
     ) -> Float[Tensor, "n 2"]:
         """Return the position (x, y), in (0,1), of a direction in each image; NaN outside it."""
-        out = torch.full((image.shape[0], 2), torch.nan)
+        out = rays_d.new_full((image.shape[0], 2), torch.nan)
         for i in to_numpy(image.unique()).tolist():
             rows = (image == i).nonzero()[:, 0]
             camera = self.cameras[i]
@@ -160,7 +168,8 @@ class TrainingPixels:
             xy = pixel / (camera.width, camera.height)
             with np.errstate(invalid="ignore"):  # behind the camera: NaN
                 inside = np.all((xy >= 0) & (xy < 1), axis=-1)
-            out[rows[to_device(inside)]] = to_device(xy[inside].astype(np.float32))
+            found = to_device(xy[inside].astype(np.float32), self.device)
+            out[rows[to_device(inside, self.device)]] = found
         return out
 
     def pixel_towards(
@@ -220,7 +229,7 @@ class TrainingPixels:
     def classes(self) -> UInt8[Tensor, "k"]:
         """Return the merged classes that occur, unknown included; empty without labels."""
         if self.label is None:
-            return torch.zeros(0, dtype=torch.uint8)
+            return torch.zeros(0, dtype=torch.uint8, device=self.device)
         # In pieces: to sort all labels would take twenty times their memory.
         pieces = [
             torch.bincount(each.long(), minlength=256) for each in self.label.split(MAX_DRAWN)
@@ -243,11 +252,11 @@ class TrainingPixels:
         pixel = self.anywhere(free, generator)
         if self.edge.numel():
             count = int(edges * (free - triples))
-            row = integers(generator, 0, self.edge.shape[0], count)
+            row = integers(generator, 0, self.edge.shape[0], count, device=self.device)
             pixel[free - count :] = self.edge[row]
         image = torch.searchsorted(self.pixel_start, pixel, right=True) - 1
         within = pixel - self.pixel_start[image]
-        in_line = torch.zeros(0, dtype=torch.bool)
+        in_line = torch.zeros(0, dtype=torch.bool, device=self.device)
         if triples:
             left, right, in_line = self.sides(image[:triples], within[:triples], generator)
             image = torch.cat([image, image[:triples], image[:triples]])
@@ -258,7 +267,7 @@ class TrainingPixels:
         xy = torch.stack([(column + 0.5) / width, (row + 0.5) / self.height[image]], dim=-1)
         c2w = self.c2w[image]
         d = self.directions.of(self.camera[image], column, row)
-        unknown = torch.full((n,), UNKNOWN, dtype=torch.uint8)
+        unknown = torch.full_like(image, UNKNOWN, dtype=torch.uint8)
         return Batch(
             rays_o=c2w[:, :3, 3].contiguous(),
             rays_d=(c2w[:, :3, :3] @ d[:, :, None])[:, :, 0].contiguous(),
@@ -279,13 +288,13 @@ class TrainingPixels:
         """
         total = self.rgb.shape[0]
         if self.drawable is None:
-            return integers(generator, 0, total, n)
+            return integers(generator, 0, total, n, device=self.device)
         found = torch.zeros(0, dtype=torch.long, device="cpu")
         while found.shape[0] < n:
             more = min(int((n - found.shape[0]) / self.usable_fraction) + 1, MAX_DRAWN)
             pixel = torch.randint(0, total, (more,), generator=generator, device="cpu")
             found = torch.cat([found, pixel[self.drawable[pixel]]])
-        return upload(found[:n])
+        return upload(found[:n], self.device)
 
     def sides(
         self, image: Int[Tensor, "m"], within: Int[Tensor, "m"], generator: torch.Generator
@@ -294,9 +303,10 @@ class TrainingPixels:
 
         Where one lies outside the image or its mask, both are the pixel itself.
         """
-        m = image.shape[0]
-        spacing = self.spacings[integers(generator, 0, len(SPACINGS), m)]
-        step = self.axes[integers(generator, 0, len(self.axes), m)] * spacing[:, None]
+        m, device = image.shape[0], self.device
+        spacing = self.spacings[integers(generator, 0, len(SPACINGS), m, device=device)]
+        step = self.axes[integers(generator, 0, len(self.axes), m, device=device)]
+        step = step * spacing[:, None]
         width, height = self.width[image], self.height[image]
         x, y = within % width, within.div(width, rounding_mode="floor")
         inside = (x >= spacing) & (x < width - spacing) & (y >= spacing) & (y < height - spacing)

@@ -72,10 +72,12 @@ class Objective:
     learns_classes: bool
     classes_trusted_at: float
     """Progress from which the field's own classes decide what is ground."""
-    logit_of_class: Int[Tensor, "256"] = field(
-        default_factory=lambda: to_device(SOLID_OF.astype(np.int64))
-    )
+    logit_of_class: Int[Tensor, "256"] = field(init=False)
     """Class logit of each merged class, `UNKNOWN` for sky and unlabelled pixels."""
+
+    def __post_init__(self) -> None:
+        """Put the table of classes next to the pixels."""
+        self.logit_of_class = to_device(SOLID_OF.astype(np.int64), self.pixels.device)
 
     @property
     def schedule(self) -> Schedule:

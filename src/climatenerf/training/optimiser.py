@@ -60,7 +60,7 @@ class GridAdam:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the tensors with which `load` continues the optimisation."""
-        state = {"steps": torch.tensor(self.steps)}
+        state = {"steps": torch.tensor(self.steps, device="cpu")}
         for i, (first, second) in enumerate(zip(self.first, self.second, strict=True)):
             state |= {f"{i}.first": first, f"{i}.second": second}
         return state

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.device import to_device
+from climatenerf.core.device import CPU, to_device
 from climatenerf.core.vectors import unit
 
 SPACING = 4  # pixels between lattice points
@@ -24,16 +24,16 @@ MAX_ERROR = 1e-2  # pixels between a lattice point and its direction projected b
 class Directions:
     """Directions of all pixels of a list of cameras."""
 
-    def __init__(self, cameras: Sequence[Camera]):
-        """Compute the lattices of the cameras."""
+    def __init__(self, cameras: Sequence[Camera], device: torch.device = CPU):
+        """Compute the lattices of the cameras, and store them on a device."""
         found = [_lattice(camera) for camera in cameras]
         lattices = [lattice for lattice, _ in found]
         counts = [each.shape[0] * each.shape[1] for each in lattices]
-        self.spacing = torch.tensor([spacing for _, spacing in found])
-        self.across = torch.tensor([each.shape[1] for each in lattices])
-        self.start = torch.tensor([0, *np.cumsum(counts)[:-1].tolist()])
+        self.spacing = torch.tensor([spacing for _, spacing in found], device=device)
+        self.across = torch.tensor([each.shape[1] for each in lattices], device=device)
+        self.start = torch.tensor([0, *np.cumsum(counts)[:-1].tolist()], device=device)
         flat = [each.reshape(-1, 3) for each in lattices]
-        self.lattice = to_device(np.concatenate(flat).astype(np.float32))
+        self.lattice = to_device(np.concatenate(flat).astype(np.float32), device)
 
     def of(
         self, camera: Int[Tensor, "n"], column: Int[Tensor, "n"], row: Int[Tensor, "n"]

@@ -12,10 +12,10 @@ class PoseCorrections(nn.Module):
     """Six numbers for each image; zeros leave its pose unchanged."""
 
     def __init__(self, images: int):
-        """Begin with no corrections of `images` images."""
+        """Begin with no corrections of `images` images, on the CPU; `.to(device)` moves them."""
         super().__init__()
-        self.turn = nn.Parameter(torch.zeros(images, 3))
-        self.shift = nn.Parameter(torch.zeros(images, 3))
+        self.turn = nn.Parameter(torch.zeros(images, 3, device="cpu"))
+        self.shift = nn.Parameter(torch.zeros(images, 3, device="cpu"))
 
     def rays(
         self,

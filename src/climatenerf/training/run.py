@@ -11,7 +11,7 @@ from jaxtyping import Float
 from PIL import Image
 
 import climatenerf
-from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, make_folder, write_json
 from climatenerf.evaluation.heldout import evaluate
@@ -44,8 +44,10 @@ MIN_INPUT_SPREAD = 1e-6  # as they are below this in units of the poses as given
 MIN_USABLE_FRACTION = 1e-3  # of the pixels that masks must leave
 
 
-def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
+def load_pixels(scene: Scene, downscale: int, device: torch.device = CPU) -> TrainingPixels:
     """Return all training pixels of a scene, its photos reduced by a factor `downscale`.
+
+    A fit to them computes on `device`.
 
     Raises:
         UserError: pictures are too small to measure, or masks leave no pixels to learn from.
@@ -66,6 +68,7 @@ def load_pixels(scene: Scene, downscale: int) -> TrainingPixels:
         (load_labels(view, scene, downscale) for view in views),
         (load_mask(view, scene, downscale) for view in views),
         (load_relative_depth(view, scene, downscale) for view in views),
+        device,
     )
     if pixels.usable_fraction < MIN_USABLE_FRACTION:
         raise UserError(
@@ -83,6 +86,7 @@ def fit_scene(
     resume: bool,
     after_step: Callable[[Report], None],
     after_view: Callable[[int, int], None],
+    device: torch.device = CPU,
 ) -> dict:
     """Fit a field to a scene, write a run folder, and return the metrics.
 
@@ -96,6 +100,7 @@ def fit_scene(
         resume: continue from the folder's checkpoint.
         after_step: called with the state of the fit after each step.
         after_view: called with (views done, views) while the held-out views are measured.
+        device: where to compute.
 
     Raises:
         UserError: the folder already holds a run (without resume) or none (with it).
@@ -108,7 +113,7 @@ def fit_scene(
         # A damaged picture must be reported now, not after the fit.
         load_image(view, scene, downscale)
         load_mask(view, scene, downscale)
-    trainer = begin(scene, settings, downscale)
+    trainer = begin(scene, settings, downscale, device)
     if resume:
         restore(trainer, run)
     make_folder(run / "previews")
@@ -154,7 +159,9 @@ def fit_scene(
     return metrics
 
 
-def begin(scene: Scene, settings: FitSettings, downscale: int) -> Trainer:
+def begin(
+    scene: Scene, settings: FitSettings, downscale: int, device: torch.device = CPU
+) -> Trainer:
     """Return a trainer before its first step: read the photos and gather all evidence.
 
     Raises:
@@ -162,7 +169,7 @@ def begin(scene: Scene, settings: FitSettings, downscale: int) -> Trainer:
     """
     poses = np.stack([scene.c2w_world(view) for view in scene.of_split("train")])
     check_baseline(poses, scene.scale)
-    pixels = load_pixels(scene, downscale)
+    pixels = load_pixels(scene, downscale, device)
     extent = find_extent(poses, scene.points_world())
     points = unmasked_sparse_depth(scene, pixels)
     matched = None
@@ -206,7 +213,8 @@ def with_corrections(scene: Scene, trainer: Trainer) -> Scene:
     if not trainer.settings.refine_poses:
         return scene
     views = scene.of_split("train")
-    given = to_device(np.stack([scene.c2w_world(view) for view in views])).float()
+    given = np.stack([scene.c2w_world(view) for view in views])
+    given = to_device(given, trainer.pixels.device).float()
     corrected = to_numpy(trainer.poses.corrected(given, trainer.field.unit).double())
     input_from_world = np.linalg.inv(scene.world_from_input)
     moved = {}

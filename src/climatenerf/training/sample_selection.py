@@ -33,7 +33,8 @@ def select_samples(
     least = schedule.min_inclusion_probability
     probability = (schedule.selected_per_ray * weights).clamp(least, 1.0) * valid
     # Systematic sampling: selected samples are spread evenly among those of similar weight.
-    passed = probability.double().cumsum(0) + uniform(generator, 1).double()
+    start = uniform(generator, 1, device=weights.device).double()
+    passed = probability.double().cumsum(0) + start
     selected = buffers.indices("selected", passed.floor() > (passed - probability).floor())
     # Unused entries of a buffer have probability 0: 0/0.
     return selected, probability[selected].clamp_min(least)

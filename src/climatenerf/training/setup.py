@@ -29,31 +29,31 @@ def make_trainer(
     """Return a trainer with an untrained field and all evidence.
 
     Args:
-        pixels: of all training photos.
+        pixels: of all training photos; the fit computes on their device.
         extent: centre (world m), unit (m per grid unit) and nearest distance of the scene.
         settings: of the fit, with the field's size.
         points: rays to sparse points.
         matched: rays with depths from multi-view stereo, some of them wrong.
     """
-    images = len(pixels.cameras)
+    images, device = len(pixels.cameras), pixels.device
     if not settings.sky_labels:
         pixels = pixels.without_sky()
     initial = torch.Generator(device="cpu").manual_seed(settings.seed)
     centre = np.array(extent.centre)
-    field = Field(settings.size, images, centre, extent.unit, extent.near, initial)
-    masks = TransientMasks(images, initial)
+    field = Field(settings.size, images, centre, extent.unit, extent.near, initial).to(device)
+    masks = TransientMasks(images, initial).to(device)
     generator = torch.Generator(device="cpu").manual_seed(settings.seed)
     evidence = gather_evidence(field, pixels, settings, generator, points, matched)
     learns_classes = settings.losses.classes > 0 and evidence.classes_learnable
-    field.learned[:] = torch.tensor([False, learns_classes])  # normals: see `normals_at`
+    field.learned[1] = learns_classes  # normals: see `normals_at`
     field.sky_grid.requires_grad_(evidence.knows_sky)
     objective = Objective(
         settings=settings,
         evidence=evidence,
         pixels=pixels,
         masks=masks,
-        depth_alignment=DepthAlignment(images),
-        buffers=buffers_for(field.geometry_grid.device),
+        depth_alignment=DepthAlignment(images, device),
+        buffers=buffers_for(device),
         learns_classes=learns_classes,
         classes_trusted_at=settings.schedule.refine_at,
     )
@@ -72,5 +72,6 @@ def compile_kernels(trainer: Trainer) -> None:
     points = trainer.evidence.free_space.sparse
     twin = make_trainer(trainer.pixels, trainer.extent, settings, points)
     twin.step(twin.pixels.draw(16, twin.generator))
-    twin.field.grid_density(torch.zeros(16, 3))
-    twin.field.density_normal(torch.zeros(16, 3))
+    q = torch.zeros(16, 3, device=twin.pixels.device)
+    twin.field.grid_density(q)
+    twin.field.density_normal(q)

@@ -78,7 +78,7 @@ class Trainer:
         self.first_near, self.generator = first_near, generator
         self.settings, self.schedule = objective.settings, objective.schedule
         self.pixels, self.masks = objective.pixels, objective.masks
-        self.poses = PoseCorrections(len(self.pixels.cameras))
+        self.poses = PoseCorrections(len(self.pixels.cameras)).to(self.pixels.device)
         grids = [field.geometry_grid, field.appearance_grid, field.sky_grid]
         grids += [field.surface_grid] if field.size.surface_levels else []
         # With decay of the geometry grid, a twentieth less of the reference street's sky was empty.
@@ -248,7 +248,7 @@ class Trainer:
             torch.full_like(far, near),
             far,
             self.step_scale,
-            uniform(self.generator, n),
+            uniform(self.generator, n, device=far.device),
             stop=STOP,
             capacity=self.buffers.capacity(name, min(n * marching.MAX_RAY_SAMPLES, limit)),
         )

@@ -33,14 +33,19 @@ class TransientMasks(nn.Module):
     """A small network over a pyramid of features for each image."""
 
     def __init__(self, images: int, generator: torch.Generator | None = None):
-        """Initialise the masks of `images` images; generator: on the CPU; None: the global one."""
+        """Initialise the masks of `images` images, on the CPU; `.to(device)` moves them.
+
+        Args:
+            images: number of training images.
+            generator: source of the initial values, on the CPU; None: PyTorch's global one.
+        """
         super().__init__()
         self.levels = nn.ParameterList()
         for side in LEVELS:
             # Each image has its own features, so that images cannot influence each other.
             shape = (images, side, side, FEATURES)
             drawn = torch.randn(shape, generator=generator, device="cpu")
-            self.levels.append(nn.Parameter((1e-2 * drawn).to(torch.get_default_device())))
+            self.levels.append(nn.Parameter(1e-2 * drawn))
         last = _linear(HIDDEN, 1, generator)
         nn.init.constant_(last.bias, math.log(RESTING_MASK / (1 - RESTING_MASK)))
         first = _linear(FEATURES * len(LEVELS), HIDDEN, generator)
@@ -97,14 +102,10 @@ class TransientMasks(nn.Module):
 def _linear(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Linear:
     """Return a layer with PyTorch's default initialisation, drawn from a given generator."""
     # Without PyTorch's own initialisation, which draws from the global generator.
-    layer = nn.Linear(inputs, outputs, device="meta").to_empty(device=torch.get_default_device())
-    weight = torch.empty(outputs, inputs, device="cpu")
-    nn.init.kaiming_uniform_(weight, a=math.sqrt(5), generator=generator)
+    layer = nn.Linear(inputs, outputs, device="meta").to_empty(device="cpu")
+    nn.init.kaiming_uniform_(layer.weight, a=math.sqrt(5), generator=generator)
     bound = 1 / math.sqrt(inputs)
-    bias = torch.empty(outputs, device="cpu").uniform_(-bound, bound, generator=generator)
-    with torch.no_grad():
-        layer.weight.copy_(weight)
-        layer.bias.copy_(bias)
+    nn.init.uniform_(layer.bias, -bound, bound, generator=generator)
     return layer
 
 
@@ -121,8 +122,8 @@ def find_static_cells(
     Several photos see such a point in one position: a parked car, or a cairn that a network labels
     as a person.
     """
-    device = pixels.c2w.device
-    static = torch.zeros(images, STATIC_CELLS, STATIC_CELLS, dtype=torch.bool, device=device)
+    shape = (images, STATIC_CELLS, STATIC_CELLS)
+    static = torch.zeros(shape, dtype=torch.bool, device=pixels.device)
     for each in depths:
         movable = is_movable(pixels.label_towards(each.image, each.rays_d))
         image = each.image[movable]

@@ -4,7 +4,8 @@ An effect states its parameters, the layers it writes, what it needs of a field 
 preparation depends on. Its entity, which does the physics, is loaded when the effect is present:
 `prepare` runs once for a scene, `Entity.place` once a frame. The tuple `registry.EFFECTS` lists the
 built-in effects; an installed package adds its own through the entry-point group
-`climatenerf.effects`.
+`climatenerf.effects`. Tensors of an effect are on the device of the rays that it receives; before
+there are rays, `field.protocol.device_of` has it.
 """
 
 import importlib

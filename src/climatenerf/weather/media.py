@@ -71,7 +71,8 @@ def _cuts(
     """Ends of stretches, ascending, up to t: where media change, and in steps that grow."""
     end = t.clamp_max(FAR)
     # From about a metre on each stretch is longer than the last one by the same factor.
-    growing = (1 + end[:, None]) ** torch.linspace(0, 1, PIECES + 1)[1:-1] - 1
+    exponent = torch.linspace(0, 1, PIECES + 1, device=t.device)[1:-1]
+    growing = (1 + end[:, None]) ** exponent - 1
     breaks = [medium.breaks(rays_o, rays_d) for medium in media]
     cuts = torch.cat([growing, *breaks, end[:, None]], dim=-1)
     return list(torch.minimum(cuts, end[:, None]).clamp_min(0).sort(-1).values.unbind(-1))

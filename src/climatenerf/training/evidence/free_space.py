@@ -55,7 +55,7 @@ class FreeSpace:
         """
         self.field, self.pixels, self.sparse = field, pixels, sparse
         self.enabled, self.poses_move = settings.free_space, settings.refine_poses
-        self.class_of_logit = to_device(SOLID)
+        self.class_of_logit = to_device(SOLID, field.centre.device)
         self.uses_ground = settings.losses.ground_height > 0 and sparse is not None
         self.fit_ground()
         self.force_empty()
@@ -66,8 +66,8 @@ class FreeSpace:
         Sets `ground` (None if it is not used or not found), and in grid units `step_points`, ground
         points that the height cannot follow, and `obstacle_points`, all that are not ground.
         """
-        self.ground, self.step_points = None, torch.zeros(0, 3)
-        q, on_ground = torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool)
+        q = self.field.centre.new_zeros(0, 3)
+        self.ground, self.step_points, on_ground = None, q, q.new_zeros(0, dtype=torch.bool)
         if self.uses_ground and self.sparse is not None:
             q, on_ground = self.classify_points(self.sparse)
             self.ground = fit_ground_height(q[on_ground])
@@ -86,7 +86,7 @@ class FreeSpace:
         on_ground = is_ground(self.pixels.label_towards(sparse.image, sparse.rays_d))
         rounded = (self.field.to_grid(sparse.points) / SAME_POINT).round()
         unique, row, views = rounded.unique(dim=0, return_inverse=True, return_counts=True)
-        votes = torch.zeros(unique.shape[0]).index_add(0, row, on_ground.float())
+        votes = unique.new_zeros(unique.shape[0]).index_add(0, row, on_ground.float())
         return unique * SAME_POINT, votes > 0.5 * views
 
     def force_empty(self, everywhere: bool = True) -> None:
@@ -99,13 +99,13 @@ class FreeSpace:
         self.rasterise_points()
         if not self.enabled:
             return
-        cells = torch.arange(occupancy.occupied.numel())
+        cells = torch.arange(occupancy.occupied.numel(), device=occupancy.occupied.device)
         if not everywhere:
             cells = cells[occupancy.occupied.view(-1) > 0]
         centre, size = occupancy.cell_centres(cells)
         x = centre * self.field.unit + self.field.centre
         radius = size * (self.field.unit * 3**0.5 / 2)
-        empty = torch.zeros(cells.shape[0], dtype=torch.bool)
+        empty = torch.zeros_like(cells, dtype=torch.bool)
         if not self.poses_move:  # poses still change: so do the frusta
             empty = ~intersects_frustum(x, radius, self.pixels.frusta)
             empty |= self.too_near_camera(x, radius)
@@ -135,9 +135,9 @@ class FreeSpace:
             radius: Ball radii, m.
         """
         if self.sparse is None:
-            return torch.zeros(x.shape[0], dtype=torch.bool)
+            return x.new_zeros(x.shape[0], dtype=torch.bool)
         count = self.pixels.c2w.shape[0]
-        clearance = torch.zeros(count)
+        clearance = x.new_zeros(count)
         for image in range(count):
             depth = self.sparse.depth[self.sparse.image == image]
             if depth.numel() >= MIN_POINTS:
@@ -155,8 +155,9 @@ class FreeSpace:
         Sets `protected` (cells of sparse points), `obstacle` and `near_step` (each with a margin of
         one cell), all [cascades side side side].
         """
-        q = torch.zeros(0, 3) if self.sparse is None else self.field.to_grid(self.sparse.points)
-        self.protected = self.cells_containing(q)
+        self.protected = torch.zeros_like(self.field.occupancy.occupied, dtype=torch.bool)
+        if self.sparse is not None:
+            self.protected = self.cells_containing(self.field.to_grid(self.sparse.points))
         if self.obstacle_hull is None:
             self.obstacle_hull = self.find_obstacles()
         # Upsample: to find the obstacles again at a finer resolution takes seconds.
@@ -172,11 +173,11 @@ class FreeSpace:
         obstacle = torch.zeros_like(occupancy.occupied, dtype=torch.bool)
         if self.ground is None or hull is None:
             return obstacle
-        for cells in torch.arange(obstacle.numel()).split(CHUNK):
+        for cells in torch.arange(obstacle.numel(), device=obstacle.device).split(CHUNK):
             centre, _ = occupancy.cell_centres(cells)
             valid = self.ground.height_above(centre)[1].nonzero()[:, 0]
             x = centre[valid] * self.field.unit + self.field.centre
-            obstacle.view(-1)[cells[valid]] = hull.consensus(x, torch.zeros(valid.shape[0]))
+            obstacle.view(-1)[cells[valid]] = hull.consensus(x, torch.zeros_like(x[:, 0]))
         return obstacle
 
     def cells_containing(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cascades side side side"]:
@@ -193,8 +194,8 @@ class FreeSpace:
         """
         hull = self.pixels.sky_hull
         if hull is None or not self.enabled:
-            return torch.ones(x.shape[0], dtype=torch.bool)
-        empty = hull.consensus(x, torch.zeros(x.shape[0]))
+            return x.new_ones(x.shape[0], dtype=torch.bool)
+        empty = hull.consensus(x, torch.zeros_like(x[:, 0]))
         cells, _ = self.field.occupancy.cell_index(self.field.to_grid(x))
         return empty & ~self.protected.view(-1)[cells]
 
@@ -209,7 +210,7 @@ class FreeSpace:
         """
         hull = self.pixels.ground_hull
         if hull is None:
-            return torch.zeros(q.shape[0], dtype=torch.bool)
+            return q.new_zeros(q.shape[0], dtype=torch.bool)
         return hull.consensus(q * self.field.unit + self.field.centre, radius)
 
     def ground_offsets(
@@ -238,18 +239,18 @@ class FreeSpace:
             penalised.
         """
         if self.ground is None:
-            return torch.zeros(0, dtype=torch.long), t[:0], t[:0] > 0
+            return t.new_zeros(0, dtype=torch.long), t[:0], t[:0] > 0
         height, valid = self.ground.height_above(q)
         height_ahead, _ = self.ground.height_above(q + STEP * rays_d)
         approach = (height - height_ahead) / STEP
         excess = height.sign() * (height.abs() - self.ground.tolerance).clamp_min(0.0)
         off = buffers.indices("off ground", valid & (approach > MIN_APPROACH) & (excess != 0))
         cells, _ = self.field.occupancy.cell_index(q[off])
-        penalised = torch.zeros(off.shape[0], dtype=torch.bool)
+        penalised = torch.zeros_like(off, dtype=torch.bool)
         if use_classes:
             penalised = self.classified_as_ground(q[off]) & ~self.near_step.view(-1)[cells]
         rest = buffers.indices("ground hull", ~penalised & ~self.obstacle.view(-1)[cells])
-        penalised[rest] = self.in_ground_hull(q[off[rest]], torch.zeros(rest.shape[0]))
+        penalised[rest] = self.in_ground_hull(q[off[rest]], q.new_zeros(rest.shape[0]))
         # The filler of a buffer may be a ray that does not approach the ground: 0/0.
         to_ground = excess[off] / approach[off].clamp_min(MIN_APPROACH)
         return off, (t[off] + to_ground).clamp_min(0.0), penalised

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.device import to_device
+from climatenerf.core.device import CPU, to_device
 
 CHUNK = 800_000  # distances between balls and views computed at once, to fit into the cache
 BORDER_SAMPLES = 64  # points along each side of an image from which its frustum is found
@@ -20,7 +20,7 @@ MIN_COSINE = 0.1  # from the optical axis; a view with wider rays has no frustum
 
 
 def frustum_planes(
-    cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"]
+    cameras: Sequence[Camera], c2w: Float[np.ndarray, "v 4 4"], device: torch.device = CPU
 ) -> Float[Tensor, "v 4 4"]:
     """Return the four side planes of each view's frustum; the frustum starts at the camera centre.
 
@@ -28,6 +28,7 @@ def frustum_planes(
         cameras: Of each view. Where lens distortion bends the image border, the frustum encloses
             the border.
         c2w: Camera poses, world m, OpenCV axes.
+        device: Where the planes are stored.
 
     Returns:
         Per view four rows (unit normal, offset): normal . x + offset is the distance (m) of x
@@ -48,7 +49,7 @@ def frustum_planes(
         outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
         normal = outward @ pose[:3, :3].T
         planes.append(np.concatenate([normal, -normal @ pose[:3, 3:]], axis=-1))
-    return to_device(np.stack(planes).astype(np.float32))
+    return to_device(np.stack(planes).astype(np.float32), device)
 
 
 def intersects_frustum(
@@ -63,7 +64,7 @@ def intersects_frustum(
     """
     found, size = [], max(256, CHUNK // frusta.shape[0])
     for centres, radii in zip(x.split(size), radius.split(size), strict=True):
-        outside = torch.full((centres.shape[0], frusta.shape[0]), -torch.inf)
+        outside = x.new_full((centres.shape[0], frusta.shape[0]), -torch.inf)
         for side in frusta.unbind(1):
             outside = torch.maximum(outside, centres @ side[:, :3].T + side[:, 3])
         found.append(outside.amin(-1) < radii)
@@ -86,7 +87,7 @@ def within_camera_range(
         camera_centres: Of each view, world m.
         max_distance: Of each view, m; 0 excludes the view.
     """
-    found = torch.zeros(x.shape[0], dtype=torch.bool)
+    found = x.new_zeros(x.shape[0], dtype=torch.bool)
     low = (camera_centres - max_distance[:, None]).amin(0)
     high = (camera_centres + max_distance[:, None]).amax(0)
     near = ((x > low) & (x < high)).all(-1).nonzero()[:, 0]

@@ -104,20 +104,21 @@ def fit_ground_height(q: Float[Tensor, "n 3"]) -> GroundHeight | None:
     bilinear = torch.stack([weight for _, _, weight in corners], dim=-1).double()
     pairs = (node[:, :, None] * size + node[:, None, :]).view(-1)
     products = bilinear[:, :, None] * bilinear[:, None, :]
-    bending = _bending_energy()
+    bending = _bending_energy(q.device)
     z = q[:, 2].double()
     median = z.median()
     weight = torch.ones_like(z) / n
-    height = torch.zeros(size, dtype=torch.float64)
+    height = z.new_zeros(size)
     for _ in range(ITERATIONS):
-        normal = torch.zeros(size * size, dtype=torch.float64)
+        normal = z.new_zeros(size * size)
         normal.index_add_(0, pairs, (weight[:, None, None] * products).view(-1))
-        target = torch.zeros(size, dtype=torch.float64)
+        target = z.new_zeros(size)
         target.index_add_(0, node.view(-1), ((weight * (z - median))[:, None] * bilinear).view(-1))
         height = torch.linalg.solve(normal.view(size, size) + bending, target)
         residual = ((bilinear * height[node]).sum(-1) + median - z).abs()
         weight = 1 / (residual.clamp_min(MIN_RESIDUAL) * n)
-    line = to_device(np.linspace(-HALF_SIDE, HALF_SIDE, GRID_NODES, dtype=np.float32))
+    line = np.linspace(-HALF_SIDE, HALF_SIDE, GRID_NODES, dtype=np.float32)
+    line = to_device(line, q.device)
     nodes = torch.stack(torch.meshgrid(line, line, indexing="xy"), dim=-1).view(-1, 2)
     nearest = torch.cdist(nodes, q[:, :2]).amin(-1)
     return GroundHeight(
@@ -130,7 +131,7 @@ def fit_ground_height(q: Float[Tensor, "n 3"]) -> GroundHeight | None:
 
 def _supported_cells(q: Float[Tensor, "n 3"]) -> Bool[Tensor, "cells cells"]:
     """Return the cells of the finer grid that contain a point, and their neighbours."""
-    count = torch.zeros(FINE_CELLS, FINE_CELLS)
+    count = q.new_zeros(FINE_CELLS, FINE_CELLS)
     x, y = _fine_cells(q)
     count[y, x] = 1
     return torch.nn.functional.max_pool2d(count[None], 3, 1, padding=1)[0] > 0
@@ -142,14 +143,15 @@ def _fine_cells(q: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n"], Int[Tensor, 
     return cell[:, 0], cell[:, 1]
 
 
-def _bending_energy() -> Float[Tensor, "nodes2 nodes2"]:
+def _bending_energy(device: torch.device) -> Float[Tensor, "nodes2 nodes2"]:
     """Return the quadratic form of the thin plate's bending energy, weighted."""
-    one = torch.eye(GRID_NODES, dtype=torch.float64)
+    one = torch.eye(GRID_NODES, dtype=torch.float64, device=device)
     slope, bend = one[1:] - one[:-1], one[2:] - 2 * one[1:-1] + one[:-2]
     along_x, along_y, twist = torch.kron(one, bend), torch.kron(bend, one), torch.kron(slope, slope)
     energy = BENDING_WEIGHT * (along_x.T @ along_x + along_y.T @ along_y + 2 * twist.T @ twist)
     # 1e-9: collinear points leave the plate's rotation about their line undetermined (singular).
-    return energy + 1e-9 * torch.eye(GRID_NODES * GRID_NODES, dtype=torch.float64)
+    nodes = GRID_NODES * GRID_NODES
+    return energy + 1e-9 * torch.eye(nodes, dtype=torch.float64, device=device)
 
 
 def _cells(q: Float[Tensor, "n 3"]) -> tuple[Int[Tensor, "n 2"], Float[Tensor, "n 2"]]:

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from climatenerf.core.device import CPU
+
 DECAY = 0.95  # of the sums, per step
 MIN_RAYS = 20.0  # of an image, before its scale and shift are used
 MAX_SQUARED_ERROR = 4.0  # of a ray, in units of the image's variance of d
@@ -18,10 +20,10 @@ MAX_SQUARED_ERROR = 4.0  # of a ray, in units of the image's variance of d
 class DepthAlignment:
     """Scale and shift that align each image's relative depth with the scene."""
 
-    def __init__(self, images: int):
-        """Start without observations of `images` images."""
+    def __init__(self, images: int, device: torch.device = CPU):
+        """Start without observations of `images` images, whose rays are on `device`."""
         # Sums over rays of 1, x, d, x², xd, d² with x = 1/z.
-        self.sums = torch.zeros(images, 6, dtype=torch.float64)
+        self.sums = torch.zeros(images, 6, dtype=torch.float64, device=device)
 
     def loss(
         self,

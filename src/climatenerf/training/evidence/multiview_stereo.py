@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import SKY
-from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.ops.cpu.plane_sweep import TILES, UNSEEN, Pictures, match
 from climatenerf.training.dataset import TrainingPixels, in_one_row
 from climatenerf.training.evidence.sparse_depth import SparseDepth
@@ -56,7 +56,7 @@ def plane_sweep_depth(
     near, median = depth_ranges(pixels, sparse, default_range)
     pictures = build_pictures(pixels, near, median)
     windows = min(MAX_WINDOWS, pixels.rgb.shape[0] // PIXELS_PER_WINDOW)
-    chosen = pixels.anywhere(windows, torch.Generator().manual_seed(seed))
+    chosen = pixels.anywhere(windows, torch.Generator(device="cpu").manual_seed(seed))
     if pixels.label is not None:
         chosen = chosen[pixels.label[chosen] != SKY]
     image = torch.searchsorted(pixels.pixel_start, chosen, right=True) - 1
@@ -73,9 +73,9 @@ def plane_sweep_depth(
     confirmed = confirmed_by_neighbour(pictures, view, local * z[:, None])
     if not confirmed.any():
         return None
-    image = to_device(view[confirmed])
-    direction = to_device(local[confirmed].astype(np.float32))
-    z_depth = to_device(z[confirmed])
+    image = to_device(view[confirmed], pixels.device)
+    direction = to_device(local[confirmed].astype(np.float32), pixels.device)
+    z_depth = to_device(z[confirmed], pixels.device)
     c2w, length = pixels.c2w[image], direction.norm(dim=-1)
     unit = (direction / length[:, None])[:, :, None]
     return SparseDepth(
@@ -208,7 +208,7 @@ def build_pictures(
     rgb = to_numpy(pixels.rgb)
     usable = None if pixels.usable is None else to_numpy(pixels.usable)
     undistorted = (
-        undistorted_grey(camera, rgb[a:b], None if usable is None else usable[a:b])
+        undistorted_grey(camera, rgb[a:b], None if usable is None else usable[a:b], pixels.device)
         for camera, a, b in zip(pixels.cameras, starts[:-1], starts[1:], strict=True)
     )
     shapes = [(camera.height, camera.width) for camera in pixels.cameras]
@@ -229,7 +229,10 @@ def build_pictures(
 
 
 def undistorted_grey(
-    camera: Camera, rgb: UInt8[np.ndarray, "hw 3"], usable: Bool[np.ndarray, "hw"] | None
+    camera: Camera,
+    rgb: UInt8[np.ndarray, "hw 3"],
+    usable: Bool[np.ndarray, "hw"] | None,
+    device: torch.device = CPU,
 ) -> UInt8[np.ndarray, "h w"]:
     """Resample a photo in grey to a pinhole camera of the same size and intrinsics.
 
@@ -237,6 +240,7 @@ def undistorted_grey(
         camera: Of the photo.
         rgb: 8-bit sRGB, row by row.
         usable: False where the photo is masked; None: nowhere.
+        device: Where the photo is resampled.
 
     Returns:
         8-bit levels; `UNSEEN` outside the photo and where it is masked.
@@ -248,10 +252,10 @@ def undistorted_grey(
         return _to_levels(grey).reshape(camera.height, camera.width)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     d = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    pixel = to_device(camera.project(d).astype(np.float32))
-    size = torch.tensor([camera.width, camera.height])
+    pixel = to_device(camera.project(d).astype(np.float32), device)
+    size = torch.tensor([camera.width, camera.height], device=device)
     resampled = torch.nn.functional.grid_sample(
-        to_device(grey).view(1, 1, camera.height, camera.width),
+        to_device(grey, device).view(1, 1, camera.height, camera.width),
         (2 * pixel / size - 1).nan_to_num(9.0)[None],
         align_corners=False,
         padding_mode="border",

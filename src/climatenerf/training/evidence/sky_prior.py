@@ -42,7 +42,7 @@ class SkyPrior:
         Returns:
             Unit directions (world, z up), their linear radiance, and which of them are unseen.
         """
-        down, across = uniform(generator, n, 2).unbind(-1)
+        down, across = uniform(generator, n, 2, device=self.colour.device).unbind(-1)
         y, x = down * ROWS, across * COLUMNS
         row, column = y.long(), x.long()
         return direction(y, x), self.colour[row, column], self.unseen[row, column]
@@ -100,7 +100,7 @@ def average_on_map(
     turn = torch.atan2(d[:, 1], d[:, 0]) / (2 * np.pi) % 1.0
     column = (turn * COLUMNS).long().clamp(0, COLUMNS - 1)
     cell = row * COLUMNS + column
-    total = torch.zeros(ROWS * COLUMNS, 3).index_add(0, cell, colour)
+    total = colour.new_zeros(ROWS * COLUMNS, 3).index_add(0, cell, colour)
     count = torch.bincount(cell, minlength=ROWS * COLUMNS).float()
     seen = (count >= MIN_PIXELS).view(ROWS, COLUMNS)
     # At least 1: an empty cell would be 0/0.

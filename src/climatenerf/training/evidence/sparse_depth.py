@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.core.device import integers, to_device
+from climatenerf.core.device import CPU, integers, to_device
 from climatenerf.scene.scene import Scene
 from climatenerf.training.dataset import TrainingPixels
 
@@ -37,11 +37,11 @@ class SparseDepth:
 
     def draw(self, n: int, generator: torch.Generator) -> "SparseDepth":
         """Return n random rays, drawn with replacement."""
-        return self.select(integers(generator, 0, self.depth.shape[0], n))
+        return self.select(integers(generator, 0, len(self.depth), n, device=self.depth.device))
 
 
-def read_sparse_depth(scene: Scene) -> SparseDepth | None:
-    """Return one ray for each sparse point that each training view observes.
+def read_sparse_depth(scene: Scene, device: torch.device = CPU) -> SparseDepth | None:
+    """Return one ray, on `device`, for each sparse point that each training view observes.
 
     Returns:
         None if the scene has no points, or no view's observations are known.
@@ -62,10 +62,10 @@ def read_sparse_depth(scene: Scene) -> SparseDepth | None:
         return None
     rays_d = (end - origin)[valid] / depth[valid, None]
     return SparseDepth(
-        rays_o=to_device(origin[valid].astype(np.float32)),
-        rays_d=to_device(rays_d.astype(np.float32)),
-        depth=to_device(depth[valid].astype(np.float32)),
-        image=to_device(np.concatenate(images)[valid].astype(np.int64)),
+        rays_o=to_device(origin[valid].astype(np.float32), device),
+        rays_d=to_device(rays_d.astype(np.float32), device),
+        depth=to_device(depth[valid].astype(np.float32), device),
+        image=to_device(np.concatenate(images)[valid].astype(np.int64), device),
     )
 
 
@@ -81,7 +81,7 @@ def unmasked_sparse_depth(scene: Scene, pixels: TrainingPixels) -> SparseDepth |
     Returns:
         None if no ray is left.
     """
-    sparse = read_sparse_depth(scene)
+    sparse = read_sparse_depth(scene, pixels.device)
     if sparse is None:
         return None
     visible = pixels.usable_towards(sparse.image, sparse.rays_d)

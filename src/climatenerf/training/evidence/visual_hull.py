@@ -9,12 +9,13 @@ enough views must vote for it, and their cameras must be a minimum baseline apar
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import UNKNOWN
-from climatenerf.core.device import to_device
+from climatenerf.core.device import CPU, to_device
 from climatenerf.core.morphology import depth_inside, eroded
 from climatenerf.ops import visual_hull
 
@@ -37,6 +38,7 @@ class VisualHull:
         labels: Sequence[UInt8[np.ndarray, "h w"]],
         classes: Sequence[int],
         min_fraction: float,
+        device: torch.device = CPU,
     ):
         """Build the label maps that vote.
 
@@ -47,6 +49,7 @@ class VisualHull:
                 have a known label.
             classes: Merged classes that carve: whatever lies in front of them is empty.
             min_fraction: Votes needed, as a fraction of the views whose image contains the point.
+            device: Where the maps are stored.
         """
         self.min_fraction = min_fraction
         labelled = [i for i, label in enumerate(labels) if (label != UNKNOWN).any()]
@@ -55,13 +58,15 @@ class VisualHull:
         maps = [border_distance(cameras[i], np.isin(labels[i], classes)) for i in voting]
         sizes = np.array([each.shape for each, _ in maps], np.int64)
         poses = np.ascontiguousarray(np.asarray(c2w, np.float32)[voting])
-        self.views = (
-            to_device(np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps])),
-            to_device(np.append(0, sizes.prod(1).cumsum()[:-1]).astype(np.int64)),
-            to_device(sizes),
-            to_device(np.array([pinhole for _, pinhole in maps], np.float32)),
-            to_device(poses),
+        arrays = (
+            np.concatenate([each.astype(np.uint8).ravel() for each, _ in maps]),
+            np.append(0, sizes.prod(1).cumsum()[:-1]).astype(np.int64),
+            sizes,
+            np.array([pinhole for _, pinhole in maps], np.float32),
+            poses,
         )
+        depth, starts, sides, pinholes, c2w_maps = (to_device(each, device) for each in arrays)
+        self.views = depth, starts, sides, pinholes, c2w_maps
         centres = poses[:, :3, 3]
         spread = float(np.linalg.norm(centres - centres.mean(0), axis=-1).mean())
         self.min_baseline = BASELINE_FRACTION * spread

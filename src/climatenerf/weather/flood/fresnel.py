@@ -136,6 +136,6 @@ def diffuse_reflectances(ior: float) -> tuple[float, float]:
     exactly; r_i is computed from it, so that a white furnace stays white. For water .0664, .4746.
     """
     x, w = np.polynomial.legendre.leggauss(64)
-    cos = torch.as_tensor((x + 1) / 2)
-    r_e = float((torch.as_tensor(w) * cos * reflectance(cos, ior)).sum())
+    cos = torch.as_tensor((x + 1) / 2, device="cpu")
+    r_e = float((torch.as_tensor(w, device="cpu") * cos * reflectance(cos, ior)).sum())
     return r_e, 1 - (1 - r_e) / ior**2

@@ -15,6 +15,7 @@ from torch import Tensor
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT
 from climatenerf.field.compositing import RENDER_STEP, composited
+from climatenerf.field.protocol import device_of
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.flood import optics, waves
 from climatenerf.weather.flood.parameters import Flood
@@ -106,7 +107,7 @@ class Water:
         t: Float[Tensor, "n"],
     ) -> Float[Tensor, "n 3"]:
         """Radiance at ray length t (m) as it arrives at an eye under water."""
-        beta = torch.tensor(optics.attenuation(self.flood))
+        beta = torch.tensor(optics.attenuation(self.flood), device=rays_o.device)
         depth = self.level - rays_o[:, 2] - t.clamp_max(1e6) * rays_d[:, 2]
         light = optics.light_cosine(self.flood, self.sun_elevation)
         passed = optics.water_transmittance(beta, t, depth, light)
@@ -119,7 +120,7 @@ class Water:
         n, rays_d = hits.t.shape[0], hits.rays_d
         below = self.inside(hits.rays_o)
         vertical = (hits.t_bottom - hits.t).clamp_min(0) * rays_d[:, 2].abs()
-        depth = torch.where(torch.isfinite(vertical) & ~below, vertical, torch.zeros(n))
+        depth = torch.where(torch.isfinite(vertical) & ~below, vertical, torch.zeros_like(vertical))
         x = hits.rays_o + hits.t[:, None] * rays_d
         x[:, 2] = self.level
         footprint = optics.footprint(hits.t, rays_d, hits.pixel_angle)
@@ -129,13 +130,14 @@ class Water:
             rays_d, slope, variance, self.flood, below, hits.sample_rotation
         )
         if self.mirror_only:
-            directions, parts = directions[:, :1], torch.ones(1)
+            directions, parts = directions[:, :1], torch.ones_like(parts[:1])
             reflectance = torch.ones_like(reflectance)
 
         # --- Reflected rays, traced like any other ------------------------------------------------
         count = directions.shape[1]
         side = torch.where(below, -SKIN, SKIN)
-        start = x + torch.stack([torch.zeros(n), torch.zeros(n), side], dim=-1)
+        zero = torch.zeros_like(side)
+        start = x + torch.stack([zero, zero, side], dim=-1)
         radiance = trace(
             start.repeat_interleave(count, 0),
             directions.reshape(-1, 3),
@@ -146,7 +148,8 @@ class Water:
         # --- What is on the other side ------------------------------------------------------------
         direction, total = optics.refract(rays_d, normal, self.flood.ior, below)
         direction = direction * ~total[:, None]  # total reflection: no ray goes on
-        start = start - 2 * side[:, None] * torch.tensor([0.0, 0.0, 1.0])
+        up = torch.tensor([0.0, 0.0, 1.0], device=start.device)
+        start = start - 2 * side[:, None] * up
         background, passed = self._other_side(
             world, start, direction, below, hits.pixel_angle, depth, trace
         )
@@ -171,9 +174,8 @@ class Water:
 
         From above: the bottom, converted from dry to wet. From below: the air's light, and 1.
         """
-        n = start.shape[0]
-        background, passed = torch.zeros(n, 3), torch.zeros(n, 3)
-        beta = torch.tensor(optics.attenuation(self.flood))
+        background, passed = torch.zeros_like(start), torch.zeros_like(start)
+        beta = torch.tensor(optics.attenuation(self.flood), device=start.device)
         # Where the water is opaque over the straight ray's depth, no ray is spent on the bottom.
         # Light comes down through this depth and goes up through at least as much.
         shows = torch.exp(-2 * beta.min() * depth) > MIN_BOTTOM
@@ -185,7 +187,7 @@ class Water:
                 world.field,
                 o,
                 d,
-                torch.zeros(down.shape[0]),
+                torch.zeros_like(o[:, 0]),
                 RENDER_STEP,
                 pruning_threshold=MIN_TAU,
                 appearance=world.appearance,
@@ -254,7 +256,7 @@ def prepare(preparation: Preparation) -> FloodEntity:
     top = scene_top(scene)
     for moment in preparation.moments:
         check_level(moment.flood.level, top)
-    waves = make_waves(first.flood, first.seed)
+    waves = make_waves(first.flood, first.seed, device=device_of(preparation.field))
     return FloodEntity(waves, preparation.irradiance(), scene.ground_z, top)
 
 

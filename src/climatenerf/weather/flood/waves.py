@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Complex, Float, Int64
 from torch import Tensor
 
-from climatenerf.core.device import to_device
+from climatenerf.core.device import CPU, to_device
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.spectrum import (
     MAX_CUTOFF,
@@ -90,13 +90,14 @@ class WaveFrame:
     pyramids: tuple[Complex[Tensor, "texels"], ...]
 
 
-def make_waves(flood: Flood, seed: int, n: int = 256) -> Waves:
+def make_waves(flood: Flood, seed: int, n: int = 256, device: torch.device = CPU) -> Waves:
     """Sample the random amplitudes of a flood's waves.
 
     Args:
         flood: wind, fetch, depth and scale.
         seed: random seed of the amplitudes.
         n: points along each side of a tile, a power of two.
+        device: where the waves are computed and looked up.
 
     Returns:
         The waves; flat without wind, or if the wind is too weak for waves longer than a centimetre.
@@ -116,9 +117,9 @@ def make_waves(flood: Flood, seed: int, n: int = 256) -> Waves:
         lengths.insert(0, lengths[0] * _RATIO)
     starts = [0.0] + [2 * math.pi * _CYCLES / length for length in lengths[1:]]
     edges = [*starts, 2 * finest]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator(device="cpu").manual_seed(seed)
     tiles = tuple(
-        make_tile(flood, length, edges[i : i + 2], cutoff, generator, n)
+        make_tile(flood, length, edges[i : i + 2], cutoff, generator, n, device)
         for i, length in enumerate(lengths)
     )
     k = log_axis(flood)
@@ -137,6 +138,7 @@ def make_tile(
     cutoff: float,
     generator: torch.Generator,
     n: int = 256,
+    device: torch.device = CPU,
 ) -> WaveTile:
     """Sample the waves of one band of wavenumbers on a periodic tile.
 
@@ -147,6 +149,7 @@ def make_tile(
         cutoff: cutoff k_c of the spectrum, rad/m.
         generator: CPU generator of the amplitudes.
         n: points along each side, a power of two.
+        device: where the tile is stored.
     """
     index = np.fft.fftfreq(n) * n
     kx, ky = np.meshgrid(2 * math.pi * index / length, 2 * math.pi * index / length)
@@ -169,13 +172,13 @@ def make_tile(
     level_variance, level_covariance = _level_variances(slope_power, kx, ky, length)
     return WaveTile(
         length,
-        to_device(np.stack([kx, ky], axis=-1)).float(),
-        to_device(omega),
-        forward.to(torch.get_default_device(), torch.complex64),
-        backward.to(torch.get_default_device(), torch.complex64),
+        to_device(np.stack([kx, ky], axis=-1), device).float(),
+        to_device(omega, device),
+        forward.to(device, torch.complex64),
+        backward.to(device, torch.complex64),
         float(slope_power.sum()),
-        to_device(level_variance).float(),
-        to_device(level_covariance).float(),
+        to_device(level_variance, device).float(),
+        to_device(level_covariance, device).float(),
     )
 
 
@@ -244,7 +247,8 @@ def _pyramid(tile: WaveTile, time: float) -> Complex[Tensor, "texels"]:
         if half < 2:  # only the mean remains, and the mean slope is 0
             maps.append(spectrum.new_zeros(size * size))
             continue
-        rows = torch.cat([torch.arange(half), torch.arange(n - half, n)]).to(spectrum.device)
+        row = torch.arange(n, device=spectrum.device)
+        rows = torch.cat([row[:half], row[n - half :]])
         part = spectrum[rows][:, rows]
         if level:
             part = part * torch.exp(-k2[rows][:, rows] * (0.5 * tile.length / size) ** 2 / 2)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.field.protocol import RadianceField
+from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.surface_fit import half_transmittance, smooth_ground
@@ -155,7 +155,7 @@ def _run_pass(
     first = np.array(grid.centre) - half - margin + random.uniform(0, h, 2)
     hits = np.full((count[1], count[0], 3), np.nan, np.float32)
     opacity = np.zeros((count[1], count[0]), np.float32)
-    rows = max(1, _CHUNK // count[0])
+    rows, device = max(1, _CHUNK // count[0]), device_of(field)
     inner = grid.half_side(cascade - 1) - 3 * h if cascade > 0 else 0.0
     for row in range(0, count[1], rows):
         j = np.arange(row, min(row + rows, count[1]))
@@ -165,8 +165,9 @@ def _run_pass(
         start = crossing - drift * (top - middle)
         selected = _leaves_square(start, crossing + drift * (middle - bottom), grid.centre, inner)
         rays_o = np.concatenate([start[selected], np.full((int(selected.sum()), 1), top)], -1)
+        length = (top - bottom) / -direction[2]
         hit_t, hit_opacity = _first_hits(
-            field, rays_o, direction, (top - bottom) / -direction[2], _STRETCH * h, random
+            field, rays_o, direction, length, _STRETCH * h, random, device
         )
         hits[row : row + len(j)][selected] = rays_o + hit_t[:, None] * direction
         opacity[row : row + len(j)][selected] = hit_opacity
@@ -205,6 +206,7 @@ def _first_hits(
     length: float,
     stretch: float,
     random: np.random.Generator,
+    device: torch.device,
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return the ray length of transmittance 1/2 (NaN: never reached) and the opacity.
 
@@ -216,12 +218,14 @@ def _first_hits(
     depth = np.zeros(len(rays_o))  # optical depth so far
     next_start = -random.uniform(0, stretch, len(rays_o))
     active = np.arange(len(rays_o))
+    heading = torch.tensor(direction, dtype=torch.float32, device=device)
     while len(active):
         start = next_start[active]
-        origins = to_device((rays_o[active] + start[:, None] * direction).astype(np.float32))
-        directions = torch.tensor(direction, dtype=torch.float32).expand_as(origins).contiguous()
-        t_min = to_device(np.maximum(-start, 0).astype(np.float32))
-        t_max = to_device(np.minimum(length - start, stretch).astype(np.float32))
+        origins = (rays_o[active] + start[:, None] * direction).astype(np.float32)
+        origins = to_device(origins, device)
+        directions = heading.expand_as(origins).contiguous()
+        t_min = to_device(np.maximum(-start, 0).astype(np.float32), device)
+        t_max = to_device(np.minimum(length - start, stretch).astype(np.float32), device)
         samples = field.march(origins, directions, t_min, t_max)
         parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
         found_t, found_depth = half_transmittance(
@@ -252,28 +256,30 @@ def _shade(
     """
     if not len(hits):
         return np.zeros(0, np.float32)
-    luma = torch.tensor(_LUMA)
+    lower, upper = field.bounds
+    device = lower.device
+    luma = torch.tensor(_LUMA, device=device)
     white = max(float(np.dot(light.irradiance_over_pi, _LUMA)), 1e-6)  # black scene: g would be 0/0
-    positions = torch.tensor(cameras, dtype=torch.float32)
+    positions = torch.tensor(cameras, dtype=torch.float32, device=device)
     sun = light.sun_direction
     lift = (snow.depth or 0.0) + max(0.05, spacing)
-    lower, upper = field.bounds
     diagonal = float((upper - lower).norm())
     shades = []
-    for points in to_device(hits).split(_CHUNK):
+    for points in to_device(hits, device).split(_CHUNK):
         nearest = positions[torch.cdist(points, positions).argmin(1)]
         offset = points - nearest
         # A camera inside the blurred density of the ground would give a direction of length 0.
         d = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         grey = (field.colour(points, d, appearance=appearance) @ luma / white).clamp(0, 1)
         shade = (grey + snow.albedo_offset) / (1 + snow.albedo_offset)
-        visible = torch.ones(len(points))
+        visible = torch.ones(len(points), device=device)
         if sun is not None and sun[2] > 0:
-            above = points + torch.tensor([0.0, 0.0, lift])
-            towards = torch.tensor(sun, dtype=torch.float32).expand_as(above).contiguous()
-            zero = torch.zeros(len(points))
+            above = points + torch.tensor([0.0, 0.0, lift], device=device)
+            towards = torch.tensor(sun, dtype=torch.float32, device=device)
+            towards = towards.expand_as(above).contiguous()
+            zero = torch.zeros(len(points), device=device)
             samples = field.march(above, towards, zero, zero + diagonal)
-            sun_depth = torch.zeros(len(points), dtype=samples.sigma.dtype)
+            sun_depth = samples.sigma.new_zeros(len(points))
             sun_depth.index_add_(0, samples.ray_index(), (samples.sigma * samples.dt).detach())
             visible = torch.exp(-sun_depth).float()
         shade = shade * (snow.sun_share * visible + snow.shade)

@@ -85,21 +85,16 @@ class BakedSnow:
         offsets, t, dt, sigma = metaballs.march(
             _array(rays_o), _array(rays_d), _array(t_min), _array(t_max), self.lattice
         )
-        return Samples(
-            to_device(offsets),
-            to_device(t),
-            to_device(dt),
-            to_device(sigma),
-        )
+        return Samples(*(to_device(each, rays_o.device) for each in (offsets, t, dt, sigma)))
 
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Extinction O of the snow at points (m), 1/m."""
-        density = to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 2])
+        density = to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 2], x.device)
         return density if self.floor_z is None else density * (x[:, 2] >= self.floor_z)
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the analytic gradient of the sum; up where there is none."""
-        gradient = to_device(metaballs.evaluate(_array(x), self.lattice)[1])
+        gradient = to_device(metaballs.evaluate(_array(x), self.lattice)[1], x.device)
         return _normal(gradient)
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -111,16 +106,19 @@ class BakedSnow:
         _, gradient, rest = metaballs.evaluate(_array(x), self.lattice)
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
-        facing = _normal(to_device(gradient)) @ torch.tensor(towards, dtype=torch.float32)
+        towards = torch.tensor(towards, dtype=torch.float32, device=x.device)
+        facing = _normal(to_device(gradient, x.device)) @ towards
         # Negative only for a wrap below 1, on the side that faces away.
         wrap = ((facing + self.snow.wrap) / (1 + self.snow.wrap)).clamp(min=0)
-        shade = to_device(rest[:, 1])
-        white = torch.tensor(self.light.irradiance_over_pi, dtype=torch.float32)
+        shade = to_device(rest[:, 1], x.device)
+        white = self.light.irradiance_over_pi
+        white = torch.tensor(white, dtype=torch.float32, device=x.device)
         return (shade * wrap)[:, None] * white
 
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
-        return to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 0]).clamp(min=0)
+        height = metaballs.evaluate(_array(x), self.lattice)[2][:, 0]
+        return to_device(height, x.device).clamp(min=0)
 
 
 def bake_snow(
@@ -221,7 +219,7 @@ def _array(x: Tensor) -> np.ndarray:
 
 def _normal(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     length = gradient.norm(dim=-1, keepdim=True)
-    up = torch.tensor([0.0, 0.0, 1.0])
+    up = torch.tensor([0.0, 0.0, 1.0], device=gradient.device)
     return torch.where(length > 1e-6, -gradient / length.clamp(min=1e-6), up)
 
 
