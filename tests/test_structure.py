@@ -92,8 +92,9 @@ CREATORS = {
 
 def torch_name(node: ast.expr) -> str:
     """The NAME of an expression `torch.NAME`; empty for others."""
-    of_torch = isinstance(node, ast.Attribute) and ast.unparse(node.value) == "torch"
-    return node.attr if of_torch else ""
+    if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "torch":
+        return node.attr
+    return ""
 
 
 def unnamed_devices(tree: ast.AST) -> set[int]:
