@@ -567,8 +567,10 @@ def test_a_full_disk_damages_nothing_and_the_run_resumes(scene, tmp_path, monkey
             fitted(scene, tmp_path / "run", steps=6, resume=True)
         assert name in str(caught.value)
     after = contents(tmp_path / "run")
-    assert after[name] == before[name]
-    assert after.keys() == before.keys(), "no temporary file stays"
+    if name == "metrics.json":  # the checkpoint is new, and those were of the earlier one
+        assert before.keys() - after.keys() == {name}
+    else:
+        assert after == before, "nothing has changed, and no temporary file stays"
     load_field(tmp_path / "run")
     assert fitted(scene, tmp_path / "run", steps=6, resume=True)["steps"] == 6
 
