@@ -97,6 +97,10 @@ def test_invalid_arguments_are_refused_before_anything_is_written(run, tmp_path)
     ):
         with pytest.raises(UserError, match=message):
             climatenerf.render_movie(run, tmp_path / "out", **options)
+    with pytest.raises(UserError, match='the folder to write into is ""'):
+        climatenerf.render_movie(run, "")
+    with pytest.raises(UserError, match='the folder to write into is ""'):
+        climatenerf.fit(run.scene, "")
     with pytest.raises(UserError, match="no loss 'beauty'"):
         climatenerf.fit(run.scene, tmp_path / "out", losses={"beauty": 1.0})
     with pytest.raises(UserError, match="does not exist"):

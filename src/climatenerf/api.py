@@ -12,6 +12,7 @@ another unit. Wrong input raises `climatenerf.core.errors.UserError`, whose mess
 with the remedy. The functions import torch when they are called, not before.
 """
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -45,11 +46,13 @@ class Run:
         folder: The run folder that `fit` made.
         field: The radiance field.
         scene: The capture, in world metres with z up.
+        digest: Hash of the files that both were read from; None takes that of the folder's files.
     """
 
     folder: Path
     field: "Field"
     scene: Scene
+    digest: str | None = None
 
     def camera(
         self, photo: str | None = None, size: tuple[int, int] | None = None
@@ -143,6 +146,7 @@ def fit(
         UserError: a value is out of range, the folder holds a run (without `resume`) or none (with
             it), or the photos cannot be fitted.
     """
+    target = _folder(folder)
     from climatenerf.core.device import resolve_device
     from climatenerf.training.run import fit_scene
     from climatenerf.training.settings import Losses, settings_of
@@ -163,7 +167,7 @@ def fit(
     report = progress or (lambda what, fraction: None)
     fit_scene(
         scene,
-        Path(folder),
+        target,
         settings,
         downscale,
         resume,
@@ -175,7 +179,7 @@ def fit(
 
 
 def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run:
-    """Read a run folder that `fit` made.
+    """Read a run folder that `fit` made, or is making: then its latest checkpoint.
 
     Args:
         folder: the run folder.
@@ -187,14 +191,21 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
     """
     from climatenerf.core.device import resolve_device
     from climatenerf.field.checkpoint import load_field
+    from climatenerf.output.job import hash_of_files
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
+    from climatenerf.training.snapshot import CONFIG, FIELD, SCENE, read_together
 
     where = resolve_device(device)
     folder = Path(folder)
-    field = load_field(folder, where)
-    check_config(folder)
-    return Run(folder, field, load_scene(folder))
+
+    def read(paths: Mapping[str, Path]) -> Run:
+        field = load_field(folder, where)
+        check_config(paths[CONFIG].parent)
+        scene = load_scene(paths[SCENE])
+        return Run(folder, field, scene, hash_of_files([paths[FIELD], paths[SCENE]]))
+
+    return read_together(folder, read)
 
 
 def render_movie(
@@ -253,7 +264,7 @@ def render_movie(
     from climatenerf.paths.camera_path import camera_path
 
     run = run if isinstance(run, Run) else load_run(run)
-    out, say = Path(out), note or (lambda sentence: None)
+    out, say = _folder(out), note or (lambda sentence: None)
     used = installed_effects() if effects is None else check_effects(tuple(effects))
     table = layer_table(used)
     unknown = set(layers) - {"all", *table}
@@ -286,6 +297,7 @@ def render_movie(
         formats=formats,
         appearance=view,
         effects=used,
+        digest=run.digest,
     )
 
     def prepare() -> "jobs.FrameSource":
@@ -326,6 +338,13 @@ def evaluate(run: Run | PathText, *, progress: Progress | None = None) -> dict[s
     return measure(
         run.field, run.scene, downscale, lambda done, all: report("held-out photos", done / all)
     )
+
+
+def _folder(path: PathText) -> Path:
+    """Return an output folder; refuse an empty text, which `Path` takes for the working folder."""
+    if not os.fspath(path):
+        raise UserError('the folder to write into is ""; name one, or give "."')
+    return Path(path)
 
 
 def _keyframed(

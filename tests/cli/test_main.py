@@ -54,6 +54,19 @@ def test_help_lists_every_verb_and_does_not_import_torch():
     assert f"climatenerf {climatenerf.__version__}\n" in done.stdout
 
 
+@pytest.mark.parametrize("verb", cli.VERBS)
+@pytest.mark.parametrize("words", [("-o", ""), ("--out", " "), ("--out=",), ("-o", "", "--seed")])
+def test_an_empty_output_folder_is_refused(tmp_path, monkeypatch, capsys, verb, words):
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([verb, *(() if verb == "demo" else ("in",)), *words]) == 2
+    err = capsys.readouterr().err
+    assert err == (
+        "climatenerf: -o is empty; name the folder to write into, or give . for the working"
+        " folder\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_closed_pipe_is_no_error():
     args = [sys.executable, "-m", "climatenerf", "--help"]
     buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.permissions import as_another_user, open_folder
 
 from climatenerf.core import storage
 from climatenerf.core.errors import UserError
@@ -131,3 +132,18 @@ def test_new_files_have_default_permissions(tmp_path):
     (tmp_path / "b").write_bytes(b"")
     storage.write_safetensors(tmp_path / "c", {"a": np.zeros(2)})
     assert len({(tmp_path / name).stat().st_mode for name in "abc"}) == 1
+
+
+def test_a_file_that_may_not_be_read_is_called_that():
+    with open_folder() as folder:
+        storage.write_safetensors(folder / "f.safetensors", {"a": np.zeros(2)})
+        storage.write_json(folder / "a.json", {})
+        for name, read in (
+            ("f.safetensors", storage.read_safetensors),
+            ("a.json", storage.read_json),
+        ):
+            (folder / name).chmod(0)
+            with as_another_user(), pytest.raises(UserError, match="no permission") as caught:
+                read(folder / name, "the run")
+            assert str(folder / name) in str(caught.value)
+            assert "damaged" not in str(caught.value)

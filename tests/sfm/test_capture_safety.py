@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from support.command_line import STREET, run_cli
 from support.photo_builders import exif, photo
+from support.processes import holder
 
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.export import export_colmap
@@ -48,6 +49,21 @@ def capture(here, out, *more):
     return run_cli(
         "capture", here / "photos", "--from-colmap", here / "model", "-o", out, *more
     )  # fmt: skip
+
+
+def test_a_second_capture_into_a_folder_is_refused_in_one_sentence(posed, capsys):
+    for out in (posed / "new", posed / "scene"):
+        if out.name == "scene":
+            assert capture(posed, out) == 0
+            capsys.readouterr()
+        with holder(out):
+            before = snapshot(out)
+            assert capture(posed, out) == 2
+            err = capsys.readouterr().err
+            assert f"another process is writing into {out}; wait until it ends" in err
+            assert len(err.strip().splitlines()) == 1 and snapshot(out) == before
+    assert capture(posed, posed / "scene") == 0, "the lock of a dead process does not count"
+    assert not list((posed / "scene").glob(".*.tmp.*")), "nor does its half of a file stay"
 
 
 @pytest.mark.parametrize("name", ["images", "sparse", "labels", "scene.json", "work", "mark.html"])

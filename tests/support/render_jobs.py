@@ -1,12 +1,20 @@
 """Render jobs with a trivial frame source, and processes that render or join their parts."""
 
-import re
+import multiprocessing
 from pathlib import Path
 
 import numpy as np
 
 from climatenerf.core.cameras import Camera
-from climatenerf.output.job import RenderedFrame, RenderJob, frames_of_part, join, render_frames
+from climatenerf.core.storage import is_temporary
+from climatenerf.output.job import (
+    RenderedFrame,
+    RenderJob,
+    frames_of_part,
+    join,
+    render_frames,
+    render_movie,
+)
 from climatenerf.paths.camera_path import CameraPath
 from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather
@@ -50,6 +58,21 @@ def render_part(out: Path, part: tuple[int, int], frames: int) -> None:
     render_frames(job, out, lambda: noise_of(job), frames_of_part(job, part))
 
 
+def render_whole(out: Path, frames: int, visibility: float) -> None:
+    """Entry point of a process that renders a movie."""
+    job = make_job(frames, visibility)
+    render_movie(job, SCENE, out, lambda: noise_of(job))
+
+
+def start(target, *words) -> multiprocessing.Process:
+    """Start a process quickly: its server has imported this module already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["support.render_jobs"])
+    process = context.Process(target=target, args=words)
+    process.start()
+    return process
+
+
 def join_parts(out: Path, frames: int) -> None:
     """Entry point of a process that joins."""
     join(make_job(frames), SCENE, out)
@@ -58,5 +81,11 @@ def join_parts(out: Path, frames: int) -> None:
 def files_of(folder: Path) -> dict[str, bytes]:
     """All files of a render by relative path, except the lock and temporary files."""
     found = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.is_file()}
-    temporary = re.compile(r"(.*/)?\.[0-9a-f]{12}\.tmp\.\w+|\.frames/(lock|unfinished-.*)")
-    return {name: p.read_bytes() for name, p in found.items() if not temporary.fullmatch(name)}
+    return {name: p.read_bytes() for name, p in found.items() if not is_left_over(name)}
+
+
+def is_left_over(name: str) -> bool:
+    """Whether a path in a render folder is the lock, or what a process leaves that is killed."""
+    path = Path(name)
+    scratch = name.startswith(".frames/unfinished-")
+    return name == ".frames/lock" or scratch or is_temporary(path.name)

@@ -326,7 +326,9 @@ def test_a_run_can_be_resumed_after_a_full_disk(scene, tmp_path, monkeypatch, na
             fitted(scene, tmp_path / "run", steps=6, resume=True)
         assert name in str(caught.value)
     after = contents(tmp_path / "run")
-    assert after[name] == before[name]
-    assert after.keys() == before.keys(), "no temporary file remains"
+    if name == "metrics.json":  # the checkpoint is new, and those were of the earlier one
+        assert before.keys() - after.keys() == {name}
+    else:
+        assert after == before, "nothing has changed, and no temporary file remains"
     load_field(tmp_path / "run")
     assert fitted(scene, tmp_path / "run", steps=6, resume=True)["steps"] == 6

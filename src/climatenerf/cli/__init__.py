@@ -8,6 +8,7 @@ import contextlib
 import difflib
 import errno
 import importlib
+import itertools
 import os
 import signal
 import sys
@@ -125,6 +126,7 @@ def _run(words: list[str]) -> int:
         near = difflib.get_close_matches(name, VERBS, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(VERBS)}."
         raise UserError(f"there is no verb {name!r}; {hint}")
+    _check_out(words[1:])
     for variable, value in THREADING.items():
         os.environ.setdefault(variable, value)
     import tyro
@@ -139,6 +141,16 @@ def _run(words: list[str]) -> int:
     if name == "render":  # given flags override a weather file
         return module.run(options, words[1:]) or 0
     return module.run(options) or 0
+
+
+def _check_out(words: Sequence[str]) -> None:
+    """Refuse an empty output folder, such as `-o "$OUT"` without OUT: it would be parsed as "."."""
+    for flag, value in itertools.pairwise([*words, "-"]):
+        empty = flag in ("-o", "--out") and not value.strip()
+        if empty or flag.strip() in ("-o=", "--out="):
+            raise UserError(
+                "-o is empty; name the folder to write into, or give . for the working folder"
+            )
 
 
 def usage() -> str:

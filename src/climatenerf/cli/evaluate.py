@@ -54,18 +54,17 @@ def run(options: Evaluate) -> int:
             "no reference to compare with; use: climatenerf evaluate RUN --reference -o OUT"
         )
 
+    from climatenerf.api import load_run
     from climatenerf.core.storage import read_json
     from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.evaluation.scores import evaluate
-    from climatenerf.field.checkpoint import load_field
     from climatenerf.output.score_report import check_folder, table_text, write_report
-    from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
 
-    field = load_field(options.run)
+    fitted = load_run(options.run)
+    field, scene = fitted.field, fitted.scene
     config = check_config(options.run)
-    scene = load_scene(options.run)
     reference = read_reference(scene.root, options.views, options.weathers)
     if options.out.resolve().is_relative_to(reference.folder.resolve()):
         raise UserError(f"{options.out} lies in the reference set; choose another folder with -o")

@@ -19,6 +19,7 @@ from climatenerf.scene.alignment.known_length import (
 from climatenerf.scene.alignment.scale import scale_findings, scale_summary
 from climatenerf.training.folder import check_folder, check_resumable
 from climatenerf.training.settings import RENAMED_LOSSES, FitSettings, Losses, settings_of
+from climatenerf.training.snapshot import writing_run
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
 
 
@@ -110,8 +111,9 @@ def run(options: Fit) -> int:
     check_folder(scene, options.out, options.resume)
     if options.resume:
         check_resumable(options.out, settings)
-    scene = with_perception(scene, options)
-    metrics = fit_with_bars(scene, options)
+    with writing_run(options.out):  # labels may be written into the run folder
+        scene = with_perception(scene, options)
+        metrics = fit_with_bars(scene, options)
     if metrics["interrupted"]:
         progress.say(f"Stopped early; resume with: {resuming(options)}")
     progress.result(summary(metrics))

@@ -1,22 +1,37 @@
 """Files written so that a failure never harms what was there before, and read with clear errors.
 
 Everything is written to a temporary name in the same folder and then renamed over the old file:
-a reader sees the old file or the new one, never half of one.
+a reader sees the old file or the new one, never half of one. A temporary name holds the host and
+the process that uses it, so that `remove_abandoned` can tell what a dead process has left.
 """
 
 import contextlib
 import dataclasses
 import errno
+import itertools
 import json
 import math
 import os
+import re
 import secrets
-from collections.abc import Iterator, Mapping
+import shutil
+import socket
+import sys
+import time
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.text import read_text
+
+ABANDONED_AFTER = 86400.0
+"""Seconds after which a temporary file counts as abandoned where its process cannot be asked."""
+_HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
+_PROCESS = secrets.token_hex(3)  # tells this process from a dead one of the same number
+_OWNED = re.compile(r"([0-9a-f]{8})-(\d+)-([0-9a-f]{6})-[0-9a-f]{8}")
+_TEMPORARY = re.compile(rf"\.({_OWNED.pattern}|[0-9a-f]{{12}})\.tmp(\..*)?")
 
 
 def explain(error: OSError, path: Path) -> UserError:
@@ -24,7 +39,6 @@ def explain(error: OSError, path: Path) -> UserError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return UserError(
             f"the disk is full: could not write {path}; free some space or choose another folder"
-            " (what was already saved is unharmed)"
         )
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return UserError(f"no permission for {path}; change that or choose another place")
@@ -66,7 +80,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     # Through a symbolic link the file it points at is replaced, not the link.
     final = Path(os.path.realpath(path))
     make_folder(final.parent)
-    temporary = final.with_name(f".{secrets.token_hex(6)}.tmp{final.suffix}")
+    temporary = final.with_name(f".{owned_name()}.tmp{final.suffix}")
     try:
         yield temporary
         # Before the rename: network disks report a full disk only here, and after a power cut an
@@ -79,6 +93,64 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink()
+
+
+def owned_name() -> str:
+    """Return a new name for something temporary; it states the host and the process."""
+    return f"{_HOST}-{os.getpid()}-{_PROCESS}-{secrets.token_hex(4)}"
+
+
+def is_temporary(name: str) -> bool:
+    """Return whether a file has a name of `atomic_path`, of this version or an earlier one."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
+def is_abandoned(path: Path) -> bool:
+    """Return whether the process that made something temporary has ended.
+
+    A process on another host cannot be asked, and names of earlier versions state none. Such a file
+    counts as abandoned after a day.
+    """
+    owner = _OWNED.search(path.name)
+    if owner is not None and owner[1] == _HOST and sys.platform != "win32":
+        number = int(owner[2])
+        if number == os.getpid():
+            return owner[3] != _PROCESS
+        try:
+            os.kill(number, 0)  # sends nothing
+        except (ProcessLookupError, OverflowError):
+            return True
+        except OSError:  # it runs under another user
+            return False
+        return False
+    try:
+        return time.time() - path.stat().st_mtime > ABANDONED_AFTER
+    except OSError:
+        return False
+
+
+def remove_abandoned(folder: Path, within: Iterable[str] = ()) -> None:
+    """Remove temporary files that dead processes left in a folder; call it as its only writer.
+
+    Args:
+        folder: the folder; its subfolders are not searched.
+        within: names of subfolders that are searched with all that they hold. Links are skipped.
+    """
+    walks = [itertools.islice(os.walk(folder), 1)]  # the folder alone
+    walks += [os.walk(folder / name) for name in within if not (folder / name).is_symlink()]
+    for here, _, names in itertools.chain.from_iterable(walks):
+        for path in (Path(here) / name for name in names if is_temporary(name)):
+            if is_abandoned(path):
+                remove(path)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder as far as that is possible; a link is removed, not its target."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
 
 
 def write_bytes(path: Path | str, data: bytes) -> None:
@@ -201,6 +273,8 @@ def read_safetensors(path: Path | str, what: str = "file") -> tuple[dict[str, An
     if not Path(path).is_file():
         raise UserError(f"{what}: {path} does not exist; check the path")
     try:
+        with open(path, "rb"):  # the library calls a file that may not be read absent
+            pass
         with safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except OSError as error:

@@ -19,8 +19,14 @@ SCHEMA_VERSION = 3
 FILE_NAME = "field.safetensors"
 
 
-def save_field(field: Field, run: Path) -> None:
-    """Write the field into a run folder, atomically."""
+def save_field(field: Field, run: Path, checkpoint: str = "") -> None:
+    """Write the field into a run folder, atomically.
+
+    Args:
+        field: the field.
+        run: the folder.
+        checkpoint: identity that the files of one checkpoint share; "" for a field alone.
+    """
     about = {
         "schema_version": SCHEMA_VERSION,
         "size": dataclasses.asdict(field.size),
@@ -28,6 +34,8 @@ def save_field(field: Field, run: Path) -> None:
         "near": field.near,
         "pruning_threshold": field.pruning_threshold,
     }
+    if checkpoint:
+        about["checkpoint"] = checkpoint
     tensors = {k: v.detach().contiguous() for k, v in field.state_dict().items()}
     write_safetensors(run / FILE_NAME, tensors, {"climatenerf": json.dumps(about)})
 

@@ -156,6 +156,7 @@ def plan(
     formats: Sequence[LayerFormat] = ("npz",),
     appearance: int | None = None,
     effects: Sequence[Effect] = EFFECTS,
+    digest: str | None = None,
 ) -> RenderJob:
     """Return the job that renders a fitted run along a path.
 
@@ -169,6 +170,7 @@ def plan(
         formats: file formats of the layers.
         appearance: index of a training view, from `appearance_index`; None takes the mean.
         effects: the effects that the weather has sections for.
+        digest: hash of the run's files that were read; None takes that of the files as they are.
 
     Raises:
         UserError: a value is out of range, the frames are too large, the run is incomplete, or EXR
@@ -183,7 +185,7 @@ def plan(
     if layers and "exr" in formats:
         require_exr()
     return RenderJob(
-        hash_of_run(run),
+        digest or hash_of_run(run),
         path,
         float(fps),
         weather,
@@ -259,13 +261,22 @@ def hash_of_run(run: Path) -> str:
     Raises:
         UserError: the run lacks one of them.
     """
+    return hash_of_files([run / name for name in ("field.safetensors", "scene.json")])
+
+
+def hash_of_files(paths: Iterable[Path]) -> str:
+    """Return the hash of the contents of files.
+
+    Raises:
+        UserError: one cannot be read.
+    """
     digest = hashlib.sha256()
-    for name in ("field.safetensors", "scene.json"):
+    for path in paths:
         try:
-            with (run / name).open("rb") as file:
+            with path.open("rb") as file:
                 digest.update(hashlib.file_digest(file, "sha256").digest())
         except OSError as error:
-            raise explain(error, run / name) from error
+            raise explain(error, path) from error
     return digest.hexdigest()
 
 
@@ -321,13 +332,14 @@ def render_frames(
         UserError: see `check_folder`; or a disk error.
     """
     indices = list(indices)
+    render_folder.continue_promotion(out)
     check_folder(job, out, preview)
-    render_folder.continue_promotion(out, job.key)
     missing = missing_frames(job, out, indices)
     if not missing:
         return
     render = prepare()
     with render_folder.locked(out):
+        render_folder.clear_abandoned(out, list(job.table))
         described = render_folder.describe(job.key, len(job), job.layers, job.formats, ())
         render_folder.claim(out, described)
     show = (lambda seen: write_png(out / PREVIEW, seen, SIMULATED)) if preview else None
@@ -354,8 +366,9 @@ def join(
 ) -> Path:
     """Write movie and sidecar from finished frames, and return the path of the movie.
 
-    A complete earlier render in the folder is replaced now. If nothing is to be done, nothing is
-    written. If the movie fails, the sidecar is written all the same.
+    A complete earlier render in the folder is replaced when both are written. If nothing is to be
+    done, nothing is written. If the movie fails, the sidecar is written all the same, and an
+    earlier render stays.
 
     Args:
         job: the job.
@@ -367,7 +380,7 @@ def join(
     Raises:
         UserError: frames are missing, ffmpeg fails, or a disk error.
     """
-    render_folder.continue_promotion(out, job.key)
+    render_folder.continue_promotion(out)
     missing = missing_frames(job, out)
     if missing:
         first = ", ".join(f"{index:04d}" for index in missing[:5])
@@ -376,16 +389,27 @@ def join(
             f"{', ...' if len(missing) > 5 else ''}); render them with the same flags, then join"
         )
     with render_folder.locked(out):
-        render_folder.promote(out, job.key)
-        render_folder.remove_abandoned(out)
+        render_folder.clear_abandoned(out, list(job.table))
+        folder = render_folder.working_folder(out, job.key)
         sidecar = _sidecar(job, scene, out)
-        if _joined(out, sidecar):
-            return out / MOVIE
-        try:
-            _encode(job, out, note, progress)
-        finally:
-            write_json(out / SIDECAR, sidecar)
+        if not _joined(folder, sidecar):
+            try:
+                _encode(job, folder, note, progress)
+            except UserError as error:
+                if folder == out:
+                    raise
+                raise _kept(error, out, folder) from error
+            finally:
+                write_json(folder / SIDECAR, sidecar)
+        render_folder.promote(out, job.key)
     return out / MOVIE
+
+
+def _kept(error: UserError, out: Path, folder: Path) -> UserError:
+    return UserError(
+        f"{error} (the frames wait in {folder}, and {out} keeps its earlier movie until the same"
+        " command has made the new one)"
+    )
 
 
 def render_movie(
@@ -403,6 +427,7 @@ def render_movie(
     A stopped render leaves a sidecar of the frames that are finished, and resumes with the same
     call. Arguments and errors are those of `render_frames` and `join`.
     """
+    render_folder.continue_promotion(out)
     check_folder(job, out, preview)
     if note is not None:  # before hours of rendering
         _note_about_movie(job, note)
@@ -518,20 +543,23 @@ def _joined(out: Path, wanted: dict[str, Any]) -> bool:
 
 
 def _encode(
-    job: RenderJob, out: Path, note: Callable[[str], None] | None, progress: Progress | None
+    job: RenderJob, folder: Path, note: Callable[[str], None] | None, progress: Progress | None
 ) -> None:
-    """Write the movie from the pictures."""
-    with MovieWriter(out / MOVIE, job.path.size, job.fps) as writer:
+    """Write the movie from the pictures in its folder."""
+    with MovieWriter(folder / MOVIE, job.path.size, job.fps) as writer:
         if note is not None and writer.note is not None:
             note(writer.note)
         for index in range(len(job)):
-            writer.add(read_rgb(out / job.files(index)[0]))
+            writer.add(read_rgb(folder / job.files(index)[0]))
             _report(progress, (index + 1) / len(job), "movie")
 
 
 def _write_partial_sidecar(job: RenderJob, scene: Scene, out: Path) -> None:
     """Describe the frames that a stopped render leaves: without a sidecar they are no data."""
-    with contextlib.suppress(UserError):
+    if not (out / render_folder.STATE).is_dir():
+        return
+    # A process that holds the lock for longer is joining, and describes all frames.
+    with contextlib.suppress(UserError), render_folder.locked(out, wait=2.0):
         folder = render_folder.working_folder(out, job.key)
         current = render_folder.current_render(folder)
         if current is not None and current["render"] == job.key:

@@ -46,7 +46,8 @@ def save_layers(
     table = layer_table() if table is None else table
     written: dict[str, list[str]] = {}
     for name, values in layers.items():
-        array = np.asarray(values, dtype=np.float32)
+        # Supersampled layers are views with strides, which OpenEXR ignores.
+        array = np.ascontiguousarray(values, dtype=np.float32)
         if name not in table or array.shape[2:] != ((3,) if name == "normal" else ()):
             raise ValueError(f"no layer {name!r} of shape {array.shape}; see layer_table")
         for kind in formats:

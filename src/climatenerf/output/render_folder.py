@@ -5,33 +5,45 @@
     OUT/movie.mp4, movie.json    written when the frames are joined
     OUT/.frames/render.json      the render that OUT holds
     OUT/.frames/0000.json        one record for each finished frame
-    OUT/.frames/next/            frames that will replace a finished render, laid out like OUT
+    OUT/.frames/next/            a render that will replace a complete one, laid out like OUT
 
 A frame is finished when its record exists. The record is written last, it holds the frame's key and
 the sizes of its files, and the picture carries the same key. Files move to their final names under
 an advisory lock of the operating system, so a killed process leaves neither a torn file nor a lock.
+
+A complete render stays as it is until the next one, its movie and its sidecar are complete in
+`next`. Then `promote` moves them, which needs no space on the disk. A promotion that a kill has
+interrupted is finished by the next call, whatever it renders.
 """
 
 import contextlib
 import errno
 import os
-import secrets
 import shutil
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.storage import atomic_path, explain, make_folder, read_json, write_json
+from climatenerf.core.locks import in_use
+from climatenerf.core.locks import locked as locked_file
+from climatenerf.core.storage import (
+    atomic_path,
+    explain,
+    is_abandoned,
+    make_folder,
+    owned_name,
+    read_json,
+    remove,
+    remove_abandoned,
+    write_json,
+)
 
 SCHEMA_VERSION = 1
 STATE = ".frames"
 NEXT = f"{STATE}/next"
 MOVIE, SIDECAR, PREVIEW = "movie.mp4", "movie.json", "preview.png"
-TEMPORARY = f".{'[0-9a-f]' * 12}.tmp.*"  # names of `storage.atomic_path`
-ABANDONED_AFTER = 3600.0
-"""Seconds after which unfinished files of a killed process are removed."""
+SCRATCH = "unfinished-"  # prefix of scratch folders
 
 
 def frame_files(index: int, layers: Sequence[str], formats: Sequence[str]) -> list[str]:
@@ -114,8 +126,8 @@ def check_foreign_files(
     for path in paths:
         if path.exists() and path.resolve() not in ours:
             raise UserError(
-                f"{path} was not made by the render that {out} holds, and would be overwritten;"
-                " choose another folder with -o, or remove it"
+                f"{path} would be overwritten, and {out} does not list it as a file of a render;"
+                " choose another folder with -o, or move it away"
             )
 
 
@@ -134,19 +146,24 @@ def working_folder(out: Path, key: str) -> Path:
         key: hash of the render.
 
     Raises:
-        UserError: the folder holds an unfinished render with other settings.
+        UserError: the folder holds another unfinished render.
     """
     current, waiting = current_render(out), current_render(out / NEXT)
     if current is not None and current["render"] == key:
         return out
-    if (current is not None and not is_complete(out, current)) or (
-        waiting is not None and waiting["render"] != key
-    ):
-        raise UserError(
-            f"{out} holds an unfinished render with other settings; finish that one with the flags"
-            " it was begun with, choose another folder with -o, or remove the folder"
-        )
+    if waiting is not None and waiting["render"] != key:
+        raise _unfinished(out, out / NEXT)
+    if waiting is None and current is not None and not is_complete(out, current):
+        raise _unfinished(out, out)
     return out / NEXT if files_of_render(out) else out
+
+
+def _unfinished(out: Path, folder: Path) -> UserError:
+    return UserError(
+        f"{out} holds an unfinished render with other settings, of another state of the run, or of"
+        " another version; finish it with the command that began it, choose another folder with"
+        f" -o, or remove {folder}"
+    )
 
 
 def is_complete(out: Path, current: Mapping[str, Any]) -> bool:
@@ -164,7 +181,7 @@ def claim(out: Path, described: Mapping[str, Any]) -> None:
     """Record in a folder which render it holds from now on; call it with the lock held.
 
     Raises:
-        UserError: the folder holds an unfinished render with other settings.
+        UserError: the folder holds another unfinished render.
     """
     folder = working_folder(out, described["render"])
     if current_render(folder) is None:
@@ -197,7 +214,7 @@ def frame_record(out: Path, index: int, key: str) -> dict[str, Any] | None:
 @contextlib.contextmanager
 def unfinished_files(out: Path) -> Iterator[Path]:
     """Yield a scratch folder inside `out` that is removed when the block ends."""
-    scratch = make_folder(out / STATE / f"unfinished-{secrets.token_hex(6)}")
+    scratch = make_folder(out / STATE / f"{SCRATCH}{owned_name()}")
     try:
         yield scratch
     finally:
@@ -240,9 +257,18 @@ def commit_frame(
 def promote(out: Path, key: str) -> None:
     """Move a complete render from `next` into `out`; call it with the lock held.
 
-    An interrupted move is finished by `continue_promotion`: `out` then holds the new render
-    already, and `next` the rest of its files.
+    Its `render.json` is written into `out` first. From then on any call finishes the promotion.
+    The sidecar is removed before the first file and comes last, so that it never describes files of
+    two renders. Ctrl-C takes effect when all is done, which takes less than a second.
     """
+    try:
+        _promote(out, key)
+    except KeyboardInterrupt:
+        _promote(out, key)
+        raise
+
+
+def _promote(out: Path, key: str) -> None:
     source = out / NEXT
     waiting = current_render(source)
     if waiting is not None and waiting["render"] == key:
@@ -251,19 +277,16 @@ def promote(out: Path, key: str) -> None:
             root = out.resolve()
             old = sorted(path.relative_to(root).as_posix() for path in files_of_render(out))
             write_json(out / STATE / "render.json", {**waiting, "replaces": old})
-        for name in (SIDECAR, MOVIE):  # they describe the earlier frames
-            (out / name).unlink(missing_ok=True)
-        for path in sorted(source.rglob("*")):
-            if path.is_file() and path != source / STATE / "render.json":
-                move(path, out / path.relative_to(source))
+        if (source / SIDECAR).exists():
+            (out / SIDECAR).unlink(missing_ok=True)
+        for name in _names_of(waiting):
+            if (source / name).exists():
+                move(source / name, out / name)
         shutil.rmtree(source, ignore_errors=True)
     current = current_render(out)
     if current is None or current["render"] != key or not current["replaces"]:
         return
-    wanted = {MOVIE, SIDECAR}
-    for index in range(current["frames"]):
-        wanted.update(frame_files(index, current["layers"], current["formats"]))
-    for name in set(current["replaces"]) - wanted:
+    for name in set(current["replaces"]) - set(_names_of(current)):
         (out / name).unlink(missing_ok=True)
     for path in (out / STATE).glob("*.json"):
         if path.stem.isdecimal() and int(path.stem) >= current["frames"]:
@@ -271,26 +294,38 @@ def promote(out: Path, key: str) -> None:
     write_json(out / STATE / "render.json", {**current, "replaces": []})
 
 
-def continue_promotion(out: Path, key: str) -> None:
+def _names_of(current: Mapping[str, Any]) -> list[str]:
+    """Return the files of a render, the sidecar last."""
+    names = []
+    for index in range(current["frames"]):
+        names += frame_files(index, current["layers"], current["formats"])
+        names.append(f"{STATE}/{index:04d}.json")
+    return [*names, MOVIE, SIDECAR]
+
+
+def continue_promotion(out: Path) -> None:
     """Finish moving a complete render into `out`, if a process was killed while it did so."""
 
-    def begun() -> bool:
-        found = [current_render(folder) for folder in (out, out / NEXT)]
-        return all(current is not None and current["render"] == key for current in found)
+    def begun() -> str | None:
+        current, waiting = current_render(out), current_render(out / NEXT)
+        if current is None:
+            return None
+        moving = waiting is not None and waiting["render"] == current["render"]
+        return current["render"] if moving or current["replaces"] else None
 
     if begun():
         with locked(out):
-            if begun():
+            key = begun()
+            if key:
                 promote(out, key)
 
 
-def remove_abandoned(out: Path) -> None:
-    """Remove scratch folders and temporary files of processes that were killed long ago."""
-    state = out / STATE
-    for path in [*state.glob("unfinished-*"), *state.glob(TEMPORARY), *out.glob(TEMPORARY)]:
-        with contextlib.suppress(OSError):
-            if time.time() - path.stat().st_mtime > ABANDONED_AFTER:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+def clear_abandoned(out: Path, layer_names: Sequence[str]) -> None:
+    """Remove scratch folders and temporary files of dead processes; call it with the lock held."""
+    remove_abandoned(out, (STATE, "frames", *layer_names))
+    for path in (out / STATE).glob(f"{SCRATCH}*"):
+        if is_abandoned(path):
+            remove(path)
 
 
 def move(source: Path, target: Path) -> None:
@@ -311,26 +346,21 @@ def move(source: Path, target: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(out: Path) -> Iterator[None]:
-    """Hold the folder's lock; other processes wait. The system frees it when a process dies.
+def locked(out: Path, *, wait: float | None = None) -> Iterator[None]:
+    """Hold the folder's lock; the system frees it when a process dies.
 
     A file system without locks gets none: every file is still replaced atomically, and the frames
     of one render are the same whichever process writes them.
-    """
-    from filelock import FileLock
 
-    make_folder(out / STATE)
-    lock = FileLock(out / STATE / "lock")
-    try:
-        lock.acquire()
-    except NotImplementedError:
-        pass
-    except OSError as error:
-        raise explain(error, out / STATE / "lock") from error
-    try:
+    Args:
+        out: the folder of the movie.
+        wait: how long to wait for another process, s; None: until it ends.
+
+    Raises:
+        UserError: the lock cannot be written, or another process still holds it.
+    """
+    with locked_file(make_folder(out / STATE) / "lock", wait=wait, busy=in_use(out)):
         yield
-    finally:
-        lock.release()
 
 
 def _png_text(path: Path, name: str) -> str | None:

@@ -41,6 +41,7 @@ from climatenerf.sfm.scene_folder import (
     discard_scene,
     install_scene,
     start_scene,
+    writing_scene,
 )
 from climatenerf.sfm.sidecars import Photo, import_sidecars
 from climatenerf.sfm.worker import reconstruct_in_subprocess
@@ -156,9 +157,17 @@ def capture(settings: CaptureSettings, listener: Listener) -> Captured:
         listener: callbacks.
 
     Raises:
-        UserError: the capture failed. An earlier scene in the folder is unchanged.
+        UserError: the capture failed, or another one works in the folder. An earlier scene in the
+            folder is unchanged.
     """
-    out, fresh = settings.out, not os.path.lexists(settings.out)
+    fresh = not os.path.lexists(settings.out)
+    with writing_scene(settings.out):
+        return _capture(settings, listener, fresh)
+
+
+def _capture(settings: CaptureSettings, listener: Listener, fresh: bool) -> Captured:
+    """Make a scene in a locked folder; `fresh`: the folder did not exist before."""
+    out = settings.out
     has_scene = (out / FILE_NAME).is_file()
     new = start_scene(out)
     try:

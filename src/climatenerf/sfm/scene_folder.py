@@ -13,6 +13,7 @@ from pathlib import Path
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.listing import is_system_file
+from climatenerf.core.locks import LOCK, only_writer
 from climatenerf.core.storage import explain, make_folder, read_json, write_json
 from climatenerf.scene import load_scene
 from climatenerf.scene.scene import FILE_NAME
@@ -83,6 +84,11 @@ def check_output(out: Path, given: Collection[str]) -> list[str]:
                 f" folder that --{kind} names, or omit --{kind}"
             )
         if key == kind or kind not in SIDECAR_KINDS:  # also a file in place of a folder
+            if not os.access(path, os.R_OK) and path.exists():
+                raise UserError(
+                    f"{path} may not be read, so it is not certain to be capture's; change its"
+                    " permissions, or choose another folder with -o"
+                )
             reason = (
                 "has changed since capture wrote it"
                 if key in record
@@ -93,6 +99,17 @@ def check_output(out: Path, given: Collection[str]) -> list[str]:
             )
         user_files.append(key)
     return user_files
+
+
+@contextlib.contextmanager
+def writing_scene(out: Path) -> Iterator[None]:
+    """Hold the lock of a scene folder, which no other capture may then write.
+
+    Raises:
+        UserError: another capture holds it, or the folder cannot be written.
+    """
+    with only_writer(out, (*ENTRIES, WORK)):
+        yield
 
 
 def start_scene(out: Path) -> Path:
@@ -112,7 +129,8 @@ def discard_scene(out: Path, fresh: bool) -> None:
         fresh: True if the folder did not exist before.
     """
     shutil.rmtree(out / WORK / "new", ignore_errors=True)
-    if fresh and not any(p.name != RECORD for p in out.rglob("*") if not p.is_dir()):
+    files = (path.name for path in out.rglob("*") if not path.is_dir())
+    if fresh and not any(name not in (RECORD, LOCK) for name in files):
         shutil.rmtree(out, ignore_errors=True)
 
 

@@ -1,26 +1,68 @@
 """Checkpoints of a fit: the field, and in `optimiser.safetensors` all else that continues it."""
 
 import dataclasses
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from climatenerf.core.device import to_numpy
 from climatenerf.core.errors import UserError
-from climatenerf.core.storage import read_safetensors, write_safetensors
+from climatenerf.core.storage import read_safetensors, write_json, write_safetensors
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.scene.scene import Scene, load_scene
-from climatenerf.training.folder import OPTIMISER, check_config
+from climatenerf.training.folder import check_config
+from climatenerf.training.snapshot import (
+    CONFIG,
+    FIELD,
+    OPTIMISER,
+    identity_of,
+    new_checkpoint,
+    stage_scene,
+)
 from climatenerf.training.trainer import Trainer
 
 OBSERVED_BATCHES, OBSERVED_RAYS = 4, 16384  # that find the cells which training photos show
 
 
-def checkpoint(trainer: Trainer, run: Path) -> None:
-    """Save the field and all that continues the fit, each file atomically."""
+def checkpoint(
+    trainer: Trainer,
+    run: Path,
+    scene: Scene | None = None,
+    config: Mapping[str, Any] | None = None,
+) -> None:
+    """Save the field and all that continues the fit; the files replace the earlier ones as one.
+
+    Args:
+        trainer: the fit.
+        run: the run folder.
+        scene: the scene as it is fitted; None keeps the one in the folder.
+        config: content of `config.json`; None keeps the file in the folder.
+    """
     mark_observed_cells(trainer)
-    save_field(trainer.field, run)
+    identity = _identity(trainer)
+    with new_checkpoint(run) as staging:
+        save_field(trainer.field, staging, identity)
+        write_safetensors(staging / OPTIMISER, _state(trainer), {"checkpoint": identity})
+        if config is not None:
+            write_json(staging / CONFIG, {**config, "checkpoint": identity})
+        if scene is not None:
+            stage_scene(scene, run, staging, identity)
+
+
+def _identity(trainer: Trainer) -> str:
+    """Return a name for the state of a fit, the same in equal fits."""
+    counters = f"{trainer.settings.seed} {trainer.steps} {trainer.samples} {trainer.rays}"
+    digest = hashlib.sha256(counters.encode())
+    digest.update(trainer.generator.get_state().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _state(trainer: Trainer) -> dict[str, torch.Tensor]:
+    """Return all but the field that continues a fit."""
     state = {f"grid.{k}": v for k, v in trainer.grid_adam.state().items()}
     for index, moments in trainer.net_adam.state_dict()["state"].items():
         state |= {f"net.{index}.{k}": torch.as_tensor(v, device="cpu") for k, v in moments.items()}
@@ -33,7 +75,7 @@ def checkpoint(trainer: Trainer, run: Path) -> None:
     state["counters"] = torch.tensor(counters, device="cpu")
     floats = [trainer.seconds, trainer.step_scale, trainer.error, trainer.progress]
     state["floats"] = torch.tensor(floats, dtype=torch.float64, device="cpu")
-    write_safetensors(run / OPTIMISER, state, {})
+    return state
 
 
 def mark_observed_cells(trainer: Trainer) -> None:
@@ -71,7 +113,12 @@ def restore(trainer: Trainer, run: Path) -> None:
         saved.near,
         saved.pruning_threshold,
     )
-    arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    arrays, about = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    if about.get("checkpoint", "") not in ("", identity_of(run / FIELD) or ""):
+        raise UserError(
+            f"{run / OPTIMISER} and {FIELD} are of different checkpoints; the run can be rendered"
+            " but not resumed, copy both again or fit anew into another folder"
+        )
     try:
         _restore_state(trainer, arrays)
     except (KeyError, ValueError, RuntimeError, TypeError) as error:

@@ -7,20 +7,23 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.storage import check_schema, read_json
 from climatenerf.scene.scene import Scene
 from climatenerf.training.settings import FitSettings, with_present_names
+from climatenerf.training.snapshot import CONFIG, METRICS, OPTIMISER, finish_after_kill
 
 SCHEMA_VERSION = 1  # of config.json
-OPTIMISER = "optimiser.safetensors"
 
 
 def check_folder(scene: Scene, run: Path, resume: bool) -> None:
     """Check that a fit would overwrite nothing in a folder, and could resume if it is to.
+
+    If a killed fit was moving its files into the folder, the moves are finished.
 
     Raises:
         UserError: the folder cannot be used.
     """
     if run.resolve() == scene.root.resolve():
         raise UserError(f"{run} is the capture itself; give another folder for the run with -o")
-    has_config = (run / "config.json").is_file()
+    finish_after_kill(run)
+    has_config = (run / CONFIG).is_file()
     if resume and not has_config:
         raise UserError(f"{run} holds no run to resume; leave --resume out to begin one")
     if resume and not (run / OPTIMISER).is_file():
@@ -31,7 +34,7 @@ def check_folder(scene: Scene, run: Path, resume: bool) -> None:
     if not resume and (run / "scene.json").exists() and not has_config:
         raise UserError(f"{run} holds a scene, which would be overwritten; choose another -o")
     # The optimiser's file is the last that a checkpoint writes; without it nothing is lost.
-    if not resume and ((run / OPTIMISER).exists() or (run / "metrics.json").exists()):
+    if not resume and ((run / OPTIMISER).exists() or (run / METRICS).exists()):
         raise UserError(
             f"{run} already holds a run; choose another -o, or continue it with --resume"
         )
@@ -43,7 +46,7 @@ def check_config(run: Path) -> dict:
     Raises:
         UserError: the file cannot be read, or a newer version wrote it.
     """
-    config = read_json(run / "config.json", "the run's configuration")
+    config = read_json(run / CONFIG, "the run's configuration")
     check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
     if isinstance(config.get("settings"), dict):
         config["settings"] = with_present_names(config["settings"])

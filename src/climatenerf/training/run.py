@@ -25,7 +25,7 @@ from climatenerf.scene.images import (
     load_mask,
     load_relative_depth,
 )
-from climatenerf.scene.scene import Scene, save_scene
+from climatenerf.scene.scene import Scene
 from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
@@ -33,6 +33,7 @@ from climatenerf.training.evidence.sparse_depth import unmasked_sparse_depth
 from climatenerf.training.folder import SCHEMA_VERSION, check_folder, check_resumable
 from climatenerf.training.settings import FitSettings, as_config
 from climatenerf.training.setup import compile_kernels, make_trainer
+from climatenerf.training.snapshot import METRICS, writing_run
 from climatenerf.training.trainer import Report, Trainer
 
 CHECKPOINT_INTERVAL = 60.0  # seconds
@@ -90,7 +91,8 @@ def fit_scene(
 ) -> dict:
     """Fit a field to a scene, write a run folder, and return the metrics.
 
-    Ctrl-C ends the fit early; the field learned so far is saved and measured.
+    Ctrl-C ends the fit early; the field learned so far is saved and measured. The folder is locked
+    against other writers; those who read it see the files of one checkpoint.
 
     Args:
         scene: the capture.
@@ -103,9 +105,26 @@ def fit_scene(
         device: where to compute.
 
     Raises:
-        UserError: the folder already holds a run (without resume) or none (with it).
+        UserError: the folder already holds a run (without resume) or none (with it), or another
+            process writes into it.
     """
     check_folder(scene, run, resume)
+    with writing_run(run):
+        check_folder(scene, run, resume)  # again: the other process may just have ended
+        return _fit(scene, run, settings, downscale, resume, (after_step, after_view), device)
+
+
+def _fit(
+    scene: Scene,
+    run: Path,
+    settings: FitSettings,
+    downscale: int,
+    resume: bool,
+    callbacks: tuple[Callable[[Report], None], Callable[[int, int], None]],
+    device: torch.device,
+) -> dict:
+    """Fit a field, with the folder locked; see `fit_scene`."""
+    after_step, after_view = callbacks
     if resume:
         check_resumable(run, settings)
         scene = in_frame_of(scene, run, downscale)
@@ -117,9 +136,7 @@ def fit_scene(
     if resume:
         restore(trainer, run)
     make_folder(run / "previews")
-    write_json(run / "config.json", _config(settings, downscale, trainer.field))
-    save_scene(with_corrections(scene, trainer), run)
-
+    config = _config(settings, downscale, trainer.field)
     last = {"checkpoint": time.monotonic(), "preview": time.monotonic()}
 
     def save_sometimes(state: Report) -> None:
@@ -129,8 +146,7 @@ def fit_scene(
             save_preview(trainer.field, with_corrections(scene, trainer), run, state.step)
             last["preview"] = time.monotonic()
         if now - last["checkpoint"] > CHECKPOINT_INTERVAL:
-            checkpoint(trainer, run)
-            save_scene(with_corrections(scene, trainer), run)
+            checkpoint(trainer, run, with_corrections(scene, trainer), config)
             last["checkpoint"] = time.monotonic()
 
     interrupted = False
@@ -140,9 +156,8 @@ def fit_scene(
     except KeyboardInterrupt:
         interrupted = True
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
-    checkpoint(trainer, run)
     scene = with_corrections(scene, trainer)
-    save_scene(scene, run)
+    checkpoint(trainer, run, scene, config)
     save_preview(trainer.field, scene, run, trainer.steps)
     metrics = {
         "seconds": round(trainer.seconds, 3),
@@ -153,9 +168,9 @@ def fit_scene(
         "train_views": len(scene.of_split("train")),
         "masked_fraction": masked_fraction(trainer),
     }
-    write_json(run / "metrics.json", metrics)
+    write_json(run / METRICS, metrics)
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
-    write_json(run / "metrics.json", metrics)
+    write_json(run / METRICS, metrics)
     return metrics
 
 
