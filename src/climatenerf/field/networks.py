@@ -20,8 +20,11 @@ def uniform_parameter(
 
     It is drawn on the CPU, so that a seed gives the same values on every device.
     """
+    device = torch.get_default_device()
+    if device.type == "meta":  # shapes without memory
+        return nn.Parameter(torch.empty(shape, device=device))
     drawn = torch.empty(shape, device="cpu").uniform_(-bound, bound, generator=generator)
-    return nn.Parameter(drawn.to(torch.get_default_device()))
+    return nn.Parameter(drawn.to(device))
 
 
 def dense_layers(generator: torch.Generator | None, *widths: int) -> nn.ParameterList:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
+import errno
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,13 +11,17 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
+from climatenerf.core import arrays
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain, one_line
 from climatenerf.core.srgb import to_linear
 from climatenerf.scene.label_spaces import to_train_ids
-from climatenerf.scene.scene import Scene, View
+from climatenerf.scene.scene import Scene, View, is_file
 
 RELATIVE_DEPTH = "depth_relative"
+MAX_PIXELS = 100_000_000
+"""Pixels of a picture; decoding one takes 1 GB. `climatenerf capture` reduces larger ones."""
+_STRIP = 2**22  # pixels that are averaged at once
 _ORIENTATION_TAG = 0x0112
 # Pillow operation that displays a stored image upright, by EXIF orientation.
 EXIF_TRANSPOSES = {
@@ -34,7 +38,8 @@ _SWAPS_SIDES = (5, 6, 7, 8)  # orientations that exchange width and height
 _DISPLAYED_UP = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
 _ALPHA_MODES = ("RGBA", "LA", "PA", "La", "RGBa")
 _IMAGE_ERRORS = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
-_ARRAY_ERRORS = (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error)
+# Larger pictures are refused here, by a sentence in place of Pillow's warning.
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 # Linear light of each 8-bit value, and the midpoints between consecutive values for re-encoding.
 _LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
@@ -81,6 +86,7 @@ def read_header(path: Path) -> Header:
     """
     try:
         with Image.open(path) as image:
+            _check_pixels(image, path)
             return _header(image)
     except _IMAGE_ERRORS as error:
         raise _image_error(path, error) from None
@@ -110,8 +116,13 @@ def load_image(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray
     if downscale == 1:
         return values
     # A larger pixel integrates light, so the average is over linear values.
-    linear = _area_average(_LINEAR[values], downscale)
-    return np.searchsorted(_LINEAR_EDGES, linear).astype(np.uint8)
+    rows = max(1, _STRIP // (values.shape[1] * downscale)) * downscale
+    strips = [
+        np.searchsorted(_LINEAR_EDGES, _area_average(_LINEAR[strip], downscale)).astype(np.uint8)
+        for start in range(0, values.shape[0], rows)
+        if len(strip := values[start : start + rows]) >= downscale or not start
+    ]
+    return np.concatenate(strips)
 
 
 def load_labels(view: View, scene: Scene, downscale: int = 1) -> UInt8[np.ndarray, "h w"] | None:
@@ -173,7 +184,7 @@ def load_relative_depth(
     name = scene.root / RELATIVE_DEPTH / view.name
     # The longer name first: `NAME.npz` may belong to `NAME.png` if `NAME.jpg.npz` exists.
     candidates = (name.with_name(f"{name.name}.npz"), name.with_suffix(".npz"))
-    path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    path = next((candidate for candidate in candidates if is_file(candidate)), None)
     if path is None:
         depth = load_depth(view, scene, downscale)
         return None if depth is None else 1.0 / depth
@@ -184,7 +195,7 @@ def load_relative_depth(
         if values.ndim != 2 or not values.size:
             raise ValueError("it must have shape height x width")
         relative = Image.fromarray(values.astype(np.float32))
-    except _ARRAY_ERRORS as error:
+    except arrays.ERRORS as error:
         raise _array_error("relative depth", path, error) from None
     full = scene.cameras[view.camera]
     _check_aspect(values, full, path)
@@ -247,7 +258,7 @@ def read_depth(path: Path) -> Float[np.ndarray, "h w"]:
                 raise UserError(
                     f"The depth {path} has 8 bits; use 16-bit PNG (millimetres), NPY or NPZ (m)."
                 )
-    except _ARRAY_ERRORS as error:
+    except arrays.ERRORS as error:
         raise _array_error("depth", path, error) from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
         depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
@@ -285,13 +296,14 @@ def to_rgb(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
         top = 255.0 if values.max(initial=0.0) <= 255 and image.mode != "I;16" else 65535.0
         grey = np.rint(np.clip(values / top, 0, 1) * 255).astype(np.uint8)
         return np.repeat(grey[..., None], 3, axis=-1)
-    return np.array(image.convert("RGB"))
+    return np.array(image if image.mode == "RGB" else image.convert("RGB"))
 
 
 def _read_image(path: Path) -> Image.Image:
     """Read and decode an image as stored."""
     try:
         with Image.open(path) as image:
+            _check_pixels(image, path)
             image.load()
             return image.copy()
     except _IMAGE_ERRORS as error:
@@ -302,6 +314,7 @@ def _read_posed_image(path: Path, camera: Camera) -> Image.Image:
     """Read an image, rotated by its EXIF orientation only if that gives the camera's size."""
     try:
         with Image.open(path) as image:
+            _check_pixels(image, path)
             image.load()
             header = _header(image)
             if header.rotates_to_fit(camera):
@@ -316,19 +329,34 @@ def _read_posed_image(path: Path, camera: Camera) -> Image.Image:
 
 def _read_array(path: Path) -> np.ndarray:
     """Read the array of an NPY file, or the first array of an NPZ file."""
-    data = np.load(path)
-    packed = isinstance(data, np.lib.npyio.NpzFile)
-    if packed != (path.suffix == ".npz"):
-        raise ValueError(f"it is no {path.suffix[1:].upper()}")
-    if not packed:
-        return data
-    with data:
-        return data[data.files[0]]
+    if path.suffix != ".npz":
+        return arrays.read_npy(path)
+    found = arrays.read_npz(path)
+    if not found:
+        raise ValueError("it holds no array")
+    return next(iter(found.values()))
+
+
+def _check_pixels(image: Image.Image, path: Path) -> None:
+    """Refuse a picture that takes too much memory; its header gives the size."""
+    if image.width * image.height > MAX_PIXELS:
+        raise _too_large(path, f"{image.width * image.height / 1e6:.0f}")
+
+
+def _too_large(path: Path, megapixels: str) -> UserError:
+    return UserError(
+        f"The image {path} has {megapixels} megapixels, more than the {MAX_PIXELS / 1e6:.0f} that"
+        " can be read; reduce it, or remove it and its pose."
+    )
 
 
 def _image_error(path: Path, error: Exception) -> UserError:
     if isinstance(error, FileNotFoundError):
         return UserError(f"The image {path} is missing; restore it or remove its pose.")
+    if isinstance(error, Image.DecompressionBombError):
+        return _too_large(path, f"over {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f}")
+    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+        return explain(error, path)  # such as a lack of permission
     return UserError(
         f"The image {path} cannot be read (truncated, damaged or of an unknown format); replace "
         "it or remove it."
@@ -337,7 +365,9 @@ def _image_error(path: Path, error: Exception) -> UserError:
 
 def _array_error(kind: str, path: Path, error: Exception) -> UserError:
     # NumPy refuses pickled objects, which could run code; its message is of no use to a user.
-    reason = "it holds no numbers" if "pickle" in str(error) else error
+    if isinstance(error, OSError) and error.errno is not None:
+        return explain(error, path)
+    reason = "it holds no numbers" if "pickle" in str(error) else one_line(str(error), 120)
     return UserError(f"The {kind} {path} cannot be read ({reason}); replace it.")
 
 

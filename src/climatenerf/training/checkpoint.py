@@ -1,15 +1,17 @@
 """Checkpoints of a fit: the field, and in `optimiser.safetensors` all else that continues it."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from climatenerf.core import parsing
 from climatenerf.core.device import to_numpy
-from climatenerf.core.errors import UserError
-from climatenerf.core.storage import read_safetensors, write_safetensors
-from climatenerf.field.checkpoint import load_field, save_field
+from climatenerf.core.errors import UserError, one_line
+from climatenerf.core.storage import check_finite, digest, read_safetensors, write_safetensors
+from climatenerf.field.checkpoint import MAX_VALUE, load_field, save_field
 from climatenerf.scene.scene import Scene, load_scene
 from climatenerf.training.folder import OPTIMISER, check_config
 from climatenerf.training.trainer import Trainer
@@ -33,7 +35,8 @@ def checkpoint(trainer: Trainer, run: Path) -> None:
     state["counters"] = torch.tensor(counters)
     floats = [trainer.seconds, trainer.step_scale, trainer.error, trainer.progress]
     state["floats"] = torch.tensor(floats, dtype=torch.float64)
-    write_safetensors(run / OPTIMISER, state, {})
+    about = json.dumps({"digest": digest(state)})
+    write_safetensors(run / OPTIMISER, state, {"climatenerf": about})
 
 
 def mark_observed_cells(trainer: Trainer) -> None:
@@ -71,17 +74,36 @@ def restore(trainer: Trainer, run: Path) -> None:
         saved.near,
         saved.pruning_threshold,
     )
-    arrays, _ = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    arrays, metadata = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    about = parsing.parse_json(metadata.get("climatenerf", "{}"), str(run / OPTIMISER))
     try:
+        _check_state(arrays, about)
         _restore_state(trainer, arrays)
-    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+    except (KeyError, ValueError, RuntimeError, TypeError, IndexError) as error:
         raise UserError(
-            f"{run / OPTIMISER} is damaged ({type(error).__name__}: {error}); the run can be"
-            " rendered but not resumed, fit anew into another folder"
+            f"{run / OPTIMISER} is damaged ({one_line(str(error), 120)}); the run can be rendered"
+            " but not resumed, fit anew into another folder"
         ) from error
     if not saved.knows_classes:  # the labels are new, so the class head begins to learn now
         objective = trainer.objective
         objective.classes_trusted_at = trainer.progress + trainer.schedule.refine_at
+
+
+def _check_state(arrays: dict[str, np.ndarray], about: object) -> None:
+    """Refuse the state of an optimiser that would make NaN of a sound field.
+
+    Raises:
+        ValueError: its checksum is wrong, or a number is not finite, far too large, or negative
+            where a square is expected.
+    """
+    expected = about.get("digest") if isinstance(about, dict) else None
+    if expected is not None and expected != digest(arrays):  # absent in earlier versions
+        raise ValueError("its checksum is another")
+    check_finite(arrays, MAX_VALUE)
+    for name, array in arrays.items():
+        negative = name.endswith((".second", ".exp_avg_sq", "steps", "counters"))
+        if negative and array.size and array.min() < 0:
+            raise ValueError(f"{name} holds a negative number")
 
 
 def _restore_state(trainer: Trainer, arrays: dict) -> None:

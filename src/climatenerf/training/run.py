@@ -41,6 +41,8 @@ PREVIEW_WIDTH = 240  # pixels
 MIN_PICTURE = 16  # pixels along each side; windows of the structural similarity have 11
 MIN_SPREAD = 1e-3  # m between cameras and their mean; nearer ones are in one position,
 MIN_INPUT_SPREAD = 1e-6  # as they are below this in units of the poses as given
+METRICS = "metrics.json"
+MAX_PIXELS_AFTER_STOP = 1_000_000  # that are rendered before a stopped fit ends: 3 s on two cores
 MIN_USABLE_FRACTION = 1e-3  # of the pixels that masks must leave
 
 
@@ -86,7 +88,7 @@ def fit_scene(
 ) -> dict:
     """Fit a field to a scene, write a run folder, and return the metrics.
 
-    Ctrl-C ends the fit early; the field learned so far is saved and measured.
+    Ctrl-C ends the fit early; the field learned so far is saved, and measured if that is quick.
 
     Args:
         scene: the capture.
@@ -124,6 +126,7 @@ def fit_scene(
             save_preview(trainer.field, with_corrections(scene, trainer), run, state.step)
             last["preview"] = time.monotonic()
         if now - last["checkpoint"] > CHECKPOINT_INTERVAL:
+            (run / METRICS).unlink(missing_ok=True)  # they are of an earlier end of the fit
             checkpoint(trainer, run)
             save_scene(with_corrections(scene, trainer), run)
             last["checkpoint"] = time.monotonic()
@@ -134,6 +137,7 @@ def fit_scene(
         trainer.run(save_sometimes)
     except KeyboardInterrupt:
         interrupted = True
+    (run / METRICS).unlink(missing_ok=True)
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     checkpoint(trainer, run)
     scene = with_corrections(scene, trainer)
@@ -148,10 +152,19 @@ def fit_scene(
         "train_views": len(scene.of_split("train")),
         "masked_fraction": masked_fraction(trainer),
     }
-    write_json(run / "metrics.json", metrics)
+    write_json(run / METRICS, metrics)
+    if interrupted and heldout_pixels(scene, downscale) > MAX_PIXELS_AFTER_STOP:
+        # The user waits for the end, and a resumed fit will be measured.
+        return metrics | {"psnr": None, "ssim": None, "psnr_cc": None}
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
-    write_json(run / "metrics.json", metrics)
+    write_json(run / METRICS, metrics)
     return metrics
+
+
+def heldout_pixels(scene: Scene, downscale: int) -> int:
+    """Return the number of pixels that measuring the held-out views renders."""
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("heldout")]
+    return sum((c.width // downscale) * (c.height // downscale) for c in cameras)
 
 
 def begin(scene: Scene, settings: FitSettings, downscale: int) -> Trainer:

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain
 from climatenerf.core.rotations import rotation_matrices
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
-from climatenerf.scene.scene import View
+from climatenerf.scene.readers.ply import MAX_POSITION
+from climatenerf.scene.scene import View, is_file
 
 # Model id -> (name, number of parameters), as in COLMAP's sensor/models.h.
 MODELS = {
@@ -161,7 +162,7 @@ def _image_folder(root: Path, names: list[str]) -> tuple[Path, Path]:
     for base in roots:
         for sub in IMAGE_FOLDERS:
             folder = base / sub
-            count = sum((folder / n).is_file() for n in names) if folder.is_dir() else 0
+            count = sum(is_file(folder / n) for n in names) if folder.is_dir() else 0
             if count > best_count:
                 best, best_count = (base, folder), count
     return best
@@ -235,9 +236,7 @@ class _Cursor:
         try:
             self.data = path.read_bytes()
         except OSError as error:
-            raise UserError(
-                f"{path} cannot be read ({error.strerror}); export the COLMAP model again."
-            ) from None
+            raise explain(error, path) from None
         self.offset = 0
 
     def damaged(self) -> UserError:
@@ -325,7 +324,7 @@ def _observed_rows(
 
 
 def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Return ids and positions, input frame, of the points with finite positions."""
+    """Return ids and positions, input frame, of the points up to `MAX_POSITION`."""
     path = model / f"points3D{_suffix(model)}"
     if not path.is_file():
         return np.empty(0, np.int64), np.empty((0, 3))
@@ -346,15 +345,17 @@ def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray
             values = cursor.take("q3d3BdQ")
             ids[i], points[i] = values[0], values[1:4]
             cursor.skip(8 * values[8])
-    finite = np.isfinite(points).all(axis=1)
-    return ids[finite], points[finite]
+    usable = (np.abs(points) <= MAX_POSITION).all(axis=1)  # NaN is not
+    return ids[usable], points[usable]
 
 
 def _lines(path: Path) -> list[str]:
     """Return the lines without comments; an empty line means an image without features."""
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise explain(error, path) from None
+    except UnicodeDecodeError as error:
         raise UserError(
             f"{path} cannot be read as text ({error}); export the COLMAP model again."
         ) from None

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain
 
 
 def text_lines(path: Path) -> list[str]:
@@ -21,7 +21,9 @@ def text_lines(path: Path) -> list[str]:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise UserError(f"{path} is missing; restore it from the source of the capture.") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise explain(error, path) from None
+    except UnicodeDecodeError as error:
         raise UserError(f"{path} cannot be read as text ({error}); replace it.") from None
     return [line.strip() for line in text.splitlines() if line.strip()]
 
