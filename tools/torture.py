@@ -92,7 +92,7 @@ def campaign(
         while chosen and len(done) < trials and time.monotonic() < until:
             for kind in chosen:
                 if len(done) < trials and time.monotonic() < until:
-                    done.append(run_trial(state, kind, seed))
+                    done.append(_noted(run_trial(state, kind, seed)))
             seed += 1
         seed = first_seed
         while others and time.monotonic() < begun + seconds:
@@ -140,7 +140,15 @@ def _kept(result: Trial | str, kind: str, skipped: dict[str, str]) -> list[Trial
     if isinstance(result, str):
         skipped[kind] = result
         return []
-    return [result]
+    return [_noted(result)]
+
+
+def _noted(trial: Trial) -> Trial:
+    """Print a line on standard error: a campaign that is stopped has shown what it found."""
+    verdict = "; ".join(trial.faults) or "passes"
+    line = f"{trial.name} [{trial.mutation}] status {trial.status}: {verdict}"
+    print(ascii(line), file=sys.stderr, flush=True)
+    return trial
 
 
 if __name__ == "__main__":

@@ -4,12 +4,11 @@ NumPy takes memory for what a header claims before it reads. Here the claim is h
 of the file, and against a bound on the size of an array, before that.
 """
 
-import io
 import math
 import zipfile
 import zlib
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 
@@ -67,7 +66,7 @@ def read_npz(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
         return {name: data[name] for name in data.files}
 
 
-def _check_claim(file: BinaryIO | io.BufferedIOBase, size: int, max_bytes: int) -> None:
+def _check_claim(file: IO[bytes], size: int, max_bytes: int) -> None:
     """Check that the header at the beginning of a file claims no more than the file holds.
 
     Args:

@@ -192,7 +192,8 @@ def digest(tensors: Mapping[str, Any]) -> int:
         head = f"{name} {array.dtype.str} {array.shape};"
         value = zlib.crc32(head.encode("utf-8", "backslashreplace"), value)
         flat = np.ascontiguousarray(array).reshape(-1)
-        value = zlib.crc32(flat.view(np.uint8) if flat.size else b"", value)
+        if flat.size:
+            value = zlib.crc32(memoryview(flat.view(np.uint8)), value)  # type: ignore[arg-type]
     return value
 
 

@@ -390,9 +390,9 @@ def _camera(data: Any, where: str) -> Camera:
     unknown = set(parsing.entries({"camera": data}, "camera", where)) - known
     if unknown:
         raise UserError(f"{where} has an unknown value {min(unknown)!r}; read the capture again.")
-    sides = {key: parsing.integer(data, key, where, 1, MAX_SIDE) for key in ("width", "height")}
-    needed = {key: parsing.number(data, key, where) for key in ("fx", "fy", "cx", "cy")}
-    other = [key for key in data if key not in (*sides, *needed, "fisheye")]
-    distortion = {key: parsing.number(data, key, where) for key in other}
+    width, height = (parsing.integer(data, k, where, 1, MAX_SIDE) for k in ("width", "height"))
+    fx, fy, cx, cy = (parsing.number(data, key, where) for key in ("fx", "fy", "cx", "cy"))
+    named = ("width", "height", "fx", "fy", "cx", "cy", "fisheye")
+    distortion = {key: parsing.number(data, key, where) for key in data if key not in named}
     fisheye = parsing.flag(data, "fisheye", where, False)
-    return Camera(**sides, **needed, **distortion, fisheye=fisheye)
+    return Camera(width, height, fx, fy, cx, cy, **distortion, fisheye=fisheye)
