@@ -30,7 +30,12 @@ from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
 from climatenerf.training.evidence.sparse_depth import unmasked_sparse_depth
-from climatenerf.training.folder import SCHEMA_VERSION, check_folder, check_resumable
+from climatenerf.training.folder import (
+    SCHEMA_VERSION,
+    check_folder,
+    check_resumable,
+    checked_metrics,
+)
 from climatenerf.training.settings import FitSettings, as_config
 from climatenerf.training.setup import compile_kernels, make_trainer
 from climatenerf.training.trainer import Report, Trainer
@@ -126,7 +131,7 @@ def fit_scene(
             save_preview(trainer.field, with_corrections(scene, trainer), run, state.step)
             last["preview"] = time.monotonic()
         if now - last["checkpoint"] > CHECKPOINT_INTERVAL:
-            (run / METRICS).unlink(missing_ok=True)  # they are of an earlier end of the fit
+            mark_unfinished(run)
             checkpoint(trainer, run)
             save_scene(with_corrections(scene, trainer), run)
             last["checkpoint"] = time.monotonic()
@@ -137,7 +142,7 @@ def fit_scene(
         trainer.run(save_sometimes)
     except KeyboardInterrupt:
         interrupted = True
-    (run / METRICS).unlink(missing_ok=True)
+    mark_unfinished(run)
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     checkpoint(trainer, run)
     scene = with_corrections(scene, trainer)
@@ -159,6 +164,23 @@ def fit_scene(
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
     write_json(run / METRICS, metrics)
     return metrics
+
+
+def mark_unfinished(run: Path) -> None:
+    """Take the scores out of the metrics of an earlier end, before another field is saved.
+
+    Raises:
+        UserError: the disk is full, or the file cannot be written.
+    """
+    if not (run / METRICS).is_file():
+        return
+    try:
+        earlier = checked_metrics(run / METRICS)
+    except UserError:  # damaged: it holds no scores
+        return
+    if not earlier["interrupted"] or "psnr" in earlier:
+        kept = {key: earlier[key] for key in ("seconds", "steps", "downscale") if key in earlier}
+        write_json(run / METRICS, {**kept, "interrupted": True})
 
 
 def heldout_pixels(scene: Scene, downscale: int) -> int:
