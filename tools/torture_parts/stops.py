@@ -19,7 +19,7 @@ from tools.torture_parts.zygote import ROOT, Runner
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
 MAX_SECONDS_AFTER_STOP = 10.0
 MOVIE = ["--path", "training", "--frames", "6", "--size", "48x27", "--flood.level", "0.3 m"]
-DISKS = {"export": ("20k", "200k"), "fit": ("100k", "2m"), "render": ("60k", "200k")}
+DISKS = {"export": ("20k", "200k"), "fit": ("100k", "2m"), "render": ("8k", "60k")}
 
 
 def commands(campaign: Campaign, out: Path) -> dict[str, list[str]]:
