@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.core.limits import check_seed
 from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, read_weather
 from climatenerf.weather.effect import Effect
@@ -151,6 +152,7 @@ def fit(
     from climatenerf.training.run import fit_scene
     from climatenerf.training.settings import Losses, settings_of
 
+    check_seed(seed)
     unknown = set(losses or {}) - {name for name in Losses.__dataclass_fields__}
     if unknown:
         raise UserError(f"there is no loss {min(unknown)!r}; see `climatenerf fit --help`")

@@ -117,6 +117,15 @@ def failing(error):
         (UserError("no photographs in /x; give another folder"), 2, "climatenerf: no photographs"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (OSError(errno.ENOSPC, "No space", "/x/a.png"), 2, "disk is full while writing /x/a.png"),
+        (OSError(errno.EIO, "broken"), 2, "the system refused a read or write"),
+        (OSError(errno.ENAMETOOLONG, "long", "/x/n"), 2, "longer than the disk allows"),
+        (PermissionError(errno.EACCES, "no", "/x/n"), 2, "no permission for /x/n"),
+        (MemoryError(), 2, "the memory is not enough"),
+        (RuntimeError("[enforce fail] can't allocate memory: 9\nx"), 2, "the memory is not enough"),
+        (RecursionError("maximum depth"), 1, "internal error"),
+        (UnicodeEncodeError("utf-8", "\udce9", 0, 1, "surrogates"), 2, "is not UTF-8"),
+        (BrokenPipeError(errno.EPIPE, "pipe"), 2, "ended early"),
+        (UserError("a name\n with \x1b[2J in it; rename it"), 2, r"a name with \x1b[2J in it"),
     ],
 )
 def test_expected_failures_are_one_line(verb, capsys, error, status, message):
@@ -200,13 +209,16 @@ def test_signal_handlers_are_restored_and_ignored_signals_stay_ignored(verb):
             signal.signal(number, handler)
 
 
-def test_unexpected_exceptions_propagate(verb):
-    verb.run = failing(ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
-        cli.main(["fit", "--scene", "a"])
-    verb.run = failing(OSError(errno.EIO, "broken"))
-    with pytest.raises(OSError):
-        cli.main(["fit", "--scene", "a"])
+def test_unexpected_exceptions_are_one_line_to_report(verb, capsys, monkeypatch):
+    verb.run = failing(ZeroDivisionError("so\nit goes"))
+    assert cli.main(["fit", "--scene", "a"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("climatenerf: internal error") and "ZeroDivisionError at" in err
+    assert "(so it goes)" in err and "please report" in err and err.count("\n") == 1
+    monkeypatch.setenv("CLIMATENERF_DEBUG", "1")
+    assert cli.main(["fit", "--scene", "a"]) == 1
+    err = capsys.readouterr().err
+    assert "Traceback" in err and err.splitlines()[-1].startswith("climatenerf: internal error")
 
 
 def test_wrong_options_exit_with_2(verb, capsys):

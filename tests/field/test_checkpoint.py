@@ -11,7 +11,7 @@ from support.random_field import directions, points, random_field
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU
-from climatenerf.core.storage import read_safetensors, write_safetensors
+from climatenerf.core.storage import digest, read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import FILE_NAME, SCHEMA_VERSION, load_field, save_field
 from climatenerf.render.volume import render_view
 
@@ -19,10 +19,11 @@ CAMERA = Camera(32, 24, 25.0, 25.0, 16.0, 12.0)
 
 
 def rewrite(run, change):
-    """Change the metadata or arrays of a field file."""
+    """Change the metadata or arrays of a field file, with a right checksum."""
     arrays, metadata = read_safetensors(run / FILE_NAME)
     about = json.loads(metadata["climatenerf"])
     change(about, arrays)
+    about["digest"] = digest(arrays)
     write_safetensors(run / FILE_NAME, arrays, {"climatenerf": json.dumps(about)})
 
 
@@ -132,12 +133,35 @@ def without(name):
         lambda about, _: about.update(pruning_threshold="a hair"),
         lambda about, _: about.update(pruning_threshold=float("nan")),
         lambda about, arrays: arrays["centre"].fill(np.nan),
+        lambda about, arrays: arrays["centre"].fill(1e38),
+        lambda about, arrays: arrays["surface_net.0"].reshape(-1)[:1].fill(np.nan),
+        lambda about, arrays: arrays["embeddings"].fill(-1e38),
+        lambda about, _: about.update(unit=1e300),
+        lambda about, _: about.update(unit=10**30),
+        lambda about, _: about.update(near=-1.0),
+        lambda about, _: about.update(size=5),
+        lambda about, _: about["size"].update(geometry_log2_rows=26, geometry_levels=64),
+        lambda about, _: about["size"].update(cascades=10**9),
+        lambda about, _: about["size"].update(cascades=40),
+        lambda about, _: about["size"].update(coarsest=0),
+        lambda about, _: about["size"].update(colour_hidden=2**20),
+        lambda about, arrays: arrays.update(surplus=np.zeros(3, np.float32)),
+        lambda about, arrays: arrays.update(embeddings=np.zeros(3, np.float32)),
     ],
 )
 def test_damaged_content_is_a_user_error(tmp_path, change):
     save_field(random_field(), tmp_path)
     rewrite(tmp_path, change)
     with pytest.raises(UserError, match="damaged"):
+        load_field(tmp_path)
+
+
+def test_a_flipped_bit_is_found(tmp_path):
+    save_field(random_field(), tmp_path)
+    data = bytearray((tmp_path / FILE_NAME).read_bytes())
+    data[-1000] ^= 1
+    (tmp_path / FILE_NAME).write_bytes(data)
+    with pytest.raises(UserError, match="damaged .its checksum"):
         load_field(tmp_path)
 
 

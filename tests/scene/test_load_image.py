@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from climatenerf.core.errors import UserError
-from climatenerf.scene import Camera, Scene, View, load_image
+from climatenerf.scene import Camera, Scene, View, images, load_image
 from climatenerf.scene.images import (
     downscaled_camera,
     load_depth,
@@ -68,6 +68,14 @@ def test_downscale_averages_linear_light(tmp_path):
     checks = ((np.indices((24, 32)).sum(axis=0) % 2) * 255).astype(np.uint8)
     values = load_image(*save(tmp_path, Image.fromarray(checks)), 2)
     assert values.shape == (12, 16, 3) and (values == 188).all()
+
+
+@pytest.mark.parametrize("downscale", [2, 3, 5])
+def test_averaging_in_strips_changes_nothing(tmp_path, monkeypatch, downscale):
+    view, scene = save(tmp_path, Image.fromarray(RGB))
+    whole = load_image(view, scene, downscale)
+    monkeypatch.setattr(images, "_STRIP", 100)
+    np.testing.assert_array_equal(load_image(view, scene, downscale), whole)
 
 
 def test_downscale_keeps_uniform_colours_and_crops_the_rest(tmp_path):

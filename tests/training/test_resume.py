@@ -306,12 +306,31 @@ def test_a_missing_or_incomplete_optimiser_state_is_a_user_error(scene, tmp_path
     fitted(scene, tmp_path / "run", steps=2)
     path = tmp_path / "run" / "optimiser.safetensors"
     arrays, about = read_safetensors(path)
-    write_safetensors(path, {k: v for k, v in arrays.items() if k != "generator"}, about)
+    fewer = {k: v for k, v in arrays.items() if k != "generator"}
+    write_safetensors(path, fewer, about)
+    with pytest.raises(UserError, match="damaged .its checksum"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+    write_safetensors(path, fewer, {})
     with pytest.raises(UserError, match="damaged.*generator.*rendered but not resumed"):
         fitted(scene, tmp_path / "run", steps=4, resume=True)
     path.unlink()
     with pytest.raises(UserError, match="rendered but not resumed"):
         fitted(scene, tmp_path / "run", steps=4, resume=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("grid.0.first", np.nan), ("grid.0.second", -1e38), ("floats", np.inf)]
+)
+def test_an_optimiser_state_that_would_make_nan_is_refused(scene, tmp_path, name, value):
+    fitted(scene, tmp_path / "run", steps=2)
+    path = tmp_path / "run" / "optimiser.safetensors"
+    arrays, _ = read_safetensors(path)
+    arrays[name] = np.full_like(arrays[name], value)
+    write_safetensors(path, arrays, {})
+    before = (tmp_path / "run" / "field.safetensors").read_bytes()
+    with pytest.raises(UserError, match=f"damaged .{name}"):
+        fitted(scene, tmp_path / "run", steps=4, resume=True)
+    assert (tmp_path / "run" / "field.safetensors").read_bytes() == before
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,15 @@ import os
 import signal
 import sys
 import threading
+import traceback
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import climatenerf
-from climatenerf.core.errors import UserError
+from climatenerf.cli import streams
+from climatenerf.core.errors import UserError, explain, one_line
 
 # Set before torch and Numba are imported, unless the user has set them. Both load an OpenMP run
 # time. Threads of one that spin long after a parallel region take cores from the other; threads
@@ -60,36 +64,87 @@ VERBS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
+    Whatever goes wrong, standard error ends with one sentence. `CLIMATENERF_DEBUG=1` shows the
+    traceback before it.
+
     Args:
         arguments: words after the program's name; None takes those of this process.
 
     Returns:
-        Exit status: 0; 2 after an error that the user can correct; 130 after Ctrl-C; 143 after
-        `kill`; 129 after the terminal is closed.
+        Exit status: 0; 1 after an error of the program itself; 2 after an error that the user can
+        correct; 130 after Ctrl-C; 143 after `kill`; 129 after the terminal is closed.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    streams.open_all()
     try:
-        with _stopped_like_ctrl_c():
-            status = _run(words)
-        sys.stdout.flush()  # here, so that a closed pipe is handled below
-        return status
-    except UserError as error:
-        return _complain(str(error))
-    except KeyboardInterrupt as stop:
-        with contextlib.suppress(OSError):  # the terminal may be closed
-            sys.stderr.write("\nclimatenerf: interrupted\n")
-        return 128 + (stop.args[0] if stop.args else signal.SIGINT)
-    except BrokenPipeError:
-        # The reader (`| head`) has exited. Redirecting prevents a second error at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except OSError as error:
+        try:
+            with _stopped_like_ctrl_c(), _without_warnings():
+                return _run(words)
+        finally:
+            streams.flush_output()
+    except (KeyboardInterrupt, Exception) as error:
+        try:
+            if os.environ.get("CLIMATENERF_DEBUG"):
+                streams.complain("".join(traceback.format_exception(error)))
+            status, sentence = outcome(error)
+            streams.complain(sentence)
+            return status
+        except KeyboardInterrupt as again:  # a second signal
+            return outcome(again)[0]
+
+
+def outcome(error: BaseException) -> tuple[int, str]:
+    """Return the exit status and the line on standard error for what ended a verb."""
+    if isinstance(error, KeyboardInterrupt):
+        number = error.args[0] if error.args else signal.SIGINT
+        return 128 + number, "\nclimatenerf: interrupted\n"
+    if isinstance(error, UserError):
+        return _sentence(str(error))
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):  # NumPy; torch
+        return _sentence(
+            "the memory is not enough for this; use --downscale for a fit, a smaller --size for"
+            " a render, or a machine with more memory"
+        )
+    if isinstance(error, BrokenPipeError):
+        return _sentence("a program that takes or gives data has ended early; run it again")
+    if isinstance(error, OSError):
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             where = f" while writing {error.filename}" if error.filename else ""
-            return _complain(f"the disk is full{where}; free some space and run it again")
-        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS) and error.filename:
-            return _complain(f"{error.filename} may not be read or written; change its permissions")
-        raise
+            return _sentence(f"the disk is full{where}; free some space and run it again")
+        if error.errno is not None and error.filename is not None:
+            return _sentence(str(explain(error, Path(os.fsdecode(error.filename)))))
+        if error.errno is not None:
+            return _sentence(f"the system refused a read or write ({error}); check the disk")
+    if isinstance(error, UnicodeError):
+        return _sentence(
+            f"a name or a text is not UTF-8 ({error}); rename the file, or convert the text"
+        )
+    return 1, one_line(
+        f"climatenerf: internal error in version {climatenerf.__version__}: {_place(error)};"
+        " please report it with this line, and with what CLIMATENERF_DEBUG=1 shows"
+    ) + "\n"
+
+
+def _sentence(message: str) -> tuple[int, str]:
+    return 2, one_line(f"climatenerf: {message}") + "\n"
+
+
+def _place(error: BaseException) -> str:
+    """Return type and message of an error, and the innermost line of this program it came from."""
+    frames = traceback.extract_tb(error.__traceback__)
+    root = str(Path(climatenerf.__file__).parent)
+    own = [frame for frame in frames if frame.filename.startswith(root)] or frames
+    where = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+    return f"{type(error).__name__}{where} ({one_line(str(error), 300)})"
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Hide warnings of libraries, which name lines of code; `python -W` and debugging show them."""
+    with warnings.catch_warnings():
+        if not sys.warnoptions and not os.environ.get("CLIMATENERF_DEBUG"):
+            warnings.simplefilter("ignore")
+        yield
 
 
 @contextlib.contextmanager
@@ -116,10 +171,10 @@ def _stop(number: int, frame: object) -> None:
 
 def _run(words: list[str]) -> int:
     if not words or words[0] in ("-h", "--help", "help"):
-        sys.stdout.write(usage())
+        streams.write_output(usage())
         return 0 if words else 2
     if words[0] in ("-V", "--version"):
-        sys.stdout.write(f"climatenerf {climatenerf.__version__}\n")
+        streams.write_output(f"climatenerf {climatenerf.__version__}\n")
         return 0
     name = words[0]
     if name not in VERBS:
@@ -127,6 +182,13 @@ def _run(words: list[str]) -> int:
         hint = f"did you mean {near[0]}?" if near else f"use one of {', '.join(VERBS)}."
         raise UserError(f"there is no verb {name!r}; {hint}")
     _check_out(words[1:])
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise UserError(
+            "the folder in which this runs no longer exists; change to another one (cd) and run it"
+            " again"
+        ) from error
     for variable, value in THREADING.items():
         os.environ.setdefault(variable, value)
     import tyro
@@ -169,8 +231,3 @@ def usage() -> str:
             "",
         ]
     )
-
-
-def _complain(message: str) -> int:
-    sys.stderr.write(f"climatenerf: {message}\n")
-    return 2

@@ -11,7 +11,8 @@ from climatenerf.cli import progress
 from climatenerf.cli.fit import Fit, fit_with_bars, summary
 from climatenerf.cli.render import parse_size
 from climatenerf.core.errors import UserError
-from climatenerf.core.storage import read_json
+from climatenerf.core.limits import MAX_FRAMES
+from climatenerf.training.folder import checked_metrics
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.snow.parameters import Snow
@@ -44,8 +45,8 @@ class Demo:
 
 def run(options: Demo) -> int:
     """Fit, render four movies and a contact sheet, and print where they are."""
-    if not options.minutes > 0 or options.frames < 1:
-        raise UserError("--minutes and --frames must be above 0")
+    if not 0 < options.minutes < float("inf") or not 1 <= options.frames <= MAX_FRAMES:
+        raise UserError(f"--minutes must be above 0, and --frames from 1 to {MAX_FRAMES}")
     size = parse_size(options.size)
     run_folder = options.out / "run"
     with as_file(files("climatenerf") / "assets" / "street") as street:
@@ -89,8 +90,8 @@ def finished(run_folder: Path) -> dict | None:
     """Return the metrics of a complete fit, or None."""
     if not (run_folder / "metrics.json").is_file():
         return None
-    metrics = read_json(run_folder / "metrics.json", "the run's metrics")
-    return metrics if "psnr" in metrics and not metrics.get("interrupted") else None
+    metrics = checked_metrics(run_folder / "metrics.json")
+    return metrics if "psnr" in metrics and not metrics["interrupted"] else None
 
 
 def _frames(folder: Path) -> list:

@@ -55,12 +55,11 @@ def run(options: Evaluate) -> int:
         )
 
     from climatenerf.api import load_run
-    from climatenerf.core.storage import read_json
     from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.evaluation.scores import evaluate
     from climatenerf.output.score_report import check_folder, table_text, write_report
-    from climatenerf.training.folder import check_config
+    from climatenerf.training.folder import check_config, checked_metrics
 
     fitted = load_run(options.run)
     field, scene = fitted.field, fitted.scene
@@ -70,7 +69,7 @@ def run(options: Evaluate) -> int:
         raise UserError(f"{options.out} lies in the reference set; choose another folder with -o")
     check_views(scene, reference)
     measured = options.run / "metrics.json"  # absent after an interrupted fit
-    metrics = read_json(measured, "the run's measurements") if measured.exists() else {}
+    metrics = checked_metrics(measured) if measured.exists() else {}
     names = ["clean", *(case.name for case in reference.weathers)]
     old = check_folder(options.out, names)
     with progress.Bar("evaluate", len(names) + 7) as bar:
@@ -93,7 +92,7 @@ def run(options: Evaluate) -> int:
 
 def run_ablation(options: Evaluate) -> int:
     """Fit and score every row; print the table and the path of the report."""
-    if not options.minutes > 0 or options.downscale < 1 or options.seeds < 1:
+    if not 0 < options.minutes < float("inf") or options.downscale < 1 or options.seeds < 1:
         raise UserError("--minutes must be above 0, --downscale and --seeds at least 1")
     if options.reference or options.views or options.weathers:
         raise UserError("--ablation excludes --reference, --views and --weathers; leave them out")

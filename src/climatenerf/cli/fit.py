@@ -9,6 +9,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError
+from climatenerf.core.limits import check_seed
 from climatenerf.scene import Scene, read_scene
 from climatenerf.scene.alignment.known_length import (
     FILE_NAME,
@@ -17,10 +18,14 @@ from climatenerf.scene.alignment.known_length import (
     read_marks,
 )
 from climatenerf.scene.alignment.scale import scale_findings, scale_summary
+from climatenerf.scene.scene import checked_world
 from climatenerf.training.folder import check_folder, check_resumable
 from climatenerf.training.settings import RENAMED_LOSSES, FitSettings, Losses, settings_of
 from climatenerf.training.snapshot import writing_run
 from climatenerf.weather.units import LENGTH, OptionalLength, parse_quantity
+
+MAX_LENGTH = 1e6  # m: of a known length
+MAX_LIMIT = 1e12  # minutes or steps
 
 
 @dataclass(frozen=True)
@@ -85,8 +90,12 @@ def run(options: Fit) -> int:
     """Read the capture, fit, and print where the run is and how good it is."""
     settings = fit_settings(options)  # reports wrong flags before photos are read
     limits = [each for each in (settings.minutes, settings.steps) if each is not None]
-    if not all(0 < limit < float("inf") for limit in limits):
-        raise UserError("--minutes and --steps must be numbers above 0; try --minutes 5")
+    if not all(0 < limit < MAX_LIMIT for limit in limits):
+        raise UserError(
+            f"--minutes and --steps must be numbers above 0 and below {MAX_LIMIT:g}; try"
+            " --minutes 5"
+        )
+    check_seed(options.seed)
     if options.downscale < 1:
         raise UserError(f"--downscale must be 1 or more; got {options.downscale}")
     given = options.camera_height is not None or options.metric_input or options.known_length
@@ -147,7 +156,8 @@ def with_known_lengths(scene: Scene, lengths: tuple[str, ...], marks: Path | Non
         return scene
     known = parse_known_lengths(lengths)
     marked = read_marks(marks or scene.root / FILE_NAME)
-    return apply_known_lengths(scene, [measure(scene, marked, *each) for each in known])
+    scaled = apply_known_lengths(scene, [measure(scene, marked, *each) for each in known])
+    return checked_world(scaled, str(scene.root))
 
 
 def parse_known_lengths(lengths: tuple[str, ...]) -> list[tuple[str, float]]:
@@ -162,8 +172,10 @@ def parse_known_lengths(lengths: tuple[str, ...]) -> list[tuple[str, float]]:
         if not equals:
             raise UserError(f'--known-length needs a name and a length, "DOOR=2.0 m"; got "{text}"')
         metres = parse_quantity(length, LENGTH, "--known-length")
-        if not metres > 0:
-            raise UserError(f'--known-length must be above 0; got "{text}"')
+        if not 0 < metres <= MAX_LENGTH:
+            raise UserError(
+                f'--known-length must be above 0 and at most {MAX_LENGTH:g} m; got "{text}"'
+            )
         if name.strip() in known:
             raise UserError(f"--known-length gives {name.strip()} twice; give it once")
         known[name.strip()] = metres
@@ -320,6 +332,8 @@ def summary(metrics: dict) -> str:
     cost = f"{metrics['steps']} steps, {metrics['seconds']:.0f} s of fitting"
     if metrics.get("masked_fraction"):  # runs of earlier versions have none
         cost += f"; {metrics['masked_fraction']:.1%} of the photos masked as passers-by"
+    if metrics["psnr"] is None and metrics["interrupted"]:
+        return f"held-out photos are not measured after a stop; {cost}"
     if metrics["psnr"] is None:
         return f"no held-out photos to measure; {cost}"
     return (

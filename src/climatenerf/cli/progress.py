@@ -1,15 +1,17 @@
 """Output for the user: progress bars with ETA in a terminal, plain lines elsewhere.
 
-This is the only module that prints. Progress goes to standard error; results (paths of files, the
+Verbs print through this module. Progress goes to standard error; results (paths of files, the
 PSNR) go to standard output, so that they can be piped.
 """
 
+import contextlib
 import functools
-import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sized
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TypeVar
+
+from climatenerf.cli import streams
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -170,7 +172,8 @@ def track(title: str, items: Iterable[Item], quiet: bool = False) -> Iterator[It
 
 def say(text: str) -> None:
     """Print a line on standard error, above the progress bar if one is shown."""
-    _console().print(text, markup=False, highlight=False, soft_wrap=True)
+    with contextlib.suppress(OSError, ValueError):  # a closed standard error ends no work
+        _console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def warn(text: str) -> None:
@@ -191,8 +194,7 @@ def report_findings(findings: "Iterable[Finding]") -> None:
 
 def result(text: str) -> None:
     """Print a result on standard output."""
-    sys.stdout.write(text + "\n")
-    sys.stdout.flush()
+    streams.write_output(text + "\n")
 
 
 def duration(seconds: float | None) -> str:

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, one_line
+from climatenerf.core.limits import MAX_FRAMES
 from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects
@@ -81,8 +82,8 @@ def run(
         effects: those that the options have flags for; None takes the installed effects.
     """
     size = parse_size(options.size)
-    if options.frames < 1 or not 1 <= options.supersample <= 8:
-        raise UserError("--frames must be above 0, --supersample from 1 to 8")
+    if not 1 <= options.frames <= MAX_FRAMES or not 1 <= options.supersample <= 8:
+        raise UserError(f"--frames must be from 1 to {MAX_FRAMES}, --supersample from 1 to 8")
     part = parse_part(options.part)
     if part is not None and options.join:
         raise UserError(
@@ -133,9 +134,11 @@ def parse_part(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     number, slash, count = (word.strip() for word in text.partition("/"))
-    if not (slash and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+    digits = slash and number.isdecimal() and count.isdecimal() and len(number + count) < 20
+    if not (digits and 1 <= int(number) <= int(count)):
+        got = one_line(text, 60)
         raise UserError(
-            f'--part must be a number and a count, from 1/N to N/N such as 3/16; got "{text}"'
+            f'--part must be a number and a count, from 1/N to N/N such as 3/16; got "{got}"'
         )
     return int(number), int(count)
 
@@ -149,6 +152,11 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     parts = text.lower().split("x")
-    if len(parts) != 2 or not all(p.isdecimal() and 16 <= int(p) <= 8192 for p in parts):
-        raise UserError(f'--size must be width x height such as 480x270, 16 to 8192; got "{text}"')
+    if len(parts) != 2 or not all(_is_side(p) for p in parts):
+        got = one_line(text, 60)
+        raise UserError(f'--size must be width x height such as 480x270, 16 to 8192; got "{got}"')
     return int(parts[0]), int(parts[1])
+
+
+def _is_side(text: str) -> bool:
+    return text.isdecimal() and len(text) < 9 and 16 <= int(text) <= 8192

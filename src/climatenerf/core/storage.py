@@ -23,8 +23,28 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from climatenerf.core.errors import UserError
-from climatenerf.core.text import read_text
+from climatenerf.core.errors import UserError, explain, one_line, shown
+from climatenerf.core.parsing import read_json
+
+__all__ = [
+    "atomic_path",
+    "check_finite",
+    "check_schema",
+    "digest",
+    "explain",
+    "is_abandoned",
+    "is_temporary",
+    "make_folder",
+    "owned_name",
+    "plain",
+    "read_json",
+    "read_safetensors",
+    "remove",
+    "remove_abandoned",
+    "write_bytes",
+    "write_json",
+    "write_safetensors",
+]
 
 ABANDONED_AFTER = 86400.0
 """Seconds after which a temporary file counts as abandoned where its process cannot be asked."""
@@ -32,25 +52,6 @@ _HOST = f"{zlib.crc32(socket.gethostname().encode()):08x}"
 _PROCESS = secrets.token_hex(3)  # tells this process from a dead one of the same number
 _OWNED = re.compile(r"([0-9a-f]{8})-(\d+)-([0-9a-f]{6})-[0-9a-f]{8}")
 _TEMPORARY = re.compile(rf"\.({_OWNED.pattern}|[0-9a-f]{{12}})\.tmp(\..*)?")
-
-
-def explain(error: OSError, path: Path) -> UserError:
-    """The sentence a user can act on for a failed read or write of ``path``."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UserError(
-            f"the disk is full: could not write {path}; free some space or choose another folder"
-        )
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return UserError(f"no permission for {path}; change that or choose another place")
-    if error.errno in (errno.ENOTDIR, errno.EEXIST):
-        return UserError(
-            f"cannot create {path}: something on the way there is a file, not a folder;"
-            " choose another place"
-        )
-    if error.errno == errno.EISDIR:
-        return UserError(f"{path} is a folder where a file was expected; choose another name")
-    reason = error.strerror or str(error)
-    return UserError(f"could not read or write {path}: {reason}; check the disk and the path")
 
 
 def make_folder(path: Path | str) -> Path:
@@ -172,8 +173,12 @@ def write_json(path: Path | str, value: Any) -> None:
     Raises:
         UserError: the disk is full, or the place cannot be written.
     """
-    text = json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
+    value = plain(value)
+    try:
+        text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False).encode()
+    except UnicodeEncodeError:  # a file name that is not UTF-8, which JSON holds as an escape
+        text = json.dumps(value, indent=1, allow_nan=False).encode()
+    write_bytes(path, text + b"\n")
 
 
 def plain(value: Any) -> Any:
@@ -194,38 +199,6 @@ def plain(value: Any) -> Any:
     if to_list is not None:
         return plain(to_list())
     raise TypeError(f"{type(value).__name__} cannot be written as JSON")
-
-
-def read_json(path: Path | str, what: str = "file") -> dict[str, Any]:
-    """Reads a JSON object.
-
-    Args:
-        path: the file.
-        what: what it is to the user ("run", "camera path"), for the error message.
-
-    Raises:
-        UserError: absent, unreadable, not JSON, or not an object.
-    """
-    try:
-        text = read_text(Path(path))
-    except UserError as error:  # another encoding
-        raise UserError(f"{what}: {error}") from error
-    except FileNotFoundError as error:
-        raise UserError(f"{what}: {path} does not exist; check the path") from error
-    except OSError as error:
-        raise explain(error, Path(path)) from error
-    try:
-        value = json.loads(text)
-    except RecursionError as error:
-        raise UserError(f"{what}: {path} is nested too deeply to be sound; restore it") from error
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"{what}: {path} is not valid JSON (line {error.lineno}, column {error.colno}:"
-            f" {error.msg}); it is damaged or cut off, restore or recreate it"
-        ) from error
-    if not isinstance(value, dict):
-        raise UserError(f"{what}: {path} should hold a JSON object {{...}}; recreate it")
-    return value
 
 
 def write_safetensors(
@@ -273,14 +246,47 @@ def read_safetensors(path: Path | str, what: str = "file") -> tuple[dict[str, An
     if not Path(path).is_file():
         raise UserError(f"{what}: {path} does not exist; check the path")
     try:
-        with open(path, "rb"):  # the library calls a file that may not be read absent
+        with open(path, "rb"):  # the library does not tell a forbidden file from a damaged one
             pass
+        # The library maps the file, and holds sizes in its header against the file's.
         with safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except OSError as error:
         raise explain(error, Path(path)) from error
-    except SafetensorError as error:
-        raise UserError(f"{what}: {path} is damaged ({error}); restore or recreate it") from error
+    except (SafetensorError, ValueError, TypeError, KeyError) as error:
+        reason = one_line(str(error), 100)
+        raise UserError(f"{what}: {path} is damaged ({reason}); restore or recreate it") from error
+
+
+def digest(tensors: Mapping[str, Any]) -> int:
+    """Return a checksum (CRC-32) of named torch tensors or numpy arrays: names, types, values."""
+    import numpy as np
+
+    value = 0
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        array = tensor.detach().cpu().numpy() if hasattr(tensor, "detach") else tensor
+        head = f"{name} {array.dtype.str} {array.shape};"
+        value = zlib.crc32(head.encode("utf-8", "backslashreplace"), value)
+        flat = np.ascontiguousarray(array).reshape(-1)
+        if flat.size:
+            value = zlib.crc32(memoryview(flat.view(np.uint8)), value)  # type: ignore[arg-type]
+    return value
+
+
+def check_finite(arrays: Mapping[str, Any], limit: float = math.inf) -> None:
+    """Check that arrays hold finite numbers up to a limit.
+
+    Raises:
+        ValueError: one does not.
+    """
+    import numpy as np
+
+    for name, array in arrays.items():
+        if array.size and np.issubdtype(array.dtype, np.floating):
+            low, high = float(array.min()), float(array.max())  # NaN if one number is
+            if not (-limit <= low and high <= limit) or math.isinf(low) or math.isinf(high):
+                raise ValueError(f"{name} holds a number that is not finite or far too large")
 
 
 def check_schema(found: object, supported: int, what: str) -> None:
@@ -295,7 +301,9 @@ def check_schema(found: object, supported: int, what: str) -> None:
         UserError: ``found`` is newer, or is no version number.
     """
     if not isinstance(found, int) or isinstance(found, bool) or found < 1:
-        raise UserError(f"{what} has no schema version ({found!r}); it is damaged, recreate it")
+        raise UserError(
+            f"{what} has no schema version ({shown(found)}); it is damaged, recreate it"
+        )
     if found > supported:
         raise UserError(
             f"{what} has schema version {found}, and this climatenerf reads up to {supported};"

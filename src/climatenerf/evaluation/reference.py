@@ -3,8 +3,6 @@
 docs/reference-scene.md describes the files of its folder.
 """
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from climatenerf.core import arrays
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import check_schema, read_json
 from climatenerf.scene import Camera, Scene, load_scene
@@ -178,7 +177,7 @@ def _read_truth(folder: Path, scene: Scene, name: str) -> Truth:
     view = next((v for v in scene.views if v.name == name), None)
     if view is None:
         raise UserError(f"{folder} has no pose of its view {name}; generate the set again")
-    arrays = _arrays((folder / "truth" / name).with_suffix(".npz"))
+    truth = _arrays((folder / "truth" / name).with_suffix(".npz"))
     label = load_labels(view, scene)
     camera, c2w = scene.cameras[view.camera], scene.c2w_world(view)
     shape = (camera.height, camera.width)
@@ -186,17 +185,17 @@ def _read_truth(folder: Path, scene: Scene, name: str) -> Truth:
         "depth": shape, "normal": (*shape, 3), "sun": shape, "clean": (*shape, 3)
     }  # fmt: skip
     for key, expected in shapes.items():
-        if key not in arrays or arrays[key].shape != expected:
+        if key not in truth or truth[key].shape != expected:
             raise UserError(f"the truth of {name} in {folder} lacks {key}; generate the set again")
     if label is None:
         raise UserError(f"{folder} has no labels of {name}; generate the set again")
     return Truth(
         name,
-        arrays["depth"].astype(np.float32),
-        arrays["normal"].astype(np.float64) @ c2w[:3, :3],
+        truth["depth"].astype(np.float32),
+        truth["normal"].astype(np.float64) @ c2w[:3, :3],
         label,
-        arrays["sun"].astype(np.float64),
-        arrays["clean"].astype(np.float64),
+        truth["sun"].astype(np.float64),
+        truth["clean"].astype(np.float64),
         world_rays(camera, c2w),
         c2w,
     )
@@ -209,9 +208,8 @@ def world_rays(camera: Camera, c2w: Float[np.ndarray, "4 4"]) -> Float[np.ndarra
 
 def _arrays(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path) as data:
-            return {key: data[key] for key in data.files}
+        return arrays.read_npz(path)
     except FileNotFoundError:
         raise UserError(f"{path} is missing; generate the reference set again") from None
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+    except arrays.ERRORS as error:
         raise UserError(f"{path} is damaged; generate the set again") from error

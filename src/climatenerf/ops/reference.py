@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor
 
 from climatenerf.core.vectors import unit
+from climatenerf.ops.limits import MAX_STEPS
 
 
 def contract(q: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
@@ -178,7 +179,8 @@ def march(
     max(steps[0], steps[1]·t) long; with an optical depth below steps[2] it counts as empty. In an
     empty cell whole steps are skipped until the ray has left it, or has left the block of skip³
     cells around it if all of these are empty, for the first such block of `skips`. The ray ends
-    where the transmittance falls below `stop`. Cascade k covers the cube of half side 2^k.
+    where the transmittance falls below `stop`, or after `MAX_STEPS`. Cascade k covers the cube of
+    half side 2^k.
     """
     cascades, side = occupied.shape[:2]
     far = 2.0 ** (cascades - 1)
@@ -192,7 +194,9 @@ def march(
             t, end = max(t, near_face), min(end, far_face)
     t += jitter * max(steps[0], steps[1] * t)
     samples, tau = [], 0.0
-    while t < end and tau < -torch.log(torch.tensor(stop, device="cpu")).item():
+    for _ in range(MAX_STEPS):
+        if not (t < end and tau < -torch.log(torch.tensor(stop, device="cpu")).item()):
+            break
         dt = min(max(steps[0], steps[1] * t), end - t)
         middle = t + dt / 2
         q = ray_o + middle * ray_d

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.limits import MAX_FRAMES
 from climatenerf.core.locks import in_use
 from climatenerf.core.locks import locked as locked_file
 from climatenerf.core.storage import (
@@ -63,6 +64,7 @@ def current_render(folder: Path) -> dict[str, Any] | None:
         current = read_json(folder / STATE / "render.json")
         wanted = {"render": str, "frames": int, "layers": list, "formats": list, "replaces": list}
         sound = all(isinstance(current.get(name), kind) for name, kind in wanted.items())
+        sound = sound and 0 <= current["frames"] <= MAX_FRAMES
     except (UserError, OSError):
         return None
     return current if sound else None

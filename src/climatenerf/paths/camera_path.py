@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, shown
+from climatenerf.core.limits import MAX_FRAMES
 from climatenerf.paths.framing import (
     check_size,
     fit_to_size,
@@ -82,7 +83,7 @@ def camera_path(
     if spec.endswith(".json"):
         return from_camera_path_json(Path(spec), scene, size)
     raise UserError(
-        f"there is no camera path {spec!r}; use training, orbit, still, still:VIEW or a"
+        f"there is no camera path {shown(spec)}; use training, orbit, still, still:VIEW or a"
         " nerfstudio camera_path.json"
     )
 
@@ -188,6 +189,7 @@ def from_camera_path_json(
     width, height = size or drawn.size
     check_size(width, height)
     focal = 0.5 * height / np.tan(np.radians(drawn.vertical_fov) / 2)
+    _check_frames(len(focal))
     cameras = tuple(Camera(width, height, f, f, width / 2, height / 2) for f in focal.tolist())
     return CameraPath(drawn.c2w, cameras, f"file:{path.name}", (drawn.note,), drawn.fps)
 
@@ -269,15 +271,18 @@ def _named_view(scene: Scene, view: str | int) -> View:
     for number, name in enumerate(names):
         if text in (name, Path(name).name, Path(name).stem):
             return scene.views[number]
-    if text.isdigit() and int(text) < len(names):
+    if text.isdecimal() and len(text) < 10 and int(text) < len(names):
         return scene.views[int(text)]
     near = difflib.get_close_matches(text, names, n=1, cutoff=0.0) or names[:1]
     raise UserError(
-        f"there is no view {text!r} among the {len(names)} photographs; give a name such as"
+        f"there is no view {shown(text)} among the {len(names)} photographs; give a name such as"
         f" {near[0]!r} or a number from 0 to {len(names) - 1}"
     )
 
 
 def _check_frames(frames: int) -> None:
-    if frames < 1:
-        raise UserError(f"a movie of {frames} frames cannot be rendered; give --frames 1 or more")
+    if not 1 <= frames <= MAX_FRAMES:
+        raise UserError(
+            f"a movie of {shown(frames)} frames cannot be rendered; give --frames 1 or more"
+            f" (up to {MAX_FRAMES})"
+        )

@@ -2,13 +2,17 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError
-from climatenerf.core.storage import read_json
+from climatenerf.core import parsing
+from climatenerf.core.errors import UserError, shown
+from climatenerf.core.limits import MAX_FRAMES
 from climatenerf.scene import Scene
+from climatenerf.scene.readers.ply import MAX_POSITION
+from climatenerf.scene.scene import MAX_SCALE, MAX_WORLD
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -43,21 +47,33 @@ def read_drawn_path(path: Path, scene: Scene) -> DrawnPath:
     Raises:
         UserError: the file is absent or damaged, or its camera is not a perspective one.
     """
-    data = read_json(path, "camera path")
+    data = parsing.read_json(path, "camera path")
     if str(data.get("camera_type", "perspective")).lower() != "perspective":
         raise UserError(
-            f"camera path: {path} is for a {data['camera_type']} camera; only perspective paths"
-            " can be rendered; change the camera in the viewer and export again"
+            f"camera path: {path} is for a {shown(data['camera_type'])} camera; only perspective"
+            " paths can be rendered; change the camera in the viewer and export again"
         )
     entries = data.get("camera_path")
     if not isinstance(entries, list) or not entries:
         raise UserError(f"camera path: {path} holds no frames; add keyframes and export it again")
+    if len(entries) > MAX_FRAMES:
+        raise UserError(
+            f"camera path: {path} holds {len(entries)} frames, more than {MAX_FRAMES}; export it"
+            " with fewer"
+        )
     input_from_model, note = _input_from_model(path, scene)
     world_from_model = scene.world_from_input @ input_from_model
     poses, fovs = [], []
     for number, entry in enumerate(entries):
         pose, fov = _entry(entry, data.get("default_fov"), f"frame {number} of {path}")
-        poses.append(_transformed(world_from_model, pose @ OPENGL_TO_OPENCV))
+        moved = _transformed(world_from_model, pose @ OPENGL_TO_OPENCV)
+        if not np.abs(moved[:3, 3]).max() <= MAX_WORLD:
+            raise UserError(
+                f"camera path: frame {number} of {path} lies {np.abs(moved[:3, 3]).max():.3g} m"
+                f" from the world's origin, and 32 bits resolve no detail beyond {MAX_WORLD:g} m;"
+                " export the path again"
+            )
+        poses.append(moved)
         fovs.append(fov)
     size = (_number(data.get("render_width")), _number(data.get("render_height")))
     return DrawnPath(
@@ -69,8 +85,8 @@ def read_drawn_path(path: Path, scene: Scene) -> DrawnPath:
     )
 
 
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) and 0 < value < 1e6 else 0.0
+def _number(value: Any) -> float:
+    return float(value) if parsing.is_number(value) and 0 < value < 1e6 else 0.0
 
 
 def _entry(entry: object, default_fov: object, where: str) -> tuple[np.ndarray, float]:
@@ -79,14 +95,19 @@ def _entry(entry: object, default_fov: object, where: str) -> tuple[np.ndarray, 
             raise TypeError
         pose = np.array(entry.get("camera_to_world"), dtype=np.float64).reshape(4, 4)
         fov = float(entry.get("fov", default_fov))
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise UserError(
             f"camera path: {where} needs 16 numbers camera_to_world and a fov; export it again"
         ) from error
-    if not np.isfinite(pose).all() or not np.linalg.det(pose[:3, :3]) > 1e-9:
+    if not np.abs(pose).max() <= MAX_POSITION:  # also NaN
+        raise UserError(
+            f"camera path: {where} has a pose that is not finite or beyond {MAX_POSITION:g}, where"
+            " 32 bits resolve nothing; export it again"
+        )
+    if not np.linalg.det(pose[:3, :3]) > 1e-9:
         raise UserError(f"camera path: {where} has no finite pose with a rotation; export it again")
     if not 0 < fov < 180:
-        raise UserError(f"camera path: {where} has a field of view of {fov} degrees; correct it")
+        raise UserError(f"camera path: {where} has a field of view of {fov:g} degrees; correct it")
     return pose, fov
 
 
@@ -98,22 +119,28 @@ def _input_from_model(path: Path, scene: Scene) -> tuple[Float[np.ndarray, "4 4"
             f"there is no {sidecar.name} beside {path.name}, so its poses are taken to be in the"
             " capture's frame"
         )
-    data = read_json(sidecar, "camera path")
+    data = parsing.read_json(sidecar, "camera path")
     # nerfstudio's input frame is before `applied_transform`, and the scene's is after it.
     capture = scene.root / "transforms.json"
     from_json = scene.source == "transforms" and capture.is_file()
-    meta = read_json(capture, "capture") if from_json else {}
-    try:
-        rigid, applied = np.eye(4), np.eye(4)
-        rigid[:3] = np.array(data["transform"], float)[:3]
-        applied[:3] = np.array(meta.get("applied_transform", applied[:3]), float)[:3]
-        scale = float(data["scale"]) / float(meta.get("applied_scale", 1.0))
-        matrix = applied @ np.linalg.inv(rigid) @ np.diag([1 / scale] * 3 + [1.0])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError, np.linalg.LinAlgError) as error:
+    meta = parsing.read_json(capture, "capture") if from_json else {}
+    rigid, applied = np.eye(4), np.eye(4)
+    shapes = [(3, 4), (4, 4)]
+    where = f"transform in {sidecar}"
+    rigid[:3] = parsing.matrix(data.get("transform"), shapes, where, MAX_POSITION)[:3]
+    if "applied_transform" in meta:
+        where = f"applied_transform in {capture}"
+        given = parsing.matrix(meta["applied_transform"], shapes, where, MAX_POSITION)
+        applied[:3] = given[:3]
+    scale = parsing.number(data, "scale", str(sidecar), 1 / MAX_SCALE, MAX_SCALE)
+    scale /= parsing.number(meta, "applied_scale", str(capture), 1 / MAX_SCALE, MAX_SCALE, 1.0)
+    determinants = [float(np.linalg.det(each[:3, :3])) for each in (rigid, applied)]
+    if not all(1e-6 < determinant < 1e6 for determinant in determinants):
         raise UserError(
-            f"camera path: {sidecar} is damaged ({error}); restore it, or move it away if the"
-            " path is in the capture's own frame"
-        ) from error
+            f"camera path: {sidecar} or {capture} has a transform without a rotation; restore it,"
+            " or move it away if the path is in the capture's own frame"
+        )
+    matrix = applied @ np.linalg.inv(rigid) @ np.diag([1 / scale] * 3 + [1.0])
     return matrix, f"poses of {path.name} transformed from nerfstudio's frame by {sidecar.name}"
 
 

@@ -88,7 +88,9 @@ def export_colmap(scene: Scene, folder: Path) -> Path:
         track = " ".join(tracks.get(index, []))
         points.append(f"{index + 1} {_join(position)} 128 128 128 0 {track}".rstrip())
     for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
-        write_bytes(model / f"{name}.txt", ("\n".join(lines) + "\n").encode())
+        text = "\n".join(lines) + "\n"
+        # Names that are not UTF-8 keep their bytes.
+        write_bytes(model / f"{name}.txt", text.encode("utf-8", "surrogateescape"))
     return model
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import zipfile
-import zlib
+import errno
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
+from climatenerf.core import arrays
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain, one_line
 from climatenerf.core.srgb import to_linear
 from climatenerf.scene.image_files import (
     differs_from_srgb,
@@ -22,7 +22,7 @@ from climatenerf.scene.image_files import (
     profile_to_srgb,
 )
 from climatenerf.scene.label_spaces import to_train_ids
-from climatenerf.scene.scene import MILLIMETRES, Scene, View
+from climatenerf.scene.scene import MILLIMETRES, Scene, View, is_file
 
 RELATIVE_DEPTH = "depth_relative"
 SATURATED = 65535  # of 16-bit depth files
@@ -50,7 +50,6 @@ _IMAGE_ERRORS = (
     RuntimeError,  # of the HEIC decoder
     Image.DecompressionBombError,
 )
-_ARRAY_ERRORS = (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, zlib.error)
 
 # Linear light of each 8-bit value, and the midpoints between consecutive values for re-encoding.
 _LINEAR = to_linear(np.arange(256) / 255).astype(np.float32)
@@ -238,7 +237,7 @@ def load_relative_depth(
     name = scene.root / RELATIVE_DEPTH / view.name
     # The longer name first: `NAME.npz` may belong to `NAME.png` if `NAME.jpg.npz` exists.
     candidates = (name.with_name(f"{name.name}.npz"), name.with_suffix(".npz"))
-    path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    path = next((candidate for candidate in candidates if is_file(candidate)), None)
     if path is None:
         depth = load_depth(view, scene, downscale)
         return None if depth is None else 1.0 / depth
@@ -249,7 +248,7 @@ def load_relative_depth(
         if values.ndim != 2 or not values.size:
             raise ValueError("it must have shape height x width")
         relative = Image.fromarray(values.astype(np.float32))
-    except _ARRAY_ERRORS as error:
+    except arrays.ERRORS as error:
         raise _array_error("relative depth", path, error) from None
     full = scene.cameras[view.camera]
     _check_aspect(values, full, path)
@@ -318,7 +317,7 @@ def read_depth(path: Path, scale: float = MILLIMETRES) -> Float[np.ndarray, "h w
                     f"The depth {path} has 8 bits; use 16-bit PNG (millimetres), NPY or NPZ (m)."
                 )
             depth = _float_depth(image) if image.mode == "RGBA" else _integer_depth(image, scale)
-    except _ARRAY_ERRORS as error:
+    except arrays.ERRORS as error:
         raise _array_error("depth", path, error) from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
         depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
@@ -415,19 +414,34 @@ def _read_posed_image(path: Path, camera: Camera) -> Image.Image:
 
 def _read_array(path: Path) -> np.ndarray:
     """Read the array of an NPY file, or the first array of an NPZ file."""
-    data = np.load(path)
-    packed = isinstance(data, np.lib.npyio.NpzFile)
-    if packed != (path.suffix == ".npz"):
-        raise ValueError(f"it is no {path.suffix[1:].upper()}")
-    if not packed:
-        return data
-    with data:
-        return data[data.files[0]]
+    if path.suffix != ".npz":
+        return arrays.read_npy(path)
+    found = arrays.read_npz(path)
+    if not found:
+        raise ValueError("it holds no array")
+    return next(iter(found.values()))
+
+
+def _check_pixels(image: Image.Image, path: Path) -> None:
+    """Refuse a picture that takes too much memory; its header gives the size."""
+    if image.width * image.height > MAX_PIXELS:
+        raise _too_large(path, f"{image.width * image.height / 1e6:.0f}")
+
+
+def _too_large(path: Path, megapixels: str) -> UserError:
+    return UserError(
+        f"The image {path} has {megapixels} megapixels, more than the {MAX_PIXELS / 1e6:.0f} that"
+        " can be read; reduce it, or remove it and its pose."
+    )
 
 
 def _image_error(path: Path, error: Exception) -> UserError:
     if isinstance(error, FileNotFoundError):
         return UserError(f"The image {path} is missing; restore it or remove its pose.")
+    if isinstance(error, Image.DecompressionBombError):
+        return _too_large(path, f"over {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f}")
+    if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
+        return explain(error, path)  # such as a lack of permission
     return UserError(
         f"The image {path} cannot be read (truncated, damaged or of an unknown format); replace "
         "it or remove it."
@@ -436,7 +450,9 @@ def _image_error(path: Path, error: Exception) -> UserError:
 
 def _array_error(kind: str, path: Path, error: Exception) -> UserError:
     # NumPy refuses pickled objects, which could run code; its message is of no use to a user.
-    reason = "it holds no numbers" if "pickle" in str(error) else error
+    if isinstance(error, OSError) and error.errno is not None:
+        return explain(error, path)
+    reason = "it holds no numbers" if "pickle" in str(error) else one_line(str(error), 120)
     return UserError(f"The {kind} {path} cannot be read ({reason}); replace it.")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -27,10 +26,19 @@ from climatenerf.scene.readers.kitti360 import kitti360_root, parse_frames, read
 from climatenerf.scene.readers.mega_nerf import is_mega_nerf, read_mega_nerf
 from climatenerf.scene.readers.tanks_temples import is_tanks_temples, read_tanks_temples
 from climatenerf.scene.readers.transforms_json import read_transforms, transforms_files
-from climatenerf.scene.scene import FILE_NAME, Scene, View, load_scene, with_split
+from climatenerf.scene.scene import (
+    FILE_NAME,
+    Scene,
+    View,
+    checked_world,
+    is_file,
+    load_scene,
+    with_split,
+)
 
 HOLDOUT_EVERY = 8
 MIN_IMAGES = 3
+MAX_CAMERA_HEIGHT = 1e5  # m: a satellite is no camera of a street
 MAX_ROUND_TRIP = 0.5  # pixels: error of inverting the lens distortion that is worth a warning
 
 
@@ -69,8 +77,11 @@ def read_scene(
     path = Path(path).absolute()
     if not path.exists():
         raise UserError(f"{path} does not exist; give the folder of a posed capture.")
-    if camera_height is not None and not (math.isfinite(camera_height) and camera_height > 0):
-        raise UserError(f"The camera height {camera_height:g} m must be above 0; correct it.")
+    if camera_height is not None and not 0 < camera_height <= MAX_CAMERA_HEIGHT:
+        raise UserError(
+            f"The camera height {camera_height:g} m must be above 0 and at most"
+            f" {MAX_CAMERA_HEIGHT:g} m; correct it."
+        )
     if camera_height is not None and metric_input:
         raise UserError("Give either the camera height or metric input, not both.")
     if label_space is not None:
@@ -125,14 +136,15 @@ def _aligned(
             label_space=scene.label_space,
         )
         if camera_height is None:
-            return aligned
+            return checked_world(aligned, str(path))
         if (rescaled := rescale_by_camera_height(aligned, camera_height)) is not None:
-            return rescaled
+            return checked_world(rescaled, str(path))
     # An explicit camera height takes precedence over the scale of a metric format.
     metric_input |= metric_capture and camera_height is None
-    return align_scene(
+    aligned = align_scene(
         scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity
     )
+    return checked_world(aligned, str(path))
 
 
 def _merged(saved: tuple[Finding, ...], new: tuple[Finding, ...]) -> tuple[Finding, ...]:
@@ -189,7 +201,7 @@ def _has_images(folder: Path) -> bool:
 def _check_images(capture: Capture) -> Capture:
     """Leave out missing images, fit the cameras to the image sizes, and sort views by name."""
     findings = list(capture.findings)
-    present = [v for v in capture.views if v.path.is_file()]
+    present = [v for v in capture.views if is_file(v.path)]
     missing = len(capture.views) - len(present)
     if len(present) < MIN_IMAGES:
         folder = capture.views[0].path.parent if capture.views else capture.root
@@ -198,7 +210,7 @@ def _check_images(capture: Capture) -> Capture:
             f"at least {MIN_IMAGES} are needed, so restore them or correct the names."
         )
     if missing:
-        first = next(v.name for v in capture.views if not v.path.is_file())
+        first = next(v.name for v in capture.views if not is_file(v.path))
         message = (
             f"{missing} of the {len(capture.views)} images with poses are not on disk "
             f"(first: {first}); they are left out"
@@ -293,7 +305,7 @@ def _find_sidecars(capture: Capture) -> Capture:
         label = view.label_path or _sidecar(capture.root / "labels", view)
         mask = view.mask_path or _sidecar(capture.root / "masks", view)
         depth = view.depth_path or _sidecar(capture.root / "depth", view, (".npz", ".npy", ".png"))
-        if mask is not None and not mask.is_file():
+        if mask is not None and not is_file(mask):
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
         views.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
     findings = (*capture.findings, *_sidecar_findings(capture.root, views))
@@ -305,7 +317,7 @@ def _sidecar(folder: Path, view: View, suffixes: tuple[str, ...] = (".png",)) ->
         return None
     base = folder / view.name
     candidates = [p for s in suffixes for p in (base.with_suffix(s), Path(f"{base}{s}"))]
-    return next((p for p in candidates if p.is_file()), None)
+    return next((p for p in candidates if is_file(p)), None)
 
 
 def _sidecar_findings(root: Path, views: Sequence[View]) -> list[Finding]:

@@ -7,23 +7,21 @@ files) and *world* (metres, z up). `Scene.world_from_input` maps the second to t
 from __future__ import annotations
 
 import json
-import math
 import os
-import zipfile
-import zlib
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from climatenerf.core import arrays, parsing
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
-from climatenerf.core.storage import atomic_path, check_schema, make_folder, read_json, write_bytes
+from climatenerf.core.errors import UserError, one_line
+from climatenerf.core.storage import atomic_path, check_schema, make_folder, write_bytes
 from climatenerf.scene.findings import Finding, finding_from_json
 from climatenerf.scene.label_spaces import TRAIN_IDS, checked_label_space
-from climatenerf.scene.readers.ply import read_points, write_points
+from climatenerf.scene.readers.ply import MAX_POSITION, read_points, write_points
 
 SCHEMA_VERSION = 1
 FILE_NAME = "scene.json"
@@ -31,6 +29,13 @@ POINTS_NAME = "points.ply"
 OBSERVATIONS_NAME = "points_seen.npz"
 MILLIMETRES = 0.001
 """Metres per unit of integer depth files, unless a capture states another scale."""
+MAX_VIEWS = 100_000
+MAX_SIDE = 100_000  # pixels
+MAX_WORLD = 1e7
+"""Distance from the origin, m, at which 32 bits still resolve a metre."""
+MAX_SCALE = 1e9
+"""Metres per input unit, and its inverse."""
+MAX_MATRIX = 1e18  # entries of `world_from_input`: greatest scale times farthest position
 
 
 @dataclass(frozen=True)
@@ -196,14 +201,45 @@ def load_scene(folder: Path | str) -> Scene:
     path = Path(folder).absolute()
     if path.is_dir():
         path = path / FILE_NAME
-    data = read_json(path, "scene")
+    data = parsing.read_json(path, "scene")
     check_schema(data.get("schema_version"), SCHEMA_VERSION, f"scene {path}")
-    try:
-        return _scene_from_json(data, path.parent)
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+    return checked_world(_scene_from_json(data, path), str(path))
+
+
+def checked_world(scene: Scene, where: str) -> Scene:
+    """Return the scene if 32 bits can hold the world that its transform and poses make.
+
+    Args:
+        scene: Scene aligned to the world frame.
+        where: File or folder, for the message.
+
+    Raises:
+        UserError: The transform is no similarity or is mirrored, or a camera or a height is beyond
+            `MAX_WORLD`.
+    """
+    linear = scene.world_from_input[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    size = abs(determinant) ** (1 / 3)
+    if not 1 / MAX_SCALE <= size <= MAX_SCALE:
         raise UserError(
-            f"{path} is damaged ({type(error).__name__}: {error}); read the capture again."
-        ) from None
+            f"world_from_input in {where} has a scale of {size:.3g} m per unit, beyond"
+            f" {1 / MAX_SCALE:g} to {MAX_SCALE:g}; read the capture again, or give its scale."
+        )
+    if determinant < 0 or np.abs(linear @ linear.T / size**2 - np.eye(3)).max() > 1e-3:
+        raise UserError(
+            f"world_from_input in {where} is mirrored or sheared, so it is no scale with a"
+            " rotation; read the capture again."
+        )
+    centres = np.array([view.c2w[:, 3] for view in scene.views]).reshape(-1, 4)
+    positions = centres @ scene.world_from_input.T
+    farthest = float(np.abs(positions[:, :3]).max(initial=0.0))
+    farthest = max(farthest, abs(scene.ground_z), abs(scene.lowest_ground_z))
+    if not farthest <= MAX_WORLD:
+        raise UserError(
+            f"A camera or the ground of {where} lies {farthest:.3g} m from the world's origin, and"
+            f" 32 bits resolve no detail beyond {MAX_WORLD:g} m; correct the poses or the scale."
+        )
+    return scene
 
 
 def _view_to_json(view: View, root: Path) -> dict[str, Any]:
@@ -225,58 +261,114 @@ def _relative(path: Path | None, root: Path) -> str | None:
     return path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
 
 
-def _scene_from_json(data: dict[str, Any], folder: Path) -> Scene:
-    root = Path(os.path.normpath(folder / data["root"]))
-    if not (root / data["views"][0]["path"]).is_file() and "root_absolute" in data:
-        root = Path(data["root_absolute"])
-    cameras = tuple(_camera(c) for c in data["cameras"])
-    views = tuple(_view_from_json(v, root) for v in data["views"])
-    if any(not 0 <= v.camera < len(cameras) for v in views):
-        raise ValueError("a view names a camera that is not listed")
-    if any(v.split not in ("train", "heldout") for v in views):
-        raise ValueError("a view's split is neither train nor heldout")
-    points = None if data["points"] is None else read_points(folder / data["points"])
-    observations = data.get("points_seen")
+def _scene_from_json(data: dict[str, Any], file: Path) -> Scene:
+    where, folder = str(file), file.parent
+    listed = parsing.items(data, "views", where)
+    if not listed or len(listed) > MAX_VIEWS:
+        raise UserError(
+            f"{where} has {len(listed)} views instead of 1 to {MAX_VIEWS}; read the capture again."
+        )
+    root = Path(os.path.normpath(folder / parsing.text(data, "root", where)))
+    first = parsing.text(listed[0], "path", f"view 0 of {where}")
+    absolute = parsing.text(data, "root_absolute", where, None)
+    if absolute is not None and not is_file(root / first):
+        root = Path(absolute)
+    listed_cameras = parsing.items(data, "cameras", where)
+    cameras = tuple(_camera(c, f"camera {i} of {where}") for i, c in enumerate(listed_cameras))
+    views = tuple(
+        _view_from_json(v, root, len(cameras), f"view {i} of {where}") for i, v in enumerate(listed)
+    )
+    cloud = parsing.text(data, "points", where, None)
+    points = None if cloud is None else read_points(folder / cloud)
+    observations = parsing.text(data, "points_seen", where, None)
     if points is not None and observations and (folder / observations).exists():
         views = _with_observations(views, len(points), folder / observations)
     return Scene(
         root=root,
-        source=_text(data["source"]),
+        source=parsing.text(data, "source", where),
         cameras=cameras,
         views=views,
         points=points,
-        world_from_input=_matrix(data["world_from_input"]),
-        scale_source=_text(data["scale_source"]),
-        scale_error=_number(data["scale_error"]),
-        scale_report={
-            _text(name): {key: _number(value) for key, value in entry.items()}
-            for name, entry in data.get("scale_report", {}).items()
+        world_from_input=_matrix(data, "world_from_input", where, MAX_MATRIX),
+        scale_source=parsing.text(data, "scale_source", where),
+        scale_error=parsing.number(data, "scale_error", where, 0.0),
+        scale_report=_scale_report(parsing.entries(data, "scale_report", where, {}), where),
+        georeference={
+            key: parsing.checked_number(value, f"georeference.{key} in {where}")
+            for key, value in parsing.entries(data, "georeference", where, {}).items()
         },
-        georeference={k: _number(v) for k, v in data.get("georeference", {}).items()},
-        ground_z=_number(data["ground_z"]),
-        lowest_ground_z=_number(data["lowest_ground_z"]),
-        up_report=dict(data["up_report"]),
-        findings=tuple(finding_from_json(f) for f in data.get("findings", data["warnings"])),
+        ground_z=parsing.number(data, "ground_z", where, -MAX_WORLD, MAX_WORLD),
+        lowest_ground_z=parsing.number(data, "lowest_ground_z", where, -MAX_WORLD, MAX_WORLD),
+        up_report=_up_report(parsing.entries(data, "up_report", where), where),
+        findings=_findings(data, where),
         label_space=checked_label_space(
-            _text(data.get("label_space", TRAIN_IDS)), f"The label_space in {folder / FILE_NAME}"
+            parsing.text(data, "label_space", where, TRAIN_IDS), f"The label_space in {where}"
         ),
-        depth_scale=_number(data.get("depth_scale", MILLIMETRES)),
+        depth_scale=parsing.number(data, "depth_scale", where, 1e-9, 1e3, MILLIMETRES),
     )
 
 
-def _view_from_json(data: dict[str, Any], root: Path) -> View:
-    def absolute(path: str | None) -> Path | None:
+def is_file(path: Path) -> bool:
+    """Return whether there is a file; a name that no disk can hold is none."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def _findings(data: dict[str, Any], where: str) -> tuple[Finding, ...]:
+    """Return the findings; earlier versions saved them as sentences."""
+    if "findings" not in data:
+        return tuple(finding_from_json(sentence) for sentence in _texts(data, "warnings", where))
+    try:
+        return tuple(map(finding_from_json, parsing.items(data, "findings", where)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{where} has a finding that is damaged ({one_line(str(error), 100)}); restore it"
+        ) from error
+
+
+def _scale_report(report: dict[str, Any], where: str) -> dict[str, dict[str, float]]:
+    out = {}
+    for name in report:
+        entry = parsing.entries(report, name, f"scale_report of {where}")
+        place = f"scale_report.{name} of {where}"
+        out[name] = {
+            "times": parsing.number(entry, "times", place, 1 / MAX_SCALE, MAX_SCALE),
+            "error": parsing.number(entry, "error", place, 0.0),
+        }
+    return out
+
+
+def _up_report(report: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return the report on up: the methods used, as a text, and the angles of all methods."""
+    place = f"up_report of {where}"
+    angles = {key: parsing.number(report, key, place) for key in report if key != "used"}
+    return {"used": parsing.text(report, "used", place)} | angles if "used" in report else angles
+
+
+def _texts(table: dict[str, Any], key: str, where: str) -> list[str]:
+    found = parsing.items(table, key, where)
+    return [parsing.text({key: each}, key, where) for each in found]
+
+
+def _view_from_json(data: Any, root: Path, cameras: int, where: str) -> View:
+    def absolute(key: str) -> Path | None:
+        path = parsing.text(data, key, where, None)
         return None if path is None else root / path
 
+    split = parsing.text(data, "split", where)
+    if split not in ("train", "heldout"):
+        raise UserError(f"{where} has a split that is neither train nor heldout; correct it.")
     return View(
-        name=_text(data["name"]),
-        path=root / data["path"],
-        camera=int(data["camera"]),
-        c2w=_matrix(data["c2w"]),
-        split=data["split"],
-        label_path=absolute(data["label_path"]),
-        mask_path=absolute(data["mask_path"]),
-        depth_path=absolute(data.get("depth_path")),
+        name=parsing.text(data, "name", where),
+        path=root / parsing.text(data, "path", where),
+        camera=parsing.integer(data, "camera", where, 0, cameras - 1),
+        c2w=_matrix(data, "c2w", where, MAX_POSITION),
+        split=split,
+        label_path=absolute("label_path"),
+        mask_path=absolute("mask_path"),
+        depth_path=absolute("depth_path"),
     )
 
 
@@ -296,11 +388,15 @@ def _save_observations(scene: Scene, path: Path) -> None:
 def _with_observations(views: tuple[View, ...], points: int, path: Path) -> tuple[View, ...]:
     """Return the views with `seen` set from a file that `_save_observations` wrote."""
     try:
-        with np.load(path) as data:
-            view, point = data["view"].astype(np.int64), data["point"].astype(np.int64)
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        data = arrays.read_npz(path)
+        view, point = (data[key] for key in ("view", "point"))
+        if not all(np.issubdtype(each.dtype, np.integer) for each in (view, point)):
+            raise ValueError("its indices are no whole numbers")
+        view, point = view.astype(np.int64).reshape(-1), point.astype(np.int64).reshape(-1)
+    except arrays.ERRORS as error:
+        reason = one_line(str(error), 100)
         raise UserError(
-            f"{path} cannot be read ({error}); delete it to load the scene without observations."
+            f"{path} cannot be read ({reason}); delete it to load the scene without observations."
         ) from None
     if view.shape != point.shape or (point < 0).any() or (point >= points).any():
         raise UserError(
@@ -310,28 +406,18 @@ def _with_observations(views: tuple[View, ...], points: int, path: Path) -> tupl
     return tuple(replace(v, seen=point[view == i]) for i, v in enumerate(views))
 
 
-def _matrix(values: Any) -> Float[np.ndarray, "4 4"]:
-    matrix = np.array(values, dtype=np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        raise ValueError("a matrix is not 4x4 and finite")
-    return matrix
+def _matrix(table: dict[str, Any], key: str, where: str, limit: float) -> Float[np.ndarray, "4 4"]:
+    return parsing.matrix(table.get(key), [(4, 4)], f"{key} in {where}", limit)
 
 
-def _camera(data: dict[str, Any]) -> Camera:
-    camera = Camera(**data)
-    numbers = {k: _number(v) for k, v in data.items() if k not in ("width", "height", "fisheye")}
-    width, height = int(camera.width), int(camera.height)
-    return replace(camera, **numbers, width=width, height=height, fisheye=bool(camera.fisheye))
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{value!r} is not a string")
-    return value
-
-
-def _number(value: Any) -> float:
-    number = float(value)
-    if not math.isfinite(number):
-        raise ValueError("a number is not finite")
-    return number
+def _camera(data: Any, where: str) -> Camera:
+    known = {item.name for item in fields(Camera)}
+    unknown = set(parsing.entries({"camera": data}, "camera", where)) - known
+    if unknown:
+        raise UserError(f"{where} has an unknown value {min(unknown)!r}; read the capture again.")
+    width, height = (parsing.integer(data, k, where, 1, MAX_SIDE) for k in ("width", "height"))
+    fx, fy, cx, cy = (parsing.number(data, key, where) for key in ("fx", "fy", "cx", "cy"))
+    named = ("width", "height", "fx", "fy", "cx", "cy", "fisheye")
+    distortion = {key: parsing.number(data, key, where) for key in data if key not in named}
+    fisheye = parsing.flag(data, "fisheye", where, False)
+    return Camera(width, height, fx, fy, cx, cy, **distortion, fisheye=fisheye)

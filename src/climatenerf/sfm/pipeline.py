@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, shown
 from climatenerf.core.listing import visible
 from climatenerf.core.storage import explain, make_folder
 from climatenerf.scene import Camera, Scene, read_scene, save_scene
@@ -26,8 +26,9 @@ from climatenerf.scene.alignment.scale import (
 )
 from climatenerf.scene.findings import without_repeats
 from climatenerf.scene.images import read_header
+from climatenerf.scene.read import MAX_CAMERA_HEIGHT
 from climatenerf.scene.readers.colmap import read_colmap
-from climatenerf.scene.scene import FILE_NAME
+from climatenerf.scene.scene import FILE_NAME, checked_world
 from climatenerf.sfm.diagnose import Unposed, diagnose
 from climatenerf.sfm.from_colmap import import_posed
 from climatenerf.sfm.mark_page import write_mark_page
@@ -122,11 +123,14 @@ def check_settings(settings: CaptureSettings) -> None:
     """
     out = settings.out
     if not 64 <= settings.features <= 32768:
-        raise UserError(f"--features must lie between 64 and 32768; got {settings.features}")
+        raise UserError(f"--features must lie between 64 and 32768; got {shown(settings.features)}")
     if not 0 <= settings.seed < 2**31:
-        raise UserError(f"--seed must lie between 0 and 2147483647; got {settings.seed}")
-    if settings.camera_height is not None and not settings.camera_height > 0:
-        raise UserError(f"--camera-height must be above 0; got {settings.camera_height:g} m")
+        raise UserError(f"--seed must lie between 0 and 2147483647; got {shown(settings.seed)}")
+    height = settings.camera_height
+    if height is not None and not 0 < height <= MAX_CAMERA_HEIGHT:
+        raise UserError(
+            f"--camera-height must be above 0 and at most {MAX_CAMERA_HEIGHT:g} m; got {height:g} m"
+        )
     if not settings.photos.exists():
         raise UserError(f"{settings.photos} does not exist; give a folder of photos or a video")
     for kind, folder in settings.sidecars.items():
@@ -210,7 +214,8 @@ def with_known_lengths(scene: Scene, known: Sequence[tuple[str, float]], marks: 
     if not known:
         return scene
     marked = read_marks(marks)
-    return apply_known_lengths(scene, [measure(scene, marked, *each) for each in known])
+    scaled = apply_known_lengths(scene, [measure(scene, marked, *each) for each in known])
+    return checked_world(scaled, str(scene.root))
 
 
 def poses_by_motion(

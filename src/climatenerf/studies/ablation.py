@@ -36,8 +36,8 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
 from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
-from climatenerf.training.folder import OPTIMISER, check_config
-from climatenerf.training.run import fit_scene
+from climatenerf.training.folder import OPTIMISER, check_config, checked_metrics
+from climatenerf.training.run import METRICS, fit_scene
 from climatenerf.training.settings import FitSettings, Losses, as_config, settings_of
 from climatenerf.training.trainer import Report
 
@@ -221,9 +221,9 @@ def fit_row(
             raise UserError(
                 f"{run} was fitted with other settings; choose another folder with -o, or remove it"
             )
-    if begun and (run / "metrics.json").is_file():
-        metrics = read_json(run / "metrics.json", "the run's measurements")
-        if metrics.get("interrupted") is False and "views" in metrics:
+    if begun and (run / METRICS).is_file():
+        metrics = checked_metrics(run / METRICS)
+        if not metrics["interrupted"] and "views" in metrics:
             return
     metrics = fit_scene(scene, run, settings, downscale, begun, after_step, lambda done, n: None)
     if metrics["interrupted"]:

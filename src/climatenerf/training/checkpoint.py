@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,17 @@ from typing import Any
 import numpy as np
 import torch
 
+from climatenerf.core import parsing
 from climatenerf.core.device import to_numpy
-from climatenerf.core.errors import UserError
-from climatenerf.core.storage import read_safetensors, write_json, write_safetensors
-from climatenerf.field.checkpoint import load_field, save_field
+from climatenerf.core.errors import UserError, one_line
+from climatenerf.core.storage import (
+    check_finite,
+    digest,
+    read_safetensors,
+    write_json,
+    write_safetensors,
+)
+from climatenerf.field.checkpoint import MAX_VALUE, load_field, save_field
 from climatenerf.scene.scene import Scene, load_scene
 from climatenerf.training.folder import check_config
 from climatenerf.training.snapshot import (
@@ -46,7 +54,9 @@ def checkpoint(
     identity = _identity(trainer)
     with new_checkpoint(run) as staging:
         save_field(trainer.field, staging, identity)
-        write_safetensors(staging / OPTIMISER, _state(trainer), {"checkpoint": identity})
+        state = _state(trainer)
+        about = {"checkpoint": identity, "climatenerf": json.dumps({"digest": digest(state)})}
+        write_safetensors(staging / OPTIMISER, state, about)
         if config is not None:
             write_json(staging / CONFIG, {**config, "checkpoint": identity})
         if scene is not None:
@@ -113,22 +123,41 @@ def restore(trainer: Trainer, run: Path) -> None:
         saved.near,
         saved.pruning_threshold,
     )
-    arrays, about = read_safetensors(run / OPTIMISER, "the optimiser's state")
-    if about.get("checkpoint", "") not in ("", identity_of(run / FIELD) or ""):
+    arrays, metadata = read_safetensors(run / OPTIMISER, "the optimiser's state")
+    if metadata.get("checkpoint", "") not in ("", identity_of(run / FIELD) or ""):
         raise UserError(
             f"{run / OPTIMISER} and {FIELD} are of different checkpoints; the run can be rendered"
             " but not resumed, copy both again or fit anew into another folder"
         )
+    about = parsing.parse_json(metadata.get("climatenerf", "{}"), str(run / OPTIMISER))
     try:
+        _check_state(arrays, about)
         _restore_state(trainer, arrays)
-    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+    except (KeyError, ValueError, RuntimeError, TypeError, IndexError) as error:
         raise UserError(
-            f"{run / OPTIMISER} is damaged ({type(error).__name__}: {error}); the run can be"
-            " rendered but not resumed, fit anew into another folder"
+            f"{run / OPTIMISER} is damaged ({one_line(str(error), 120)}); the run can be rendered"
+            " but not resumed, fit anew into another folder"
         ) from error
     if not saved.knows_classes:  # the labels are new, so the class head begins to learn now
         objective = trainer.objective
         objective.classes_trusted_at = trainer.progress + trainer.schedule.refine_at
+
+
+def _check_state(arrays: dict[str, np.ndarray], about: object) -> None:
+    """Refuse the state of an optimiser that would make NaN of a sound field.
+
+    Raises:
+        ValueError: its checksum is wrong, or a number is not finite, far too large, or negative
+            where a square is expected.
+    """
+    expected = about.get("digest") if isinstance(about, dict) else None
+    if expected is not None and expected != digest(arrays):  # absent in earlier versions
+        raise ValueError("its checksum is another")
+    check_finite(arrays, MAX_VALUE)
+    for name, array in arrays.items():
+        negative = name.endswith((".second", ".exp_avg_sq", "steps", "counters"))
+        if negative and array.size and array.min() < 0:
+            raise ValueError(f"{name} holds a negative number")
 
 
 def _restore_state(trainer: Trainer, arrays: dict) -> None:

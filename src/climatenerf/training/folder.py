@@ -3,8 +3,9 @@
 import dataclasses
 from pathlib import Path
 
-from climatenerf.core.errors import UserError
-from climatenerf.core.storage import check_schema, read_json
+from climatenerf.core import parsing
+from climatenerf.core.errors import UserError, one_line
+from climatenerf.core.storage import check_schema
 from climatenerf.scene.scene import Scene
 from climatenerf.training.settings import FitSettings, with_present_names
 from climatenerf.training.snapshot import CONFIG, METRICS, OPTIMISER, finish_after_kill
@@ -46,11 +47,30 @@ def check_config(run: Path) -> dict:
     Raises:
         UserError: the file cannot be read, or a newer version wrote it.
     """
-    config = read_json(run / CONFIG, "the run's configuration")
+    where = str(run / CONFIG)
+    config = parsing.read_json(run / CONFIG, "the run's configuration")
     check_schema(config.get("schema_version"), SCHEMA_VERSION, f"the run in {run}")
-    if isinstance(config.get("settings"), dict):
-        config["settings"] = with_present_names(config["settings"])
+    config["settings"] = with_present_names(parsing.entries(config, "settings", where, {}))
+    parsing.integer(config, "downscale", where, 1, 10_000, 1)
+    parsing.entries(config, "field", where, {})
     return config
+
+
+def checked_metrics(path: Path) -> dict:
+    """Return the content of a run's `metrics.json`, with the types that `fit` writes.
+
+    Raises:
+        UserError: the file cannot be read, or a value has another type.
+    """
+    metrics, where = parsing.read_json(path, "the run's metrics"), str(path)
+    metrics["interrupted"] = parsing.flag(metrics, "interrupted", where, False)
+    metrics["steps"] = parsing.integer(metrics, "steps", where, 0, 2**53, 0)
+    for name in ("seconds", "masked_fraction", "psnr", "psnr_cc", "ssim"):
+        if metrics.get(name) is not None:
+            parsing.number(metrics, name, where)
+    if metrics.get("psnr") is not None:  # all three are written together
+        metrics |= {name: parsing.number(metrics, name, where) for name in ("psnr_cc", "ssim")}
+    return metrics
 
 
 def check_resumable(run: Path, settings: FitSettings) -> None:
@@ -60,11 +80,10 @@ def check_resumable(run: Path, settings: FitSettings) -> None:
         UserError: the run was begun with settings that cannot be changed.
     """
     config = check_config(run)
-    before, size = config.get("settings") or {}, settings.size
+    before, size = config["settings"], settings.size
     if "losses" in before and before.get("preset", settings.preset) != settings.preset:
-        raise UserError(
-            f"{run} was fitted with --preset {before['preset']}; resume it with the same"
-        )
+        preset = one_line(str(before["preset"]), 40)
+        raise UserError(f"{run} was fitted with --preset {preset}; resume it with the same")
     if "losses" not in before or config.get("field") != dataclasses.asdict(size):
         raise UserError(
             f"{run} was fitted by an earlier version; it can be rendered but not resumed, fit anew"

@@ -30,7 +30,11 @@ from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
 from climatenerf.training.evidence.sparse_depth import unmasked_sparse_depth
-from climatenerf.training.folder import SCHEMA_VERSION, check_folder, check_resumable
+from climatenerf.training.folder import (
+    SCHEMA_VERSION,
+    check_folder,
+    check_resumable,
+)
 from climatenerf.training.settings import FitSettings, as_config
 from climatenerf.training.setup import compile_kernels, make_trainer
 from climatenerf.training.snapshot import METRICS, writing_run
@@ -42,6 +46,7 @@ PREVIEW_WIDTH = 240  # pixels
 MIN_PICTURE = 16  # pixels along each side; windows of the structural similarity have 11
 MIN_SPREAD = 1e-3  # m between cameras and their mean; nearer ones are in one position,
 MIN_INPUT_SPREAD = 1e-6  # as they are below this in units of the poses as given
+MAX_PIXELS_AFTER_STOP = 1_000_000  # that are rendered before a stopped fit ends: 3 s on two cores
 MIN_USABLE_FRACTION = 1e-3  # of the pixels that masks must leave
 
 
@@ -91,8 +96,8 @@ def fit_scene(
 ) -> dict:
     """Fit a field to a scene, write a run folder, and return the metrics.
 
-    Ctrl-C ends the fit early; the field learned so far is saved and measured. The folder is locked
-    against other writers; those who read it see the files of one checkpoint.
+    Ctrl-C ends the fit early; the field learned so far is saved, and measured if that is quick. The
+    folder is locked against other writers; those who read it see the files of one checkpoint.
 
     Args:
         scene: the capture.
@@ -169,9 +174,18 @@ def _fit(
         "masked_fraction": masked_fraction(trainer),
     }
     write_json(run / METRICS, metrics)
+    if interrupted and heldout_pixels(scene, downscale) > MAX_PIXELS_AFTER_STOP:
+        # The user waits for the end, and a resumed fit will be measured.
+        return metrics | {"psnr": None, "ssim": None, "psnr_cc": None}
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
     write_json(run / METRICS, metrics)
     return metrics
+
+
+def heldout_pixels(scene: Scene, downscale: int) -> int:
+    """Return the number of pixels that measuring the held-out views renders."""
+    cameras = [scene.cameras[view.camera] for view in scene.of_split("heldout")]
+    return sum((c.width // downscale) * (c.height // downscale) for c in cameras)
 
 
 def begin(

@@ -11,19 +11,20 @@ Sections, names, units and ranges come from the effects. Loads no torch.
 """
 
 import difflib
-import tomllib
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, one_line, shown
+from climatenerf.core.parsing import read_toml
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import EFFECTS, parameters
 from climatenerf.weather.units import DURATION, Parameter, format_quantity, parse_quantity
 from climatenerf.weather.weather import Weather, check
 
+MAX_KEYFRAMES = 10_000
 Keyframes = tuple[tuple[float, Any], ...]
 
 
@@ -54,17 +55,7 @@ def read_weather(path: Path, effects: Sequence[Effect] = EFFECTS) -> KeyframedWe
         UserError: the file cannot be read, is not TOML, names something unknown (the message offers
             the nearest valid name), or holds a value of the wrong dimension or outside its range.
     """
-    try:
-        with path.open("rb") as file:
-            table = tomllib.load(file)
-    except OSError as error:
-        raise UserError(
-            f"cannot read the weather file {path}: {error.strerror}; check the path"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"the weather file {path} is not valid TOML: {error}; correct it"
-        ) from error
+    table = read_toml(path, "the weather file")
     try:
         return weather_from_table(table, effects)
     except UserError as error:
@@ -83,7 +74,7 @@ def weather_from_table(
             weather = weather.with_value("seed", _integer(entries))
             continue
         if not isinstance(entries, Mapping):
-            raise UserError(f"[{section}] must be a table of values; got {entries!r}")
+            raise UserError(f"[{section}] must be a table of values; got {shown(entries)}")
         for key, raw in entries.items():
             item = _nearest(key, list(known[section]), f"key in [{section}]")
             name, parameter = f"{section}.{item}", known[section][item]
@@ -182,14 +173,19 @@ def _nearest(name: str, valid: list[str], what: str) -> str:
     plain = name.replace("-", "_")
     if plain in valid:
         return plain
-    near = difflib.get_close_matches(plain, valid, n=1, cutoff=0)[0].replace("_", "-")
-    raise UserError(f'unknown {what} "{name}"; did you mean "{near}"?')
+    near = difflib.get_close_matches(plain[:60], valid, n=1, cutoff=0)[0].replace("_", "-")
+    raise UserError(f'unknown {what} "{one_line(name, 60)}"; did you mean "{near}"?')
 
 
 def _read_keyframes(name: str, parameter: Parameter, raw: Mapping[str, Any]) -> Keyframes:
     where = name.replace("_", "-")
     if not raw:
         raise UserError(f"{where} has an empty table of keyframes; give it at least one time")
+    if len(raw) > MAX_KEYFRAMES:
+        raise UserError(
+            f"{where} has {len(raw)} keyframes, more than the {MAX_KEYFRAMES} that can be read;"
+            " leave some out"
+        )
     times = {parse_quantity(text, DURATION, f"a time of {where}"): v for text, v in raw.items()}
     if len(times) < len(raw):
         raise UserError(f"{where} names the same time twice")
@@ -203,7 +199,7 @@ def _read_keyframes(name: str, parameter: Parameter, raw: Mapping[str, Any]) -> 
 
 def _integer(raw: Any) -> int:
     if isinstance(raw, bool) or not isinstance(raw, int):
-        raise UserError(f"seed must be a whole number; got {raw!r}")
+        raise UserError(f"seed must be a whole number; got {shown(raw)}")
     return raw
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from tyro.constructors import PrimitiveConstructorSpec
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, one_line, shown
 
 if TYPE_CHECKING:
     import pint
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _QUANTITY = re.compile(
     r"\s*(?P<number>[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(?P<unit>[\w°/*^. -]{0,24}?)\s*"
 )
+MAX_TEXT = 200
+"""Characters of a quantity."""
 _ANGLE_UNITS = ("degree", "radian", "milliradian", "arcminute", "arcsecond", "turn", "grade")
 
 
@@ -74,8 +76,10 @@ def parse_quantity(text: str, kind: Kind, where: str = "") -> float:
         UserError: no number, no unit, an unknown unit, another dimension, or a value that is not
             finite.
     """
-    message = f'{where} must be {kind.name} such as "{kind.example}"; got "{text}"'.lstrip()
-    match = _QUANTITY.fullmatch(text)
+    got = one_line(text, 60)
+    message = f'{where} must be {kind.name} such as "{kind.example}"; got "{got}"'.lstrip()
+    # The time of the search grows with the square of the number of digits.
+    match = _QUANTITY.fullmatch(text) if len(text) <= MAX_TEXT else None
     if match is None:
         raise UserError(message)
     number, unit = float(match["number"]), re.sub(r"^(per |/)", "1/", match["unit"])
@@ -158,6 +162,13 @@ class Parameter(PrimitiveConstructorSpec[Any]):
             return f"{value:g}"
         return f"{value / self.kind.scale:.6g} {self.kind.unit}"
 
+    def _got(self, value: float) -> str:
+        """One number of any size for a message."""
+        try:
+            return self.text(value)
+        except OverflowError:
+            return shown(value)
+
     def check(self, value: float | tuple[float, ...] | None, name: str) -> None:
         """Check a value against the range; `name` is the field's, such as "flood.wind_speed".
 
@@ -172,7 +183,7 @@ class Parameter(PrimitiveConstructorSpec[Any]):
             if not self.low - slack <= number <= self.high + slack:
                 raise UserError(
                     f"--{name.replace('_', '-')} must lie between {self.text(self.low)} and"
-                    f" {self.text(self.high)}; got {self.text(number)}"
+                    f" {self.text(self.high)}; got {self._got(number)}"
                 )
 
     def read(self, raw: Any, where: str) -> Any:
@@ -185,16 +196,18 @@ class Parameter(PrimitiveConstructorSpec[Any]):
             return None
         if self.kind is not None:
             if not isinstance(raw, str):
-                example = self.kind.example
-                raise UserError(f'{where} must be {self.kind.name} such as "{example}"; got {raw}')
+                message = f'{where} must be {self.kind.name} such as "{self.kind.example}"'
+                raise UserError(f"{message}; got {shown(raw)}")
             return parse_quantity(raw, self.kind, where)
         if self.count == 1:
             if isinstance(raw, bool) or not isinstance(raw, int | float):
-                raise UserError(f"{where} must be a number; got {raw!r}")
+                raise UserError(f"{where} must be a number; got {shown(raw)}")
             return float(raw)
         numbers = isinstance(raw, list | tuple) and len(raw) == self.count
         if not numbers or any(isinstance(x, bool) or not isinstance(x, int | float) for x in raw):
-            raise UserError(f"{where} must be three numbers such as [0.5, 0.4, 0.3]; got {raw!r}")
+            raise UserError(
+                f"{where} must be three numbers such as [0.5, 0.4, 0.3]; got {shown(raw)}"
+            )
         return tuple(float(x) for x in raw)
 
     def write(self, value: Any) -> Any:

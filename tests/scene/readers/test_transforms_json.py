@@ -220,7 +220,7 @@ def test_invalid_values_raise(tmp_path, top, message):
 
 def test_invalid_json_raises(tmp_path):
     (tmp_path / "transforms.json").write_text('{"frames": [')
-    with pytest.raises(UserError, match=r"transforms\.json is not readable JSON"):
+    with pytest.raises(UserError, match=r"transforms\.json is not valid JSON"):
         read_scene(tmp_path)
 
 

@@ -10,6 +10,7 @@ from numba import njit, prange
 
 from climatenerf.ops.cpu import simd
 from climatenerf.ops.cpu.simd import LANES
+from climatenerf.ops.limits import MAX_STEPS
 
 SIMD_DIGEST = "2210a987a87b"  # of `simd.py`, which explains why
 
@@ -215,13 +216,14 @@ def march(rays_o, rays_d, spans, cells, steps, stop, net, rows, counts):
                     t = max(t, min(ta, tb))
                     end = min(end, max(ta, tb))
             tau = np.float32(0.0)
-            first = k
+            first, steps_left = k, MAX_STEPS
             t += spans[r, 2] * max(dt_min, cone * t)
-            while t < end:
+            while t < end and steps_left > 0:
                 # The next LANES steps in occupied cells. The ray may end at the first of them, but
                 # together they cost little more than one.
                 count = 0
-                while t < end and count < LANES:
+                while t < end and count < LANES and steps_left > 0:
+                    steps_left -= 1
                     dt = min(max(dt_min, cone * t), end - t)
                     tm = t + np.float32(0.5) * dt
                     qx, qy, qz = ox + tm * dx, oy + tm * dy, oz + tm * dz

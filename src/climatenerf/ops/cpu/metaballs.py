@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int
 from numba import njit, prange
 
 from climatenerf.ops.cpu.simd_metaballs import BALL_SUPPORT, ball_means, ball_sums
+from climatenerf.ops.limits import MAX_METABALL_STEPS
 
 SIMD_DIGEST = "ee9d1f67a672"  # of `simd.py` and `simd_metaballs.py`; the former explains why
 BRICK = 8
@@ -221,7 +222,9 @@ def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
     group, moment, first, last = 0.0, 0.0, 0.0, 0.0
     k, brick, h, per = -1, -1, 0.0, 0.0
     cx, cy, cz = 0.0, 0.0, 0.0  # the brick's corner
-    while t < end and depth < _OPAQUE:
+    steps_left = MAX_METABALL_STEPS
+    while t < end and depth < _OPAQUE and steps_left > 0:
+        steps_left -= 1
         x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
         px, py, pz = (x - cx) * per, (y - cy) * per, (z - cz) * per
         # Most steps stay in their brick. In the finest cascade no finer brick can be there.

@@ -18,6 +18,7 @@ from climatenerf.ops.triton.compositing import weight_of
 from climatenerf.ops.triton.encoding import features_at
 from climatenerf.ops.triton.marching import (
     RAYS,
+    SEARCHES,
     WARPS,
     begin,
     cells_of,
@@ -78,7 +79,9 @@ def _composite(
     tau, length = tl.zeros_like(t), tl.zeros_like(t)
     rgb = tl.zeros([BLOCK, 16], tl.float32)
     live = valid & (t < end)
+    searches = 0
     while tl.max(live.to(tl.int32), 0) > 0:
+        searches += 1
         t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
         if tl.max(found, 0) > 0:
@@ -96,7 +99,7 @@ def _composite(
                 y = tl.dot(h, second_layer, input_precision=FAST) + bias[None, :]
                 rgb += tl.where(heavy, weight, 0.0)[:, None] * radiance(y)
             t = tl.where(here, t + dt, t)
-        live = live & (t < end) & (tau < limits[0])
+        live = live & (t < end) & (tau < limits[0]) & (searches < SEARCHES)
     tl.store(out + 5 * r[:, None] + c[None, :], rgb, mask=valid[:, None] & (c < 3)[None, :])
     tl.store(out + 5 * r + 3, length, mask=valid)
     tl.store(out + 5 * r + 4, tl.exp(-tau), mask=valid)

@@ -16,6 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from climatenerf.ops.limits import MAX_STEPS
 from climatenerf.ops.triton.encoding import features_at, slopes_of
 from climatenerf.ops.triton.network import EXACT, first_layer, hidden_of, sizes_of
 from climatenerf.ops.triton.tiles import RAY_LISTS, launch, points, ray_lists
@@ -23,6 +24,7 @@ from climatenerf.ops.triton.tiles import RAY_LISTS, launch, points, ray_lists
 SAMPLES = 64  # per tile of densities
 RAYS = 16  # that march together in a program
 WARPS = 2  # per program that marches
+SEARCHES = tl.constexpr(MAX_STEPS)  # at most, of a ray
 TRIES = tl.constexpr(4)  # empty cells that a ray crosses between two computations of densities
 INFINITE = tl.constexpr(1e30)
 SLOPE_SAMPLES, SLOPE_WARPS = 32, 4  # per tile of the density's slopes
@@ -239,7 +241,9 @@ def _march(
     tau = tl.zeros_like(t)
     k = tl.zeros_like(r)
     live = valid & (t < end)
+    searches = 0
     while tl.max(live.to(tl.int32), 0) > 0:
+        searches += 1
         t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
         if tl.max(found, 0) > 0:
@@ -254,7 +258,7 @@ def _march(
             tau += tl.where(thick, sigma * dt, 0.0)
             k += thick.to(tl.int64)
             t = tl.where(here, t + dt, t)
-        live = live & (t < end) & (tau < max_depth) & (k < capacity)
+        live = live & (t < end) & (tau < max_depth) & (k < capacity) & (searches < SEARCHES)
     tl.store(counts + r, k, mask=valid)
 
 

@@ -10,7 +10,6 @@ Marks are a TOML file of pixels (x right, y down) in the scene's images:
     "0017.jpg" = [704, 871]
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError
-from climatenerf.core.text import read_text
+from climatenerf.core.errors import UserError, shown
+from climatenerf.core.parsing import read_toml
 from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
 from climatenerf.scene.findings import Finding
 from climatenerf.scene.scene import Scene
@@ -56,16 +55,13 @@ def read_marks(path: Path) -> Marks:
     Raises:
         UserError: The file is absent, not TOML, or not of the form above.
     """
-    try:
-        table = tomllib.loads(read_text(path))
-    except FileNotFoundError:
+    if not path.exists():
         raise UserError(
             f"{path} does not exist; mark both ends of the length in two images or more (open"
             " mark.html in the scene folder, which capture makes, or write the file as"
             " docs/formats.md describes) and save the result there"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise UserError(f"the marks {path} are not valid TOML ({error}); correct them") from None
+        )
+    table = read_toml(path, "the marks")
     marks: Marks = {}
     for name, ends in table.items():
         if not isinstance(ends, Mapping) or set(ends) != {"from", "to"}:
@@ -90,7 +86,8 @@ def _pixel(value: object, name: str, end: str, path: Path) -> tuple[float, float
         if len(numbers) == 2 and np.isfinite(numbers).all():
             return float(numbers[0]), float(numbers[1])
     raise UserError(
-        f"[{name}.{end}] in {path} contains {value!r}; replace it by a pixel such as [812, 440]"
+        f"[{name}.{end}] in {path} contains {shown(value)}; replace it by a pixel such as"
+        " [812, 440]"
     )
 
 

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, shown
 from climatenerf.scene.findings import Finding
 from climatenerf.scene.label_spaces import TRAIN_IDS
-from climatenerf.scene.scene import MILLIMETRES, View
+from climatenerf.scene.readers.ply import MAX_POSITION
+from climatenerf.scene.scene import MAX_SIDE, MILLIMETRES, View
 
-# No real pose, focal length or size comes near; above it, products of several numbers overflow.
+# No real focal length or size comes near; above it, products of several numbers overflow.
 _MAX_VALUE = 1e12
 
 
@@ -73,10 +74,9 @@ def checked_camera(camera: Camera, where: str) -> Camera:
         raise UserError(
             f"A camera in {where} has focal length 0; calibrate again or correct the file."
         )
-    if not (0 < camera.width < _MAX_VALUE and 0 < camera.height < _MAX_VALUE):
-        raise UserError(
-            f"A camera in {where} has size {camera.width}x{camera.height} pixels; correct the file."
-        )
+    if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
+        size = f"{shown(camera.width)}x{shown(camera.height)}"
+        raise UserError(f"A camera in {where} has size {size} pixels; correct the file.")
     return camera
 
 
@@ -96,7 +96,7 @@ def checked_pose(matrix: Any, name: str, where: str) -> Float[np.ndarray, "4 4"]
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.empty(0)
     if pose.shape not in ((3, 4), (4, 4)):
         raise UserError(f"The pose of {name} in {where} is not a 4x4 matrix; correct the file.")
@@ -104,6 +104,12 @@ def checked_pose(matrix: Any, name: str, where: str) -> Float[np.ndarray, "4 4"]
         raise UserError(
             f"The pose of {name} in {where} is not finite or far too large; remove that image or "
             "compute its pose again."
+        )
+    if np.abs(pose[:3, 3]).max() > MAX_POSITION:
+        raise UserError(
+            f"The pose of {name} in {where} is far too large: {np.abs(pose[:3, 3]).max():.3g} units"
+            f" from the origin, and 32 bits resolve nothing beyond {MAX_POSITION:g}; remove that"
+            " image or compute its pose again."
         )
     u, stretch, vt = np.linalg.svd(pose[:3, :3])
     mean = stretch.mean()

@@ -16,13 +16,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain
 from climatenerf.core.listing import visible
 from climatenerf.core.rotations import rotation_matrices
 from climatenerf.core.text import decode, lines_of, read_text
 from climatenerf.scene.file_names import FileNames
 from climatenerf.scene.findings import Finding
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
+from climatenerf.scene.readers.ply import MAX_POSITION
 from climatenerf.scene.scene import View
 
 # Model id -> (name, number of parameters), as in COLMAP's sensor/models.h.
@@ -258,9 +259,7 @@ class _Cursor:
         try:
             self.data = path.read_bytes()
         except OSError as error:
-            raise UserError(
-                f"{path} cannot be read ({error.strerror}); export the COLMAP model again."
-            ) from None
+            raise explain(error, path) from None
         self.offset = 0
 
     def damaged(self) -> UserError:
@@ -352,7 +351,7 @@ def _observed_rows(
 
 
 def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Return ids and positions, input frame, of the points with finite positions."""
+    """Return ids and positions, input frame, of the points up to `MAX_POSITION`."""
     path = model / f"points3D{_suffix(model)}"
     if not path.is_file():
         return np.empty(0, np.int64), np.empty((0, 3))
@@ -373,8 +372,8 @@ def _read_points3d(model: Path) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray
             values = cursor.take("q3d3BdQ")
             ids[i], points[i] = values[0], values[1:4]
             cursor.skip(8 * values[8])
-    finite = np.isfinite(points).all(axis=1)
-    return ids[finite], points[finite]
+    usable = (np.abs(points) <= MAX_POSITION).all(axis=1)  # NaN is not
+    return ids[usable], points[usable]
 
 
 def _lines(path: Path) -> list[str]:
@@ -382,9 +381,7 @@ def _lines(path: Path) -> list[str]:
     try:
         text = read_text(path)
     except OSError as error:
-        raise UserError(
-            f"{path} cannot be read ({error.strerror}); export the COLMAP model again."
-        ) from None
+        raise explain(error, path) from None
     lines = (line.strip(" \t") for line in lines_of(text))
     return [line for line in lines if not line.startswith("#")]
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.listing import visible
 from climatenerf.scene.findings import Finding
 from climatenerf.scene.label_spaces import CITYSCAPES_IDS, TRAIN_IDS
@@ -46,9 +46,11 @@ def parse_frames(frames: str | tuple[int, int]) -> tuple[int, int]:
         UserError: The text has another form, or the first frame is after the last.
     """
     if isinstance(frames, str):
-        found = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", frames)
+        found = re.fullmatch(r"\s*(\d{1,10})\s*:\s*(\d{1,10})\s*", frames)
         if not found:
-            raise UserError(f'--frames is "{frames}"; give two frames, such as 1538:1601.')
+            raise UserError(
+                f'--frames is "{one_line(frames, 60)}"; give two frames, such as 1538:1601.'
+            )
         frames = int(found[1]), int(found[2])
     if frames[0] > frames[1]:
         raise UserError(f"--frames {frames[0]}:{frames[1]} ends before it begins; exchange them.")

@@ -14,6 +14,7 @@ have no lens distortion.
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +29,7 @@ from climatenerf.scene.scene import View
 
 SPLITS: dict[str, Literal["train", "heldout"]] = {"train": "train", "val": "heldout"}
 MAX_TILT = 0.1  # sine of 6 degrees
+MAX_METADATA = 4_000_000  # bytes of one .pt; it holds some 30 numbers
 _SUFFIXES = (".jpg", ".JPG", ".png", ".PNG")
 _UPRIGHT_FROM_DRB = np.array([[0.0, 1, 0], [0, 0, -1], [-1, 0, 0]])
 
@@ -84,7 +86,10 @@ def _load(path: Path) -> dict[str, Any]:
     import torch
 
     try:
+        _check_size(path)
         data = torch.load(path, map_location="cpu", weights_only=True)
+    except UserError:
+        raise
     except Exception as error:  # torch raises many types of exceptions for damaged files
         reason = str(error).strip().split("\n")[0][:80]
         raise UserError(
@@ -93,6 +98,19 @@ def _load(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise UserError(f"{path} contains no dictionary of named values; download it again.")
     return data
+
+
+def _check_size(path: Path) -> None:
+    """Refuse a file that holds, or unpacks to, more than the metadata of a photo."""
+    size = path.stat().st_size
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            size = max(size, sum(member.file_size for member in archive.infolist()))
+    if size > MAX_METADATA:
+        raise UserError(
+            f"{path} holds {size / 1e6:.0f} MB, more than the metadata of a photo; download it"
+            " again."
+        )
 
 
 def _array(data: dict[str, Any], key: str, shape: tuple[int, ...], path: Path) -> np.ndarray:

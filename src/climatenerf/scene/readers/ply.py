@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain, one_line
 from climatenerf.core.storage import write_bytes
+
+MAX_POSITION = 1e9
+"""Input units. 32 bits resolve a hundredth part of a scene of a millionth of that."""
 
 _TYPES = {
     "char": "i1",
@@ -33,7 +36,7 @@ _TYPES = {
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Read the vertex positions of an ASCII or binary PLY file, in the units of the file.
 
-    Points that are not finite are left out.
+    Points that are not finite or beyond `MAX_POSITION` are left out.
 
     Raises:
         UserError: The file is missing, damaged, or not a point cloud.
@@ -41,16 +44,19 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     try:
         raw = path.read_bytes()
     except OSError as error:
+        if not isinstance(error, FileNotFoundError):
+            raise explain(error, path) from None
         raise UserError(
             f"The points {path} cannot be read ({error.strerror}); restore the file."
         ) from None
     try:
         points = _parse(raw)
-    except (ValueError, KeyError, IndexError) as error:
+    except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise UserError(
-            f"The points {path} are not a readable PLY point cloud ({error}); export them again."
+            f"The points {path} are not a readable PLY point cloud"
+            f" ({one_line(str(error), 100)}); export them again."
         ) from None
-    return points[np.isfinite(points).all(axis=1)]
+    return points[(np.abs(points) <= MAX_POSITION).all(axis=1)]  # NaN is not
 
 
 def write_points(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
@@ -103,6 +109,8 @@ def _parse_header(header: str) -> tuple[str, int, list[tuple[str, str]]]:
             if words[1] != "vertex":
                 raise ValueError("vertices are not the first element")
             count, in_vertex = int(words[2]), True
+            if count < 0:
+                raise ValueError("a negative number of points")
         elif words[:1] == ["property"] and in_vertex:
             properties.append((words[2], _TYPES[words[1]]))
     return encoding, count, properties

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, explain
 from climatenerf.core.text import lines_of, read_text
 
 
@@ -23,7 +23,7 @@ def text_lines(path: Path) -> list[str]:
     except FileNotFoundError:
         raise UserError(f"{path} is missing; restore it from the source of the capture.") from None
     except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}); replace it.") from None
+        raise explain(error, path) from None
     return [line.strip() for line in lines_of(text) if line.strip()]
 
 

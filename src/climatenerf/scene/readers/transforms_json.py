@@ -10,7 +10,6 @@ its viewer and are not applied. Depth files are those of nerfstudio (`depth_file
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,15 +19,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from climatenerf.core import parsing
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.text import read_text
 from climatenerf.scene.file_names import FileNames, normalised
 from climatenerf.scene.findings import Finding, examples
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.ply import read_points
-from climatenerf.scene.scene import MILLIMETRES, View
+from climatenerf.scene.scene import MAX_VIEWS, MILLIMETRES, View, is_file
 
 SPLIT_FILES = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 _PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -192,13 +191,15 @@ def _point_transforms(data: dict[str, Any]) -> list[Float[np.ndarray, "4 4"]]:
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        data = json.loads(read_text(path))
-    except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} is not readable JSON ({error}); export it again.") from None
-    frames = data.get("frames") if isinstance(data, dict) else None
+    data = parsing.read_json(path, "the capture")
+    frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise UserError(f"{path} has no list of frames; export it again.")
+    if len(frames) > MAX_VIEWS:
+        raise UserError(
+            f"{path} has {len(frames)} frames, more than the {MAX_VIEWS} that can be read; leave"
+            " some out."
+        )
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise UserError(f"Frame {i} of {path} has no file_path; export it again.")
@@ -222,7 +223,7 @@ def _view(
 ) -> View:
     relative = normalised(frame["file_path"])
     path = files.find(relative) or files.folder / relative
-    if not path.is_file() and path.suffix.lower() not in (s.lower() for s in _IMAGE_SUFFIXES):
+    if not is_file(path) and path.suffix.lower() not in (s.lower() for s in _IMAGE_SUFFIXES):
         found = (files.find(f"{relative}{suffix}") for suffix in _IMAGE_SUFFIXES)
         path = next((file for file in found if file is not None), Path(f"{path}.png"))
     name = relative.removeprefix("images/")
@@ -251,7 +252,7 @@ def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str)
         value = frame.get(key, data.get(key, default))
         try:
             return None if value is None else float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise UserError(f"{key} in {where} is not a number; correct the file.") from None
 
     model = str(frame.get("camera_model", data.get("camera_model", "OPENCV")))
@@ -264,7 +265,7 @@ def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str)
     width, height = number("w"), number("h")
     if width is None or height is None:
         # A missing image gets a placeholder size; it is left out later.
-        header = read_header(path) if path.is_file() else None
+        header = read_header(path) if is_file(path) else None
         width, height = (header.width, header.height) if header else (1.0, 1.0)
     fx, fy = _focal_lengths(number, width, height, where)
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "k3", "p1", "p2")

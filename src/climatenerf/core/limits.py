@@ -1,0 +1,19 @@
+"""Greatest values of numbers that users give."""
+
+from climatenerf.core.errors import UserError, shown
+
+MAX_FRAMES = 100_000
+"""Frames of a movie: over an hour at 24 per second."""
+MAX_SEED = 2**63 - 1
+"""Random generators take 64 bits with a sign."""
+
+
+def check_seed(seed: int) -> int:
+    """Return a random seed.
+
+    Raises:
+        UserError: it is outside 0 to `MAX_SEED`.
+    """
+    if not 0 <= seed <= MAX_SEED:
+        raise UserError(f"--seed must lie between 0 and {MAX_SEED}; got {shown(seed)}")
+    return seed

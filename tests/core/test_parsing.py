@@ -1,0 +1,160 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from climatenerf.core import parsing
+from climatenerf.core.errors import MAX_LINE, UserError, one_line, shown
+
+PLACE = "scene.json"
+
+
+def written(tmp_path, text, name="a.json"):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[" * 20_000, "nested too deeply"),
+        ('{"a":' * 20_000, "nested too deeply"),
+        ('{"a": ' + "[" * 101 + "]" * 101 + "}", "nested too deeply"),
+        ('{"a": ' + "9" * 400 + "}", "a number of 400 digits"),
+        ('{"a": -' + "9" * 5000 + "}", "a number of 5001 digits"),
+        ("{", "not valid JSON"),
+        ("", "not valid JSON"),
+        ("[1]", "JSON object"),
+        (b'{"a": "\xff"}', "not text"),
+        ('{"a": 1}'.encode("utf-16"), "not text|not valid"),
+    ],
+)
+def test_json_that_is_refused(tmp_path, text, words):
+    with pytest.raises(UserError, match=words) as caught:
+        parsing.read_json(written(tmp_path, text), "scene")
+    assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
+
+
+def test_json_within_the_bounds_is_read(tmp_path):
+    deep = '{"a": ' + "[" * 98 + "]" * 98 + "}"
+    assert len(json.dumps(parsing.read_json(written(tmp_path, deep)))) > 190
+    brackets = json.dumps({"names": ["[" * 500, "}" * 500, '\\"[{'] * 20})
+    assert parsing.read_json(written(tmp_path, brackets)) == json.loads(brackets)
+    mark = b"\xef\xbb\xbf" + b'{"a": 1}'
+    assert parsing.read_json(written(tmp_path, mark)) == {"a": 1}
+
+
+def test_too_many_values_are_refused_before_they_are_parsed(tmp_path, monkeypatch):
+    monkeypatch.setattr(parsing, "MAX_VALUES", 1000)
+    monkeypatch.setattr(parsing.json, "loads", None)
+    with pytest.raises(UserError, match="values, more than"):
+        parsing.read_json(written(tmp_path, json.dumps({"a": [0] * 2000})))
+
+
+def test_no_more_than_the_greatest_size_is_read(tmp_path):
+    path = written(tmp_path, "x" * 101)
+    with pytest.raises(UserError, match="has more than"):
+        parsing.read_bytes(path, "file", 100)
+    with pytest.raises(UserError, match="has more than"):
+        parsing.read_bytes("/dev/zero", "file", 1000)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a = " + "[" * 20_000, "nested too deeply"),
+        ("a = " + "{a=" * 20_000, "nested too deeply"),
+        (".".join("a" * 1000) + " = 1", "nested too deeply"),
+        ("[" + ".".join("a" * 200) + "]", "nested too deeply"),
+        ("a = " + "9" * 400, "a number of 400 digits"),
+        ("a = " + "9" * 5000, "over 4300 digits"),
+        ("a = 0x" + "f" * 4000, "digits"),
+        ("a = ", "not valid TOML"),
+        (b"a = '\xff'", "not text"),
+        ("# " + "x" * parsing.MAX_TOML_BYTES, "has more than"),
+    ],
+)
+def test_toml_that_is_refused(tmp_path, text, words):
+    with pytest.raises(UserError, match=words) as caught:
+        parsing.read_toml(written(tmp_path, text, "a.toml"), "the weather file")
+    assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_opened(tmp_path, monkeypatch):
+    with pytest.raises(UserError, match="does not exist"):
+        parsing.read_json(tmp_path / "absent")
+    with pytest.raises(UserError, match="longer than the disk allows"):
+        parsing.read_json(tmp_path / ("n" * 300))
+    with pytest.raises(UserError, match="a folder where a file"):
+        parsing.read_json(tmp_path)
+    with pytest.raises(UserError, match="no name of a file"):
+        parsing.read_json("a\0b")
+
+    def forbidden(*_):
+        raise PermissionError(13, os.strerror(13))
+
+    monkeypatch.setattr("builtins.open", forbidden)
+    with pytest.raises(UserError, match="no permission"):
+        parsing.read_json(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("value", [None, True, "1", [], {}, float("nan"), float("inf"), 11, -1])
+def test_numbers_of_other_types_and_out_of_range_are_refused(value):
+    with pytest.raises(UserError, match="width in scene.json should be a finite number from 0"):
+        parsing.number({"width": value}, "width", PLACE, 0, 10)
+
+
+def test_typed_values():
+    table = {"n": 3, "t": "x", "b": True, "d": {"k": 1}, "l": [1], "m": [[1, 0.5], [2, 3]]}
+    assert parsing.number(table, "n", PLACE) == 3.0
+    assert parsing.number(table, "absent", PLACE, default=None) is None
+    assert parsing.integer(table, "n", PLACE, 0, 5) == 3
+    assert parsing.text(table, "t", PLACE) == "x" and parsing.flag(table, "b", PLACE) is True
+    assert parsing.entries(table, "d", PLACE) == {"k": 1}
+    assert parsing.items(table, "l", PLACE) == [1]
+    assert np.array_equal(parsing.matrix(table["m"], [(2, 2)], PLACE), [[1, 0.5], [2, 3]])
+    for read in (parsing.text, parsing.flag, parsing.entries, parsing.items):
+        with pytest.raises(UserError, match=r"n in scene\.json should be"):
+            read(table, "n", PLACE)
+        with pytest.raises(UserError, match="has no absent"):
+            read(table, "absent", PLACE)
+    for value in (2.5, True, "3", 6, 10**30):
+        with pytest.raises(UserError, match="a whole number from 0 to 5"):
+            parsing.integer({"n": value}, "n", PLACE, 0, 5)
+    with pytest.raises(UserError, match="should be a table"):
+        parsing.number([1], "n", PLACE)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "value", [None, 5, [], [[1, 2]], [[1], [2, 3]], [[1, "2"], [3, 4]], [[1, 2], [3, 1e300]],
+              [[1, 2], [3, float("nan")]], [[True, 1], [1, 1]], {"a": 1}, [[10**39, 1], [1, 1]]],
+)  # fmt: skip
+def test_matrices_of_other_shapes_and_values_are_refused(value):
+    with pytest.raises(UserError, match="2x2 finite numbers up to 1000"):
+        parsing.matrix(value, [(2, 2)], PLACE, 1000.0)
+
+
+def test_messages_are_one_line_of_bounded_length():
+    assert one_line("two\n  lines\t and \x1b[2J a bell\a") == r"two lines\t and \x1b[2J a bell\x07"
+    assert one_line("two  blanks") == "two  blanks"
+    assert len(one_line("x" * 10**6)) < MAX_LINE + 10
+    assert shown(10**6000).endswith("digits") and shown([0] * 100) == "a list of 100 entries"
+    deep: list = []
+    for _ in range(10_000):
+        deep = [deep]
+    assert shown(deep) == "a list" and len(shown("x" * 10**6)) < 80
+
+
+def test_every_reading_of_json_and_toml_is_here():
+    """One place bounds what is parsed; `json.loads` elsewhere reads this program's own pipes."""
+    root = Path(parsing.__file__).parents[1]
+    allowed = {"core/parsing.py", "sfm/worker.py"}
+    found = {
+        path.relative_to(root).as_posix()
+        for path in root.rglob("*.py")
+        if any(word in path.read_text() for word in ("json.load", "tomllib", "np.load("))
+    }
+    assert found <= {*allowed, "core/arrays.py"}, found

@@ -1,0 +1,91 @@
+"""A short and a longer part of `tools/torture.py`: hostile files, kills, full disks."""
+
+import json
+import os
+import random
+
+import numpy as np
+import pytest
+
+from tools import torture
+from tools.torture_parts import mutations, trials
+from tools.torture_parts.zygote import Outcome
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+FIRST_SEED = 1000
+"""Of trials that once failed, more are replayed by name below."""
+QUICK = ["transforms", "colmap-binary", "weather", "camera-path", "run-scene", "field"]
+REGRESSIONS = ()
+
+
+def passed(found):
+    assert not found["failures"], json.dumps(found["failures"], indent=1)
+    return found["counts"]
+
+
+def test_some_mutations_of_quick_kinds(tmp_path):
+    """The others begin with fits, and are tried by the slow test."""
+    options = {"seconds": 600.0, "trials": 2 * len(QUICK), "first_seed": FIRST_SEED}
+    counts = passed(torture.campaign(tmp_path, only=QUICK, **options))
+    assert {kind: row["trials"] for kind, row in counts.items()} == dict.fromkeys(QUICK, 2)
+
+
+@pytest.mark.slow
+def test_many_mutations_kills_and_full_disks(tmp_path):
+    counts = passed(torture.campaign(tmp_path, seconds=240, first_seed=2 * FIRST_SEED))
+    assert counts
+
+
+@pytest.mark.skipif(not REGRESSIONS, reason="no trial has failed since the tool exists")
+def test_trials_that_once_failed(tmp_path):
+    passed(torture.campaign(tmp_path, replay=REGRESSIONS))
+
+
+def test_a_seed_determines_the_mutation(tmp_path):
+    tree = json.dumps({"a": {"b": [1, 2.5, "x"]}, "c": None})
+    for seed in range(40):
+        results = []
+        for name in ("one", "two"):
+            (tmp_path / name).mkdir(exist_ok=True)
+            path = tmp_path / name / "file.json"
+            path.write_text(tree)
+            done = mutations.mutate(path, random.Random(seed))
+            files = sorted(p for p in (tmp_path / name).iterdir() if p.is_file())
+            results.append((done, [p.read_bytes() for p in files]))
+            for each in (tmp_path / name).iterdir():
+                each.rmdir() if each.is_dir() else each.unlink()
+        assert results[0] == results[1]
+
+
+def ended(status=0, err="", seconds=1.0, peak=100_000_000, hung=False):
+    return Outcome(status, seconds, peak, hung, None, "", err)
+
+
+@pytest.mark.parametrize(
+    ("done", "words"),
+    [
+        (ended(1, "climatenerf: internal error\n"), ["status 1", "internal error"]),
+        (ended(-9, hung=True), ["hangs"]),
+        (ended(-11), ["status -11"]),
+        (ended(0, "Traceback (most recent call last):"), ["Traceback"]),
+        (ended(2, "no sentence"), ["no single sentence"]),
+        (ended(2, "climatenerf: a\nclimatenerf: b\n"), ["no single sentence"]),
+        (ended(2, "climatenerf: Error(s) in loading state_dict\n"), ["Error(s) in loading"]),
+        (ended(peak=10**9), ["1000 MB instead of 100"]),
+    ],
+)
+def test_the_judge_refuses(done, words):
+    faults = "; ".join(trials.judged(done, ended()))
+    assert all(word in faults for word in words), faults
+
+
+def test_the_judge_accepts():
+    assert trials.judged(ended(), ended()) == []
+    assert trials.judged(ended(2, "warning: so\nclimatenerf: no photos; take some\n")) == []
+
+
+def test_the_judge_sees_nan(tmp_path):
+    (tmp_path / "a.json").write_text('{"x": NaN}')
+    np.savez(tmp_path / "b.npz", depth=np.array([1.0, np.nan]))
+    np.savez(tmp_path / "c.npz", depth=np.array([1.0, np.inf]))
+    assert trials.unsound(tmp_path) == ["a.json holds NaN", "b.npz holds NaN"]
