@@ -131,7 +131,7 @@ def _check_grids(size: FieldSize, arrays: Mapping[str, np.ndarray], version: int
     for kind in kinds:
         levels, rows = getattr(size, f"{kind}_levels"), 2 ** getattr(size, f"{kind}_log2_rows")
         shape = arrays[f"{kind}_grid"].shape
-        if levels and (len(shape) != 3 or shape[0] != levels or shape[1] > rows):
+        if levels and (len(shape) != 3 or shape[:2] != (levels, rows)):
             raise ValueError(f"{kind}_grid is of another size")
 
 
