@@ -169,7 +169,7 @@ def load_grey(view: View, scene: Scene, side: int) -> UInt8[np.ndarray, "h w"]:
             rotated = header.rotates_to_fit(camera)
             if not rotated and image.size != (camera.width, camera.height):
                 raise _size_error(view.path, *image.size, camera)
-            image.draft("L", size[::-1] if rotated else size)
+            image.draft("L", (size[1], size[0]) if rotated else size)
             grey = image.convert("L")
     except _IMAGE_ERRORS as error:
         raise _image_error(view.path, error) from None
@@ -420,19 +420,6 @@ def _read_array(path: Path) -> np.ndarray:
     if not found:
         raise ValueError("it holds no array")
     return next(iter(found.values()))
-
-
-def _check_pixels(image: Image.Image, path: Path) -> None:
-    """Refuse a picture that takes too much memory; its header gives the size."""
-    if image.width * image.height > MAX_PIXELS:
-        raise _too_large(path, f"{image.width * image.height / 1e6:.0f}")
-
-
-def _too_large(path: Path, megapixels: str) -> UserError:
-    return UserError(
-        f"The image {path} has {megapixels} megapixels, more than the {MAX_PIXELS / 1e6:.0f} that"
-        " can be read; reduce it, or remove it and its pose."
-    )
 
 
 def _image_error(path: Path, error: Exception) -> UserError:

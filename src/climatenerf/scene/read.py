@@ -112,6 +112,7 @@ def read_scene(
         scene, views=_split(scene.views, capture.predefined_split, holdout, capture.root)
     )
     aligned = _aligned(scene, saved, camera_height, metric_input, capture.metric, gravity)
+    aligned = checked_world(aligned, str(path))
     odd = (*aligned.findings, *sidecar_findings(aligned), *unused_findings(aligned, capture.views))
     return replace(aligned, findings=without_repeats(odd))
 
@@ -136,15 +137,14 @@ def _aligned(
             label_space=scene.label_space,
         )
         if camera_height is None:
-            return checked_world(aligned, str(path))
+            return aligned
         if (rescaled := rescale_by_camera_height(aligned, camera_height)) is not None:
-            return checked_world(rescaled, str(path))
+            return rescaled
     # An explicit camera height takes precedence over the scale of a metric format.
     metric_input |= metric_capture and camera_height is None
-    aligned = align_scene(
+    return align_scene(
         scene, camera_height=camera_height, metric_input=metric_input, gravity=gravity
     )
-    return checked_world(aligned, str(path))
 
 
 def _merged(saved: tuple[Finding, ...], new: tuple[Finding, ...]) -> tuple[Finding, ...]:

@@ -137,7 +137,8 @@ def _described(
     """Return corners (x, y) of a reduced photo, their normalised patches, and its camera."""
     values = load_grey(view, scene, SIDE).astype(np.float32)
     camera = scene.cameras[view.camera].resized(values.shape[1], values.shape[0])
-    dy, dx = (ndimage.gaussian_filter(values, 1.0, order) for order in ((1, 0), (0, 1)))
+    dy = ndimage.gaussian_filter(values, 1.0, order=[1, 0])
+    dx = ndimage.gaussian_filter(values, 1.0, order=[0, 1])
     xx, yy, xy = (ndimage.gaussian_filter(v, 1.5) for v in (dx * dx, dy * dy, dx * dy))
     strength = xx * yy - xy * xy - 0.05 * (xx + yy) ** 2
     margin = 2 * PATCH + 2

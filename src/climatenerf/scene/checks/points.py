@@ -205,8 +205,8 @@ def agreeing_convention(
             f" {first:.1%} before)",
             "correct the file to keep it from being guessed",
         )
-        scene = best.scene
-        return scene, point_shares(scene.cameras, scene.views, scene.points), [*findings, finding]
+        found, cloud = best.scene, best.scene.points
+        return found, point_shares(found.cameras, found.views, cloud), [*findings, finding]
     finding = Finding(
         "points-outside",
         f"Only {shares.agreement:.1%} of {what} lie inside a photo and in front of its camera",

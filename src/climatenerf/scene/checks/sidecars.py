@@ -101,7 +101,7 @@ def depth_findings(scene: Scene) -> list[Finding]:
         value = depth[at.row, at.column]
         known = np.isfinite(value)
         if known.sum() >= MIN_POINTS:
-            logs.append(tuple(np.log(each[known]) for each in (value, at.z, at.length)))
+            logs.append((np.log(value[known]), np.log(at.z[known]), np.log(at.length[known])))
     if saturated:
         message = (
             f"{saturated} of {len(views)} depth files that were looked at hold the largest value"
