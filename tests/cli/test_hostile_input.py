@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from support.command_line import STREET, complaint, run_cli
+from support.command_line import STREET, error_message, run_cli
 from support.scene_builders import names_of, ring, write_images, write_transforms
 
 from climatenerf.scene import load_scene
@@ -76,7 +76,7 @@ def weather(tmp_path, text):
 )
 def test_scene_files_of_other_types_and_sizes(street, tmp_path, capsys, change, words):
     edited(street / "scene.json", change)
-    said = complaint(capsys, "export", street, "-o", tmp_path / "out")
+    said = error_message(capsys, "export", street, "-o", tmp_path / "out")
     import re
 
     assert re.search(words, said), said
@@ -93,9 +93,9 @@ def test_names_that_no_disk_can_hold(capture, tmp_path, capsys):
     assert run_cli("export", capture, "-o", tmp_path / "out") == 0
     exported = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert len(exported["frames"]) == 4, "images that are not on disk are left out"
-    said = complaint(capsys, "export", capture, "-o", tmp_path / ("n" * 300))
+    said = error_message(capsys, "export", capture, "-o", tmp_path / ("n" * 300))
     assert "longer than the disk allows" in said
-    said = complaint(capsys, "export", tmp_path / ("n" * 300), "-o", tmp_path / "other")
+    said = error_message(capsys, "export", tmp_path / ("n" * 300), "-o", tmp_path / "other")
     assert "longer than the disk allows" in said
 
 
@@ -126,7 +126,7 @@ def test_photo_names_that_are_not_utf8_are_exported(capture, tmp_path):
 )  # fmt: skip
 def test_weather_files(tmp_path, capsys, text):
     path = weather(tmp_path, text)
-    said = complaint(capsys, "render", tmp_path, "-o", tmp_path / "out", "--weather", path)
+    said = error_message(capsys, "render", tmp_path, "-o", tmp_path / "out", "--weather", path)
     assert "weather.toml" in said and len(said) < 600
 
 
@@ -135,7 +135,7 @@ def test_marks(tmp_path, capsys, text):
     path = tmp_path / "marks.toml"
     path.write_text(f'[DOOR.from]\n"0001.jpg" = [{text}, 2]\n"0011.jpg" = [3, 4]\n[DOOR.to]\n')
     length = ["--known-length", "DOOR=2 m", "--marks", path]
-    assert "marks.toml" in complaint(capsys, "fit", STREET, "-o", tmp_path / "out", *length)
+    assert "marks.toml" in error_message(capsys, "fit", STREET, "-o", tmp_path / "out", *length)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_marks(tmp_path, capsys, text):
 def test_flags_of_fit(tmp_path, capsys, flags, words):
     import re
 
-    said = complaint(capsys, "fit", STREET, "-o", tmp_path / "out", *flags)
+    said = error_message(capsys, "fit", STREET, "-o", tmp_path / "out", *flags)
     assert re.search(words, said), said
 
 
@@ -172,7 +172,7 @@ def test_flags_of_fit(tmp_path, capsys, flags, words):
     ],
 )
 def test_flags_of_render(run_folder, tmp_path, capsys, flags, words):
-    said = complaint(capsys, "render", run_folder, "-o", tmp_path / "out", *flags)
+    said = error_message(capsys, "render", run_folder, "-o", tmp_path / "out", *flags)
     assert words in said and len(said) < 1500 and not (tmp_path / "out").exists()
 
 
@@ -203,7 +203,7 @@ def test_camera_paths(run_folder, tmp_path, capsys, change):
     text = json.dumps({**PATH, **change}) if change.get("camera_path") != 10**399 else ""
     path.write_text(text or f'{{"camera_path": {"9" * 400}}}')
     out = tmp_path / "out"
-    said = complaint(capsys, "render", run_folder, "-o", out, "--path", path)
+    said = error_message(capsys, "render", run_folder, "-o", out, "--path", path)
     assert "camera path" in said and len(said) < 500 and not out.exists()
 
 
@@ -214,7 +214,7 @@ def test_scales_of_nerfstudio(run_folder, tmp_path, capsys, scale):
     text = f'{{"transform": {transform}, "scale": {scale}}}'
     (tmp_path / "dataparser_transforms.json").write_text(text)
     words = ["render", run_folder, "-o", tmp_path / "out", "--path", tmp_path / "camera_path.json"]
-    assert "scale in" in complaint(capsys, *words)
+    assert "scale in" in error_message(capsys, *words)
 
 
 @pytest.mark.parametrize("verb", ["render", "fit"])
@@ -226,7 +226,7 @@ def test_settings_of_another_type(run_folder, tmp_path, capsys, verb):
         "render": ["render", run, "-o", tmp_path / "out"],
         "fit": ["fit", STREET, "-o", run, "--resume", "--downscale", "6"],
     }
-    assert "settings in" in complaint(capsys, *words[verb])
+    assert "settings in" in error_message(capsys, *words[verb])
 
 
 def test_arrays_that_claim_terabytes(capture, tmp_path, capsys):
@@ -235,14 +235,14 @@ def test_arrays_that_claim_terabytes(capture, tmp_path, capsys):
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }"
     packed = header.ljust(117) + b"\n"
     depth.write_bytes(b"\x93NUMPY\x01\x00\x76\x00" + packed + bytes(12))
-    said = complaint(capsys, "fit", capture, "-o", tmp_path / "run", "--steps", "1")
+    said = error_message(capsys, "fit", capture, "-o", tmp_path / "run", "--steps", "1")
     assert "001.npy cannot be read (its header claims" in said
 
 
 def test_pictures_that_take_too_much_memory(capture, tmp_path, capsys):
     big = capture / "images" / "000.png"
     Image.new("1", (12_000, 10_000)).save(big)
-    said = complaint(capsys, "export", capture, "-o", tmp_path / "out")
+    said = error_message(capsys, "export", capture, "-o", tmp_path / "out")
     assert "000.png has 120 megapixels, more than the 100" in said
 
 
@@ -250,7 +250,7 @@ def test_more_frames_than_can_be_read(capture, tmp_path, capsys):
     path = capture / "transforms.json"
     few = json.loads(path.read_text())
     path.write_text(json.dumps({**few, "frames": [few["frames"][0]] * (MAX_VIEWS + 1)}))
-    assert "frames, more than" in complaint(capsys, "export", capture, "-o", tmp_path / "out")
+    assert "frames, more than" in error_message(capsys, "export", capture, "-o", tmp_path / "out")
 
 
 def test_poses_that_32_bits_cannot_hold(capture, tmp_path, capsys):
@@ -258,7 +258,7 @@ def test_poses_that_32_bits_cannot_hold(capture, tmp_path, capsys):
         capture / "transforms.json",
         lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, 1e10),
     )
-    said = complaint(capsys, "export", capture, "-o", tmp_path / "out")
+    said = error_message(capsys, "export", capture, "-o", tmp_path / "out")
     assert "units from the origin" in said and "32 bits" in said
 
 
@@ -322,14 +322,14 @@ def test_a_working_folder_that_is_gone(tmp_path):
 )  # fmt: skip
 def test_hostile_files_of_renders(run_folder, tmp_path, capsys, name, flag):
     out = tmp_path / "out"
-    complaint(capsys, "render", run_folder, "-o", out, flag, FAULTS / name)
+    error_message(capsys, "render", run_folder, "-o", out, flag, FAULTS / name)
     assert not out.exists()
 
 
 @pytest.mark.skipif(not FAULTS.is_dir(), reason="the hostile files are no part of the project")
 @pytest.mark.parametrize("name", ["scale_report_list", "georef_null"])
 def test_hostile_scenes(tmp_path, capsys, name):
-    assert "scene.json" in complaint(capsys, "export", FAULTS / name, "-o", tmp_path / "out")
+    assert "scene.json" in error_message(capsys, "export", FAULTS / name, "-o", tmp_path / "out")
 
 
 def test_the_street_itself_is_read():

@@ -425,8 +425,6 @@ def _read_array(path: Path) -> np.ndarray:
 def _image_error(path: Path, error: Exception) -> UserError:
     if isinstance(error, FileNotFoundError):
         return UserError(f"The image {path} is missing; restore it or remove its pose.")
-    if isinstance(error, Image.DecompressionBombError):
-        return _too_large(path, f"over {2 * (Image.MAX_IMAGE_PIXELS or 0) / 1e6:.0f}")
     if isinstance(error, OSError) and error.errno not in (None, errno.EINVAL):
         return explain(error, path)  # such as a lack of permission
     return UserError(
