@@ -21,6 +21,7 @@ from climatenerf.training import losses
 from climatenerf.training import trainer as module
 from climatenerf.training.dataset import HORIZON
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
+from climatenerf.training.optimiser import Diverged
 from climatenerf.training.run import load_pixels
 from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import FitSettings, Losses
@@ -132,6 +133,43 @@ def test_all_parameters_change_and_stay_finite(scene):
     for name, parameter in trainer.field.named_parameters():
         assert torch.isfinite(parameter).all(), name
         assert not torch.equal(parameter, before[name]), name
+
+
+def with_faulty_batches(trainer, faulty):
+    """Give the batches of the steps in `faulty` a colour that is not a number."""
+    draw = trainer.draw_batch
+
+    def batch():
+        found = draw()
+        if trainer.steps not in faulty:
+            return found
+        rgb = found.rgb.clone()
+        rgb[0] = torch.nan
+        return replace(found, rgb=rgb)
+
+    trainer.draw_batch = batch
+    return trainer
+
+
+def test_a_step_with_gradients_that_are_not_finite_is_discarded(scene):
+    trainer = with_faulty_batches(begin(scene, steps=8), {5})
+    states = []
+
+    def record(_):
+        states.append({k: v.detach().clone() for k, v in trainer.field.named_parameters()})
+
+    trainer.run(record)
+    assert trainer.discarded.total == 1 and math.isfinite(trainer.error)
+    assert all(torch.equal(states[5][name], states[4][name]) for name in states[0])
+    assert not torch.equal(states[6]["geometry_grid"], states[5]["geometry_grid"])
+    assert all(value.isfinite().all() for value in states[-1].values())
+
+
+def test_a_fit_ends_after_many_such_steps_with_the_field_before_them(scene):
+    trainer = with_faulty_batches(begin(scene, steps=100), range(4, 100))
+    with pytest.raises(Diverged, match="20 steps in a row"):
+        trainer.run(lambda _: None)
+    assert all(value.isfinite().all() for value in trainer.field.parameters())
 
 
 def test_space_outside_all_frusta_stays_empty(scene):

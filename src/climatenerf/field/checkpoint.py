@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from climatenerf.core import parsing
-from climatenerf.core.device import CPU, to_device
+from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.samples import MIN_TAU
 from climatenerf.core.storage import (
@@ -38,6 +38,9 @@ def save_field(field: Field, run: Path, checkpoint: str = "") -> None:
         field: the field.
         run: the folder.
         checkpoint: identity that the files of one checkpoint share; "" for a field alone.
+
+    Raises:
+        UserError: the field holds numbers that are not finite, or the folder cannot be written.
     """
     about = {
         "schema_version": SCHEMA_VERSION,
@@ -49,6 +52,10 @@ def save_field(field: Field, run: Path, checkpoint: str = "") -> None:
     if checkpoint:
         about["checkpoint"] = checkpoint
     tensors = {k: v.detach().contiguous() for k, v in field.state_dict().items()}
+    try:
+        check_finite({k: to_numpy(v) for k, v in tensors.items()}, MAX_VALUE)
+    except ValueError as error:
+        raise UserError(f"the field is not saved, since {error}; fit anew") from error
     about["digest"] = digest(tensors)
     write_safetensors(run / FILE_NAME, tensors, {"climatenerf": json.dumps(about)})
 

@@ -3,10 +3,62 @@
 from collections.abc import Iterable, Sequence
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
+from climatenerf.core.errors import UserError
 from climatenerf.ops import optimiser
 
+MAX_DISCARDED = 20  # steps in a row, after which a fit ends
 DECAY_INTERVAL = 8  # steps; decay reads all rows, while a step reads few
+
+
+class Diverged(UserError):
+    """Gradients of too many steps in a row were not finite."""
+
+
+def keep_finite(gradients: Iterable[Tensor], buffers: Sequence[Tensor]) -> Bool[Tensor, ""]:
+    """Set all gradients of a step to zero if one is not finite.
+
+    Args:
+        gradients: of the networks. Every sample contributes to them, so that one that is not finite
+            in any sample shows here.
+        buffers: gradient buffers of the tables, which are too large to be searched.
+
+    Returns:
+        Whether they were finite, without waiting for a GPU.
+    """
+    gradients = list(gradients)
+    finite = torch.stack([gradient.isfinite().all() for gradient in gradients]).all()
+    on_cpu = finite.device.type == "cpu"
+    if on_cpu and bool(finite):
+        return finite
+    for values in (*gradients, *buffers):
+        values.copy_(torch.where(finite, values, 0.0))
+    return finite
+
+
+class DiscardedSteps:
+    """Counts the steps whose gradients were not finite, and ends a fit after many in a row."""
+
+    def __init__(self):
+        self.total = 0
+        self.in_a_row = 0
+
+    def record(self, finite: bool, step: int) -> None:
+        """Count a step.
+
+        Raises:
+            Diverged: `MAX_DISCARDED` in a row; the parameters are those before the first.
+        """
+        self.total += not finite
+        self.in_a_row = 0 if finite else self.in_a_row + 1
+        if self.in_a_row >= MAX_DISCARDED:
+            raise Diverged(
+                f"{MAX_DISCARDED} steps in a row had gradients that are not finite, the last at"
+                f" step {step}; the field before them is saved, so check the capture with"
+                " `climatenerf check`, then fit anew or resume"
+            )
 
 
 class GridAdam:
@@ -57,6 +109,11 @@ class GridAdam:
             )
             if decay and self.steps % DECAY_INTERVAL == 0:
                 table.data.mul_(1 - DECAY_INTERVAL * rate * decay)
+
+    @property
+    def gradients(self) -> list[Tensor]:
+        """Gradient buffers of the tables."""
+        return [table.grad_buffer for table in self.tables]  # type: ignore[attr-defined]
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the tensors with which `load` continues the optimisation."""

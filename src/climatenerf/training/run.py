@@ -35,6 +35,7 @@ from climatenerf.training.folder import (
     check_folder,
     check_resumable,
 )
+from climatenerf.training.optimiser import Diverged
 from climatenerf.training.settings import FitSettings, as_config
 from climatenerf.training.setup import compile_kernels, make_trainer
 from climatenerf.training.snapshot import METRICS, writing_run
@@ -160,6 +161,9 @@ def _fit(
         trainer.run(save_sometimes)
     except KeyboardInterrupt:
         interrupted = True
+    except Diverged:
+        checkpoint(trainer, run, with_corrections(scene, trainer), config)
+        raise
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     scene = with_corrections(scene, trainer)
     checkpoint(trainer, run, scene, config)
@@ -172,6 +176,7 @@ def _fit(
         "downscale": downscale,
         "train_views": len(scene.of_split("train")),
         "masked_fraction": masked_fraction(trainer),
+        "discarded_steps": trainer.discarded.total,
     }
     write_json(run / METRICS, metrics)
     if interrupted and heldout_pixels(scene, downscale) > MAX_PIXELS_AFTER_STOP:

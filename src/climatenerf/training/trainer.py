@@ -28,7 +28,7 @@ from climatenerf.training.evidence.gather import Evidence
 from climatenerf.training.evidence.sparse_depth import concatenate
 from climatenerf.training.losses import scale_gradient
 from climatenerf.training.objective import Objective, RenderedRays, VisibleSamples
-from climatenerf.training.optimiser import GridAdam
+from climatenerf.training.optimiser import DiscardedSteps, GridAdam, keep_finite
 from climatenerf.training.poses import PoseCorrections
 from climatenerf.training.sample_selection import select_samples
 from climatenerf.training.schedule import Rates
@@ -88,6 +88,7 @@ class Trainer:
         self.net_adam = torch.optim.Adam(
             self.parameter_groups(), self.settings.net_rate, (0.9, 0.99), eps=1e-15, fused=True
         )
+        self.discarded = DiscardedSteps()
         self.steps = 0
         self.seconds = 0.0
         self.resumed_progress = 0.0  # of the run that is resumed
@@ -160,7 +161,8 @@ class Trainer:
             self.steps += 1
             self.seconds += seconds
             self.samples += samples
-            self.error += max(0.02, 1.0 / self.steps) * (error - self.error)
+            if math.isfinite(error):
+                self.error += max(0.02, 1.0 / self.steps) * (error - self.error)
             report(
                 Report(
                     step=self.steps,
@@ -350,10 +352,20 @@ class Trainer:
         return len(kinds) * self.settings.losses.sparse_depth * loss, samples.offsets[-1]
 
     def update_parameters(self, loss: Float[Tensor, ""]) -> None:
-        """Take one step of both optimisers down the gradient of a loss."""
+        """Take one step of both optimisers down the gradient of a loss.
+
+        Raises:
+            Diverged: the gradients of many steps in a row were not finite.
+        """
         settings, found = self.settings, self.schedule.surfaces_found(self.progress)
         self.net_adam.zero_grad()
         loss.backward()
+        weights = [w for group in self.net_adam.param_groups for w in group["params"]]
+        gradients = [w.grad for w in weights if w.grad is not None]
+        finite = keep_finite(gradients, self.grid_adam.gradients)
+        self.discarded.record(self.buffers.read("finite", finite.float(), 1.0) > 0, self.steps)
+        if self.discarded.in_a_row and not finite.is_cuda:  # a GPU steps with gradients of zero
+            return
         rate = self.schedule.learning_rate(settings.final_rate, self.elapsed, self.steps)
         for group in self.net_adam.param_groups:
             group["lr"] = settings.net_rate * rate * group["rates"][found]

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
 
 from climatenerf.core.cameras import Camera
 from climatenerf.scene.checks.conventions import CONVENTIONS, Pose, with_poses
@@ -135,6 +134,8 @@ def _described(
     scene: Scene, view: View
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n d"], Camera]:
     """Return corners (x, y) of a reduced photo, their normalised patches, and its camera."""
+    from scipy import ndimage  # here, since help and input errors should not wait for it
+
     values = load_grey(view, scene, SIDE).astype(np.float32)
     camera = scene.cameras[view.camera].resized(values.shape[1], values.shape[0])
     dy = ndimage.gaussian_filter(values, 1.0, order=[1, 0])
