@@ -23,11 +23,12 @@ MAY_IMPORT = {
     "render": BELOW_RENDER,
     "evaluation": BELOW_RENDER | {"render", "paths"},
     "output": BELOW_RENDER | {"render", "paths", "evaluation"},
+    "verification": BELOW_RENDER | {"render"},
     "training": BELOW_TRAINING,
     "studies": BELOW_STUDIES,
     "extend": BELOW_RENDER,
     "api": BELOW_STUDIES | {"studies", "sfm", "perception"},
-    "cli": BELOW_STUDIES | {"studies", "sfm", "perception", "api"},
+    "cli": BELOW_STUDIES | {"studies", "sfm", "perception", "verification", "api"},
     "__main__": {"cli"},
 }
 

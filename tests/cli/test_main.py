@@ -87,7 +87,8 @@ def test_missing_and_unknown_verbs_are_refused(capsys):
     assert capsys.readouterr().err == error_message
     assert cli.main(["xyzzy"]) == 2
     assert (
-        "use one of capture, check, fit, render, evaluate, export, demo" in capsys.readouterr().err
+        "use one of capture, check, fit, render, evaluate, verify, export, demo"
+        in capsys.readouterr().err
     )
 
 
@@ -236,7 +237,7 @@ def test_status_of_a_verb_is_passed_on(verb):
     assert cli.main(["fit", "--scene", "a"]) == 1
 
 
-@pytest.mark.parametrize("verb", ["fit", "render", "demo"])
+@pytest.mark.parametrize("verb", ["fit", "render", "verify", "demo"])
 def test_help_of_a_verb_does_not_load_torch(verb):
     code = (
         "import sys; from climatenerf.cli import main\n"

@@ -56,6 +56,7 @@ VERBS = {
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
     "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),
+    "verify": Verb("climatenerf.cli.verify", "Verify", "check the physics of this installation"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),
     "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the embedded street"),
 }

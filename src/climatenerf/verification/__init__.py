@@ -1,0 +1,1 @@
+"""The physics self-test of the installed program: `climatenerf verify`."""
