@@ -241,9 +241,9 @@ def test_arrays_that_claim_terabytes(capture, tmp_path, capsys):
 
 def test_pictures_that_take_too_much_memory(capture, tmp_path, capsys):
     big = capture / "images" / "000.png"
-    Image.new("1", (12_000, 10_000)).save(big)
+    Image.new("1", (24_000, 20_000)).save(big)
     said = error_message(capsys, "export", capture, "-o", tmp_path / "out")
-    assert "000.png has 120 megapixels, more than the 100" in said
+    assert "000.png has 24000x20000 pixels, above the limit of 400 megapixels" in said
 
 
 def test_more_frames_than_can_be_read(capture, tmp_path, capsys):
@@ -281,7 +281,7 @@ def shell(command, *words):
 def test_a_closed_standard_output_is_reported_and_ends_nothing(capture, tmp_path):
     done = shell('"$@" >&-', "export", capture, "-o", tmp_path / "out")
     assert done.returncode == 0 and (tmp_path / "out" / "transforms.json").exists()
-    assert "standard output is closed" in done.stderr and done.stderr.count("\n") == 1
+    assert "standard output is closed" in done.stderr and "Error" not in done.stderr
     if Path("/dev/full").exists():
         done = shell('"$@" >/dev/full', "export", capture, "-o", tmp_path / "full")
         assert done.returncode == 0 and "standard output cannot be written" in done.stderr

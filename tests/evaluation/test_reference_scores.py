@@ -62,6 +62,7 @@ class TwoLayers:
     """A field with equal weights at 1 m and 5 m on even rays, and low opacity on odd rays."""
 
     near = 0.1
+    bounds = torch.zeros(2, 3)
 
     def march(self, rays_o, rays_d, near, far, step, pruning_threshold=None):
         n = rays_o.shape[0]

@@ -80,7 +80,7 @@ def _composite(
     rgb = tl.zeros([BLOCK, 16], tl.float32)
     live = valid & (t < end)
     searches = 0
-    while tl.max(live.to(tl.int32), 0) > 0:
+    while (tl.max(live.to(tl.int32), 0) > 0) & (searches < SEARCHES):
         searches += 1
         t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
@@ -99,7 +99,7 @@ def _composite(
                 y = tl.dot(h, second_layer, input_precision=FAST) + bias[None, :]
                 rgb += tl.where(heavy, weight, 0.0)[:, None] * radiance(y)
             t = tl.where(here, t + dt, t)
-        live = live & (t < end) & (tau < limits[0]) & (searches < SEARCHES)
+        live = live & (t < end) & (tau < limits[0])
     tl.store(out + 5 * r[:, None] + c[None, :], rgb, mask=valid[:, None] & (c < 3)[None, :])
     tl.store(out + 5 * r + 3, length, mask=valid)
     tl.store(out + 5 * r + 4, tl.exp(-tau), mask=valid)

@@ -242,7 +242,7 @@ def _march(
     k = tl.zeros_like(r)
     live = valid & (t < end)
     searches = 0
-    while tl.max(live.to(tl.int32), 0) > 0:
+    while (tl.max(live.to(tl.int32), 0) > 0) & (searches < SEARCHES):
         searches += 1
         t, found = search(o, d, t, end, live, cells, steps)
         here = found > 0
@@ -258,7 +258,7 @@ def _march(
             tau += tl.where(thick, sigma * dt, 0.0)
             k += thick.to(tl.int64)
             t = tl.where(here, t + dt, t)
-        live = live & (t < end) & (tau < max_depth) & (k < capacity) & (searches < SEARCHES)
+        live = live & (t < end) & (tau < max_depth) & (k < capacity)
     tl.store(counts + r, k, mask=valid)
 
 
