@@ -192,15 +192,14 @@ def _run(words: list[str]) -> int:
         ) from error
     for variable, value in THREADING.items():
         os.environ.setdefault(variable, value)
-    import tyro
+    from climatenerf.cli.flags import parse_flags
 
     verb = VERBS[name]
     module = importlib.import_module(verb.module)
     kind = getattr(module, verb.options)
     if name == "render":  # its flags depend on the installed weather effects
         kind = module.options_class()
-    # tyro prints help and errors itself, and raises SystemExit with status 0 or 2.
-    options = tyro.cli(kind, prog=f"climatenerf {name}", args=words[1:])
+    options = parse_flags(kind, f"climatenerf {name}", words[1:])
     if name == "render":  # given flags override a weather file
         return module.run(options, words[1:]) or 0
     return module.run(options) or 0

@@ -138,8 +138,8 @@ def _described(
 
     values = load_grey(view, scene, SIDE).astype(np.float32)
     camera = scene.cameras[view.camera].resized(values.shape[1], values.shape[0])
-    dy = ndimage.gaussian_filter(values, 1.0, order=[1, 0])
-    dx = ndimage.gaussian_filter(values, 1.0, order=[0, 1])
+    smooth = ndimage.gaussian_filter(values, 1.0)
+    dy, dx = np.gradient(smooth)
     xx, yy, xy = (ndimage.gaussian_filter(v, 1.5) for v in (dx * dx, dy * dy, dx * dy))
     strength = xx * yy - xy * xy - 0.05 * (xx + yy) ** 2
     margin = 2 * PATCH + 2
@@ -149,7 +149,6 @@ def _described(
     strongest = np.argsort(-strength[row, column])[:CORNERS]
     row, column = row[strongest], column[strongest]
     offset = 2 * np.arange(-PATCH, PATCH + 1)
-    smooth = ndimage.gaussian_filter(values, 1.0)
     rows = row[:, None, None] + offset[:, None]
     patches = smooth[rows, column[:, None, None] + offset].reshape(len(row), (2 * PATCH + 1) ** 2)
     patches = patches - patches.mean(axis=1, keepdims=True)

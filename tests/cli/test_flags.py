@@ -1,0 +1,43 @@
+import os
+import subprocess
+import sys
+
+import pytest
+from support.command_line import error_message
+
+RENDER = ("render", "run", "-o", "out")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (
+            (*RENDER, "--flood.level", "3 kg"),
+            '--flood.level must be a length such as "0.5 m"; got "3 kg"; see climatenerf render',
+        ),
+        ((*RENDER, "--flod.level", "3 m"), "--flod.level, 3 m; did you mean --flood.level?"),
+        (("fit",), "missing from climatenerf fit: PATH, -o PATH, --out PATH; see"),
+        (("fit", "a", "-o", "b", "--preset", "x"), "invalid choice 'x' for argument '--preset'"),
+        (("fit", "a", "-o", "b", "--minutes", "x"), "--minutes must be a number; got 'x'"),
+        ((*RENDER, "--size"), "missing value for argument '--size'"),
+    ],
+)  # fmt: skip
+def test_a_wrong_flag_is_one_sentence_with_status_2(words, expected, capsys):
+    found = error_message(capsys, *words)
+    assert expected in found and "None" not in found
+    assert "\n" not in found
+
+
+def test_boxes_of_utf_8_and_of_ascii_give_the_same_sentence():
+    words = [sys.executable, "-m", "climatenerf", "fit", "a", "--preset", "x"]
+    for encoding in ("utf-8", "ascii"):
+        environment = {**os.environ, "PYTHONIOENCODING": encoding}
+        done = subprocess.run(words, capture_output=True, text=True, env=environment)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+        assert done.stderr.startswith("climatenerf: invalid choice 'x'")
+
+
+def test_help_into_a_pipe_that_closes_is_silent():
+    command = f"{sys.executable} -m climatenerf render --help | head -n 1"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True)
+    assert done.stdout.startswith("usage:") and done.stderr == ""
