@@ -45,7 +45,7 @@ def limited_cost(monkeypatch):
 
 def test_a_run_folder_contains_metrics_config_scene_preview_and_field(toy, tmp_path):
     done = []
-    metrics = fitted(scene, tmp_path / "run", evaluated=lambda *count: done.append(count))
+    metrics = fitted(toy, tmp_path / "run", evaluated=lambda *count: done.append(count))
     assert done == [(i, 4) for i in range(1, 5)]
     on_disk = read_json(tmp_path / "run" / "metrics.json")
     assert on_disk == json.loads(json.dumps(metrics))
@@ -61,31 +61,31 @@ def test_a_run_folder_contains_metrics_config_scene_preview_and_field(toy, tmp_p
     config = read_json(tmp_path / "run" / "config.json")
     assert config["schema_version"] == 1 and config["settings"]["steps"] == 6
     loaded = load_scene(tmp_path / "run")
-    assert [v.split for v in loaded.views] == [v.split for v in scene.views]
+    assert [v.split for v in loaded.views] == [v.split for v in toy.views]
     preview = Image.open(next((tmp_path / "run" / "previews").glob("*.jpg")))
     assert preview.size == (64, 24)
     field = load_field(tmp_path / "run")
-    view = scene.of_split("heldout")[0]
-    photos = np.stack([scene.c2w_world(v) for v in scene.of_split("train")])
-    appearance = nearby_appearance(field, photos, scene.c2w_world(view))
-    picture = render_view(field, scene.cameras[0], scene.c2w_world(view), appearance)
+    view = toy.of_split("heldout")[0]
+    photos = np.stack([toy.c2w_world(v) for v in toy.of_split("train")])
+    appearance = nearby_appearance(field, photos, toy.c2w_world(view))
+    picture = render_view(field, toy.cameras[0], toy.c2w_world(view), appearance)
     truth = np.asarray(Image.open(view.path)) / 255
     found = -10 * np.log10(np.mean((picture - truth) ** 2))
     assert found == pytest.approx(on_disk["views"][view.name]["psnr"], abs=1e-3)
 
 
 def test_masked_pixels_do_not_count_in_the_score(toy, tmp_path):
-    metrics = fitted(scene, tmp_path / "run", steps=2)
-    field, (view, other, *_) = load_field(tmp_path / "run"), scene.of_split("heldout")
+    metrics = fitted(toy, tmp_path / "run", steps=2)
+    field, (view, other, *_) = load_field(tmp_path / "run"), toy.of_split("heldout")
     truth = np.asarray(Image.open(view.path)) / 255
-    picture = render_view(field, scene.cameras[0], scene.c2w_world(view))
+    picture = render_view(field, toy.cameras[0], toy.c2w_world(view))
     mask = np.zeros((36, 48), np.uint8)
     mask[:, :20] = 255
     Image.fromarray(mask).save(tmp_path / "half.png")
     Image.fromarray(0 * mask).save(tmp_path / "none.png")
     masks = {view.name: tmp_path / "half.png", other.name: tmp_path / "none.png"}
-    views = [dataclasses.replace(v, mask_path=masks.get(v.name)) for v in scene.views]
-    masked = dataclasses.replace(scene, views=tuple(views))
+    views = [dataclasses.replace(v, mask_path=masks.get(v.name)) for v in toy.views]
+    masked = dataclasses.replace(toy, views=tuple(views))
     found = evaluate(field, masked, 1, nothing, nearby=False)["views"]
     expected = -10 * np.log10(np.mean((picture - truth)[:, :20] ** 2))
     assert found[view.name]["psnr"] == pytest.approx(expected, abs=1e-3)
@@ -97,9 +97,9 @@ def test_masked_pixels_do_not_count_in_the_score(toy, tmp_path):
 
 def test_held_out_views_are_rendered_in_the_appearance_of_nearby_photos(toy, tmp_path, monkeypatch):
     """Appearance vectors are set to the northward component of each photo's direction."""
-    fitted(scene, tmp_path / "run", steps=2)
+    fitted(toy, tmp_path / "run", steps=2)
     field = load_field(tmp_path / "run")
-    train = [scene.c2w_world(view) for view in scene.of_split("train")]
+    train = [toy.c2w_world(view) for view in toy.of_split("train")]
     field.embeddings.requires_grad_(False)
     field.embeddings[:] = torch.tensor([[c2w[1, 2]] for c2w in train])
     found = []
@@ -110,12 +110,12 @@ def test_held_out_views_are_rendered_in_the_appearance_of_nearby_photos(toy, tmp
         return render_view(field, camera, c2w, appearance)
 
     monkeypatch.setattr("climatenerf.evaluation.heldout.render_view", recorded)
-    evaluate(field, scene, 1, nothing)
-    expected = [scene.c2w_world(view)[1, 2] for view in scene.of_split("heldout")]
+    evaluate(field, toy, 1, nothing)
+    expected = [toy.c2w_world(view)[1, 2] for view in toy.of_split("heldout")]
     assert np.ptp(expected) > 0.5
     assert np.allclose(found, expected, atol=0.1), (found, expected)
     found.clear()
-    evaluate(field, scene, 1, nothing, nearby=False)
+    evaluate(field, toy, 1, nothing, nearby=False)
     assert np.ptp(found) == 0
 
 
