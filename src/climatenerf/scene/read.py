@@ -15,6 +15,7 @@ from climatenerf.core.listing import visible
 from climatenerf.scene.alignment.scale import rescale_by_camera_height
 from climatenerf.scene.alignment.world_frame import align_scene
 from climatenerf.scene.checks.check import corrected
+from climatenerf.scene.checks.intrinsics import corrected_camera
 from climatenerf.scene.checks.sidecars import sidecar_findings, unused_findings
 from climatenerf.scene.findings import Finding, without_repeats
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
@@ -243,7 +244,7 @@ def _check_images(capture: Capture) -> Capture:
         message = f"{transparent} images have an alpha channel, which is ignored"
         findings.append(Finding("photo-alpha", message, "use masks to exclude pixels"))
     for camera in cameras:
-        error = _round_trip_error(camera)
+        error = _round_trip_error(corrected_camera(camera)[0])
         if error > MAX_ROUND_TRIP:
             message = (
                 f"The lens distortion of a {camera.width}x{camera.height} camera cannot be "

@@ -30,7 +30,7 @@ def corrected_camera(camera: Camera) -> tuple[Camera, list[Finding]]:
     if camera.fx < 0 or camera.fy < 0:
         message = (
             f"A focal length is negative (fx {camera.fx:g}, fy {camera.fy:g}); its absolute value"
-            " is used, since the axes belong into the pose"
+            " is used"
         )
         findings.append(Finding("focal-negative", message, "check that the result is upright"))
         camera = replace(camera, fx=abs(camera.fx), fy=abs(camera.fy))

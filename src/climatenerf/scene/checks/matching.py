@@ -1,8 +1,8 @@
-"""Poses held against the photos where no points do it: matches lie on epipolar lines.
+"""Poses held against the photos where no points do it: matches meet in front of both cameras.
 
 Corners (Harris & Stephens 1988) of neighbouring photos are matched by normalised patches. A match
-must lie in the plane of the two cameras and the ray of its partner (Longuet-Higgins 1981). Wrong
-axes or intrinsics break that for all pairs alike.
+must lie in the plane of the two cameras and the ray of its partner (Longuet-Higgins 1981), and both
+rays must meet in front of the cameras. Wrong axes or intrinsics break that for all pairs alike.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ PATCH = 4  # samples to each side of a corner, two pixels apart
 MIN_CORRELATION = 0.8
 MIN_MARGIN = 0.04  # of the best correlation over the second best
 MIN_MATCHES = 25  # of a pair
-TOLERANCE = 2.5  # pixels from the epipolar line
-AGREE = 0.8  # share of matches on their epipolar lines; right poses have more than 0.9
-BETTER = 0.2  # share that other axes must gain; a drive straight ahead hardly tells axes apart
-DISAGREE = 0.4  # wrong poses have up to 0.6, for neighbouring epipolar lines are nearly parallel
+TOLERANCE = 1.0  # pixels from the epipolar line, of poses in the right convention
+LOOSE_TOLERANCE = 4.0  # pixels, of imprecise poses such as those of a phone
+AGREE = 0.7  # share of matches that agree; right poses have 0.9, wrong matches are the rest
+BETTER = 0.2  # share that another convention must gain
+DISAGREE = 0.4  # wrong poses have up to 0.6: neighbouring epipolar lines are nearly parallel
 MAX_ANGLE = 35.0  # degrees between the viewing directions of a pair
 
 Match = tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], float]
@@ -48,9 +49,9 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
         return scene, []
     pairs, matches = [pairs[i] for i in usable], [matches[i] for i in usable]
 
-    def agreement(change: Callable[[Pose], Pose]) -> float:
+    def agreement(change: Callable[[Pose], Pose], tolerance: float = TOLERANCE) -> float:
         shares = [
-            epipolar_share(change(a.c2w), change(b.c2w), found)
+            agreeing_share(change(a.c2w), change(b.c2w), found, tolerance)
             for (a, b), found in zip(pairs, matches, strict=True)
         ]
         return float(np.median(shares))
@@ -68,6 +69,7 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
         )
         finding = Finding("pose-axes", message, "correct the file to keep it from being guessed")
         return with_poses(scene, change), [finding]
+    given = agreement(lambda pose: pose, LOOSE_TOLERANCE)
     if given >= DISAGREE:
         return scene, []
     message = (
@@ -157,20 +159,35 @@ def _described(
     return np.stack([column + 0.5, row + 0.5], axis=-1), patches, camera
 
 
-def epipolar_share(
-    first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"], found: Match
+def agreeing_share(
+    first: Float[np.ndarray, "4 4"],
+    second: Float[np.ndarray, "4 4"],
+    found: Match,
+    tolerance: float = TOLERANCE,
 ) -> float:
-    """Return the share of matches within `TOLERANCE` of their epipolar lines.
+    """Return the share of matches on their epipolar lines and in front of both cameras.
+
+    Moving sideways, cameras with their axes exchanged have the same epipolar lines as before, but
+    their rays meet behind them. Nearly parallel rays count as in front.
 
     Args:
         first: Camera-to-input pose of the first photo.
         second: That of the second.
         found: Their matches.
+        tolerance: Distance from the epipolar line, pixels.
     """
     a, b, pixel = found
+    a, b = a @ first[:3, :3].T, b @ second[:3, :3].T
     baseline = second[:3, 3] - first[:3, 3]
-    normal = np.cross(baseline, a @ first[:3, :3].T)
+    normal = np.cross(baseline, a)
     length = np.linalg.norm(normal, axis=1)
-    sine = np.abs(np.einsum("mi,mi->m", b @ second[:3, :3].T, normal))
+    sine = np.abs(np.einsum("mi,mi->m", b, normal))
     # A ray along the baseline has no plane; it counts as on it.
-    return float((sine <= np.sin(TOLERANCE * pixel) * length).mean())
+    on_line = sine <= np.sin(tolerance * pixel) * length
+    across = np.cross(a, b)
+    parallel = np.linalg.norm(across, axis=1) < tolerance * pixel
+    # Signs of the lengths along both rays at which these are nearest to each other.
+    along_first = np.einsum("mi,mi->m", np.cross(baseline, b), across)
+    along_second = np.einsum("mi,mi->m", normal, across)
+    in_front = parallel | ((along_first > 0) & (along_second > 0))
+    return float((on_line & in_front).mean())
