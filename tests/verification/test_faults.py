@@ -256,7 +256,14 @@ def test_every_check_has_a_fault_that_fails_it(checks):
     assert covered == {check.name for check in checks}
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+# Each runs the whole suite, for four seconds; every ninth is among the quick tests.
+TRIALS = [
+    pytest.param(fault, marks=[] if i % 9 == 0 else pytest.mark.slow)
+    for i, fault in enumerate(FAULTS)
+]
+
+
+@pytest.mark.parametrize("fault", TRIALS)
 def test_a_fault_fails_exactly_the_matching_checks(fault, monkeypatch):
     where, name, change, expected = FAULTS[fault]
     fresnel.diffuse_reflectances(1.333)  # cached, so that no fault changes what it keeps
