@@ -99,7 +99,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(UserError, match="is a folder where a file was expected"):
         read_weather(tmp_path)
     (tmp_path / "a.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UserError, match="is not text"):
+    with pytest.raises(UserError, match="encoding UTF-16"):
         read_weather(tmp_path / "a.toml")
 
 

@@ -17,25 +17,19 @@ class Diverged(UserError):
     """Gradients of too many steps in a row were not finite."""
 
 
-def keep_finite(gradients: Iterable[Tensor], buffers: Sequence[Tensor]) -> Bool[Tensor, ""]:
-    """Set all gradients of a step to zero if one is not finite.
+def all_finite(gradients: Iterable[Tensor]) -> Bool[Tensor, ""]:
+    """Return whether gradients are finite, without waiting for a GPU.
 
-    Args:
-        gradients: of the networks. Every sample contributes to them, so that one that is not finite
-            in any sample shows here.
-        buffers: gradient buffers of the tables, which are too large to be searched.
-
-    Returns:
-        Whether they were finite, without waiting for a GPU.
+    Those of the networks suffice: every sample contributes to them, so one that is not finite shows
+    there, while the tables are too large to be searched in each step.
     """
-    gradients = list(gradients)
-    finite = torch.stack([gradient.isfinite().all() for gradient in gradients]).all()
-    on_cpu = finite.device.type == "cpu"
-    if on_cpu and bool(finite):
-        return finite
-    for values in (*gradients, *buffers):
-        values.copy_(torch.where(finite, values, 0.0))
-    return finite
+    return torch.stack([gradient.isfinite().all() for gradient in gradients]).all()
+
+
+def clear_unless(finite: Bool[Tensor, ""], gradients: Iterable[Tensor]) -> None:
+    """Set gradients to zero, in place, unless `finite`; without waiting for a GPU."""
+    for gradient in gradients:
+        gradient.copy_(torch.where(finite, gradient, 0.0))
 
 
 class DiscardedSteps:

@@ -24,6 +24,9 @@ DECAY = 0.9  # a step, of the largest number of entries needed
 class Buffers(Protocol):
     """Index lists and read-backs of the steps of a fit, by name."""
 
+    deferred: bool
+    """Whether numbers that are read are those of an earlier step."""
+
     def begin_step(self, rays: int) -> None:
         """Begin a step of `rays` rays; capacities are proportional to it."""
         ...
@@ -75,6 +78,8 @@ class Buffers(Protocol):
 class ExactBuffers:
     """Lists of exactly the entries needed, and numbers read at once; for the CPU."""
 
+    deferred = False
+
     def begin_step(self, rays: int) -> None:
         """Do nothing."""
 
@@ -112,6 +117,8 @@ class ExactBuffers:
 
 class FixedBuffers:
     """Lists of fixed capacity, and numbers read two steps later; for a GPU."""
+
+    deferred = True
 
     def __init__(self) -> None:
         self.n_rays = 1

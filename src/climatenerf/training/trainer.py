@@ -28,7 +28,7 @@ from climatenerf.training.evidence.gather import Evidence
 from climatenerf.training.evidence.sparse_depth import concatenate
 from climatenerf.training.losses import scale_gradient
 from climatenerf.training.objective import Objective, RenderedRays, VisibleSamples
-from climatenerf.training.optimiser import DiscardedSteps, GridAdam, keep_finite
+from climatenerf.training.optimiser import DiscardedSteps, GridAdam, all_finite, clear_unless
 from climatenerf.training.poses import PoseCorrections
 from climatenerf.training.sample_selection import select_samples
 from climatenerf.training.schedule import Rates
@@ -362,9 +362,12 @@ class Trainer:
         loss.backward()
         weights = [w for group in self.net_adam.param_groups for w in group["params"]]
         gradients = [w.grad for w in weights if w.grad is not None]
-        finite = keep_finite(gradients, self.grid_adam.gradients)
-        self.discarded.record(self.buffers.read("finite", finite.float(), 1.0) > 0, self.steps)
-        if self.discarded.in_a_row and not finite.is_cuda:  # a GPU steps with gradients of zero
+        finite = all_finite(gradients)
+        usable = self.buffers.read("finite", finite.float(), 1.0) > 0
+        if self.buffers.deferred or not usable:
+            clear_unless(finite, [*gradients, *self.grid_adam.gradients])
+        self.discarded.record(usable, self.steps)
+        if not (usable or self.buffers.deferred):
             return
         rate = self.schedule.learning_rate(settings.final_rate, self.elapsed, self.steps)
         for group in self.net_adam.param_groups:
