@@ -13,6 +13,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.scene import read_scene
 from climatenerf.scene.alignment.scale import scale_findings
 from climatenerf.scene.findings import Finding
+from climatenerf.scene.read import check_flags
 from climatenerf.scene.scene import Scene
 
 
@@ -65,6 +66,7 @@ def inspected(options: Check) -> tuple[Scene | None, Sequence[Finding]]:
     height = None
     if options.camera_height is not None:
         height = parse_quantity(options.camera_height, LENGTH, "--camera-height")
+    check_flags(height, options.metric_input, options.frames, options.label_space)
     try:
         scene = read_scene(
             options.capture,

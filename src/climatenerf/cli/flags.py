@@ -9,6 +9,7 @@ from typing import Any
 from climatenerf.cli import streams
 from climatenerf.core.errors import UserError
 
+_KINDS = {"FLOAT": "a number", "INT": "a whole number", "PATH": "a path", "STR": "a text"}
 _RULE = re.compile(r"─+|-{10,}")
 _NO_TYPE = re.compile(
     r"Error parsing (\S+): no type matching (\S+) could be instantiated from \[(.*?)\]"
@@ -64,7 +65,9 @@ def _sentence(box: str) -> str:
     text = re.sub(r"^Error parsing (\S+): must be", r"\1 must be", text)
     if (wrong := _NO_TYPE.match(text)) is not None:
         flag, types, value = wrong.groups()
-        text = f"{flag} must be {'a number' if 'FLOAT' in types else types}; got {value}"
+        kind = types.removeprefix("{None}|")
+        text = f"{flag} must be {_KINDS.get(kind, kind)}; got {value}"
+    text = re.sub(r"\. Expected \d+ values?$", "", text.strip().rstrip("."))
     text = text.replace(", 'None')", ")").replace("'None', ", "")
     for section in sections[1:]:
         if section and section[0].strip() == "Perhaps you meant:" and len(section) > 1:

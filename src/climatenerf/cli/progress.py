@@ -184,12 +184,10 @@ def warn(text: str) -> None:
 def report_findings(findings: "Iterable[Finding]") -> None:
     """Print each finding about a capture once, on standard error: warnings, then notes."""
     unique = dict.fromkeys(findings)
-    for finding in unique:
-        if finding.severity != "note":
-            warn(str(finding))
-    for finding in unique:
-        if finding.severity == "note":
-            say(f"note: {finding}")
+    for severity in ("error", "warning", "note"):
+        for finding in unique:
+            if finding.severity == severity:
+                say(f"{severity}: {finding}")
 
 
 def result(text: str) -> None:

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 from climatenerf.core.listing import is_passed_over
-from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.findings import Finding, counted, examples
 
 MAX_FILES = 200_000
 """Files of a folder that are indexed; more are not searched for other spellings."""
@@ -96,15 +96,15 @@ class FileNames:
         if self.respelled:
             pairs = [f"{n!r} is {p.name!r} on disk" for n, p in self.respelled.items()]
             message = (
-                f"{len(self.respelled)} names differ from those on disk in Unicode form, case or"
-                f" slashes and are matched ({examples(pairs, 1)})"
+                f"{counted(len(self.respelled), 'name')} matched to files on disk with another"
+                f" Unicode form, case or slashes ({examples(pairs, 1)})"
             )
             out.append(Finding("name-normalised", message, severity="note", file=str(self.folder)))
         if self.ambiguous:
             name, files = next(iter(self.ambiguous.items()))
             message = (
-                f"{len(self.ambiguous)} names match several files in {self.folder} and are left"
-                f" out (first: {name!r} matches {examples(files)})"
+                f"{counted(len(self.ambiguous), 'name')} in {self.folder} with several matching"
+                f" files, left out (first: {name!r} matches {examples(files)})"
             )
             remedy = "rename the files as the poses name them"
             out.append(Finding("name-ambiguous", message, remedy, file=str(self.folder)))

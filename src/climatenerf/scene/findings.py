@@ -41,11 +41,13 @@ CODES: dict[str, str] = {
     "pose-no-baseline": "All cameras are at one position, so depth cannot be found.",
     "pose-axes": "The poses have the axes of another convention; converted.",
     "pose-disagrees": "The pose of a photo contradicts the points that were seen in it.",
+    "matches-few": "Too few matches between photos to hold the poses against them.",
     "matches-disagree": "Matches between neighbouring photos contradict their poses.",
     # Points.
     "points-outside": "Most sparse points lie in no picture.",
     "points-frame": "The sparse points are in another frame than the poses; transformed.",
     # Depths, masks, labels.
+    "depth-empty": "Depth files hold no known depth.",
     "depth-saturated": "Depths at the largest value of the file format are taken as unknown.",
     "depth-unit": "The unit of the depth files disagrees with the poses.",
     "depth-ray-length": "The depth files hold lengths along rays instead of z-depths.",
@@ -126,3 +128,8 @@ def examples(names: list[str], count: int = 3) -> str:
     """Return the first of some names for a sentence: "a, b, c and 4 more"."""
     listed, rest = ", ".join(names[:count]), len(names) - count
     return f"{listed} and {rest} more" if rest > 0 else listed
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: "1 photo", "3 photos"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

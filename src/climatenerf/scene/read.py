@@ -78,15 +78,7 @@ def read_scene(
     path = Path(path).absolute()
     if not path.exists():
         raise UserError(f"{path} does not exist; give the folder of a posed capture.")
-    if camera_height is not None and not 0 < camera_height <= MAX_CAMERA_HEIGHT:
-        raise UserError(
-            f"The camera height {camera_height:g} m must be above 0 and at most"
-            f" {MAX_CAMERA_HEIGHT:g} m; correct it."
-        )
-    if camera_height is not None and metric_input:
-        raise UserError("Give either the camera height or metric input, not both.")
-    if label_space is not None:
-        checked_label_space(label_space, "--label-space")
+    check_flags(camera_height, metric_input, frames, label_space)
     saved = None
     if (path / FILE_NAME).is_file() or path.name == FILE_NAME:
         saved = load_scene(path)
@@ -116,6 +108,30 @@ def read_scene(
     aligned = checked_world(aligned, str(path))
     odd = (*aligned.findings, *sidecar_findings(aligned), *unused_findings(aligned, capture.views))
     return replace(aligned, findings=without_repeats(odd))
+
+
+def check_flags(
+    camera_height: float | None,
+    metric_input: bool,
+    frames: str | tuple[int, int] | None,
+    label_space: str | None,
+) -> None:
+    """Check what `read_scene` is asked for, without a capture.
+
+    Raises:
+        UserError: A value is out of range or unknown, or two exclude each other.
+    """
+    if camera_height is not None and not 0 < camera_height <= MAX_CAMERA_HEIGHT:
+        raise UserError(
+            f"The camera height {camera_height:g} m must be above 0 and at most"
+            f" {MAX_CAMERA_HEIGHT:g} m; correct it."
+        )
+    if camera_height is not None and metric_input:
+        raise UserError("Give either the camera height or metric input, not both.")
+    if frames is not None:
+        parse_frames(frames)
+    if label_space is not None:
+        checked_label_space(label_space, "--label-space")
 
 
 def _aligned(

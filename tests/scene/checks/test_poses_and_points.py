@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 from support.scene_builders import OPENGL
 from support.textured_scene import CAMERA, textured_scene
 
@@ -93,6 +94,29 @@ def test_a_camera_far_away_is_left_out(scene):
     found = corrected(replace(scene, views=tuple(views)))
     assert codes(found) == ["pose-outlier"] and len(found.views) == len(scene.views) - 1
     assert "003.png" in str(found.findings[0])
+
+
+@pytest.mark.parametrize(("count", "far"), [(8, 1), (5, 1), (12, 2), (12, 3), (24, 2)])
+def test_far_cameras_of_small_captures_are_told(scene, count, far):
+    """One is left out of any capture, and of more at most a tenth."""
+    views = list(scene.views[:: len(scene.views) // count][:count])
+    for i in range(far):
+        pose = views[3 + i].c2w.copy()
+        pose[:3, 3] += 90_000.0 + 30_000.0 * i
+        views[3 + i] = replace(views[3 + i], c2w=pose)
+    found = corrected(replace(scene, views=tuple(views), points=None))
+    assert "pose-outlier" in codes(found)
+    left_out = far <= max(1, 0.1 * count)
+    assert len(found.views) == count - far * left_out
+
+
+def test_photos_without_matches_are_noted(scene, tmp_path):
+    views = []
+    for view in unrecorded(scene).views:
+        Image.new("RGB", (320, 240), (90, 90, 90)).save(tmp_path / view.name)
+        views.append(replace(view, path=tmp_path / view.name))
+    found = corrected(replace(scene, views=tuple(views), points=None))
+    assert codes(found) == ["matches-few"] and found.findings[0].severity == "note"
 
 
 def test_a_distant_camera_that_its_points_support_stays(scene):

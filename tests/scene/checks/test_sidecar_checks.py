@@ -46,6 +46,7 @@ ALONG_RAY = 1 / CAMERA.directions()[..., 2]
         (lambda depth: 3 / depth, ["depth-inverse"]),
         (lambda depth: depth * (1 + 0.7 * np.sin(np.arange(320) / 9)), ["depth-disagrees"]),
         (lambda depth: np.where(depth > 9, np.nan, depth), []),
+        (lambda depth: np.full_like(depth, np.nan), ["depth-empty"]),
     ],
 )
 def test_depth_files_are_held_against_the_points(scene, tmp_path, change, expected):

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.scene.checks.conventions import CONVENTIONS, Pose, with_poses
-from climatenerf.scene.findings import Finding
+from climatenerf.scene.findings import Finding, counted
 from climatenerf.scene.images import load_grey
 from climatenerf.scene.scene import Scene, View
 
@@ -46,7 +46,12 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
     matches = [match(scene, a, b) for a, b in pairs]
     usable = [i for i, (first, _, _) in enumerate(matches) if len(first) >= MIN_MATCHES]
     if len(usable) < 2:
-        return scene, []
+        message = (
+            "Neighbouring photos have too few matches to hold the poses against them"
+            f" ({counted(len(usable), 'pair')} of {len(pairs)} with {MIN_MATCHES} or more)"
+        )
+        remedy = "check that poses and photos belong together if photos overlap"
+        return scene, [Finding("matches-few", message, remedy, "note", str(scene.root))]
     pairs, matches = [pairs[i] for i in usable], [matches[i] for i in usable]
 
     def agreement(change: Callable[[Pose], Pose], tolerance: float = TOLERANCE) -> float:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from climatenerf.core.cameras import Camera
 from climatenerf.scene.checks.conventions import CONVENTIONS, with_poses
 from climatenerf.scene.checks.intrinsics import SAME_SHAPE, scaled_by, size_ratio
-from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.scene import Scene, View
 
 MAX_POINTS = 1000  # points a view; more change a share by less than two hundredths
@@ -232,7 +232,8 @@ def view_findings(scene: Scene, shares: Shares) -> list[Finding]:
     if not wrong:
         return []
     message = (
-        f"Of {len(wrong)} photos less than half of their own sparse points lie inside them"
+        f"Less than half of their own sparse points lie inside {counted(len(wrong), 'photo')}"
         f" ({examples(wrong)})"
     )
-    return [Finding("pose-disagrees", message, "remove these photos or compute their poses again")]
+    remedy = "remove these photos or compute their poses again"
+    return [Finding("pose-disagrees", message, remedy, file=str(scene.root))]

@@ -9,43 +9,54 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from climatenerf.scene.checks.points import Shares
-from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.scene import Scene
 
 OUTLIER = 30.0  # distance from the median position over the 80th percentile of all distances
 CERTAIN_OUTLIER = 300.0  # the same, even if the photo's own points support its pose
-MAX_OUTLIERS = 0.1  # fraction of the photos; more are a second group, not errors
+MAX_OUTLIERS = 0.1  # fraction of the photos
 MIN_BASELINE = 1e-3  # of the median distance from cameras to their points
 MIN_LEFT = 3  # photos
 
 
-def outliers(positions: Float[np.ndarray, "n 3"], shares: Shares | None) -> Bool[np.ndarray, " n"]:
-    """Return which cameras are so far from the others that their poses are errors.
+def distance_ratios(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Return distances from the median position over the distance that 80 % do not exceed.
 
-    A route of cameras reaches a few times the 80th percentile of its distances from the middle; a
-    failed registration reaches thousands. A far camera whose own points fall into its photo may be
-    a real one, such as a second group far away, unless it is extremely far.
+    In a small capture with few far cameras, these must not set the measure: it is that of the
+    nearest 60 % if these are thirty times nearer.
+    """
+    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    typical = float(np.quantile(distance, 0.8))
+    near = float(np.quantile(distance, 0.6))
+    if typical > OUTLIER * near:
+        typical = near
+    return distance / max(typical, 1e-9)  # all others at one position: 0 / 0
+
+
+def outliers(positions: Float[np.ndarray, "n 3"], shares: Shares | None) -> Bool[np.ndarray, " n"]:
+    """Return which cameras are so far from the others that their poses are in doubt.
+
+    A route of cameras reaches a few times the distance of four fifths of them; a failed
+    registration reaches thousands. A far camera whose own points fall into its photo may be a real
+    one, such as a second group far away, unless it is extremely far.
 
     Args:
         positions: Of the cameras.
         shares: Of the sparse points inside the photos, if there are points.
     """
-    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    typical = float(np.quantile(distance, 0.8))
-    if typical == 0:
-        typical = 1e-9  # all others at one position
-    ratio = distance / typical
+    ratio = distance_ratios(positions)
     far = ratio > OUTLIER
     if shares is not None and shares.recorded:
         supported = np.nan_to_num(shares.by_view) >= 0.5
         far &= ~supported | (ratio > CERTAIN_OUTLIER)
-    if far.mean() > MAX_OUTLIERS or (~far).sum() < MIN_LEFT:
-        return np.zeros(len(positions), bool)
     return far
 
 
 def without_outliers(scene: Scene, shares: Shares | None) -> tuple[Scene, list[Finding]]:
-    """Return the scene without photos whose cameras are far off, and a finding about them."""
+    """Return the scene without photos whose cameras are far off, and a finding about them.
+
+    More than `MAX_OUTLIERS` of the photos are a second group rather than errors; they stay.
+    """
     positions = np.stack([view.c2w[:3, 3] for view in scene.views])
     far = outliers(positions, shares)
     if not far.any():
@@ -55,12 +66,15 @@ def without_outliers(scene: Scene, shares: Shares | None) -> tuple[Scene, list[F
     rest = positions[~far]
     extent = float(np.linalg.norm(rest - np.median(rest, axis=0), axis=1).max())
     distance = np.linalg.norm(positions[far] - np.median(rest, axis=0), axis=1)
+    few = len(names) <= max(1, MAX_OUTLIERS * len(far)) and len(kept) >= MIN_LEFT
+    what = "they are left out" if few else "they are too many to be left out"
     message = (
-        f"{len(names)} photos have cameras {distance.min():.3g} units from the others, which span"
-        f" {extent:.3g} ({examples(names)}); they are left out"
+        f"{counted(len(names), 'photo')} with cameras {distance.min():.3g} units from the others,"
+        f" which span {extent:.3g} ({examples(names)}); {what}"
     )
-    finding = Finding("pose-outlier", message, "compute their poses again to use them")
-    return replace(scene, views=kept), [finding]
+    remedy = "compute their poses again to use them" if few else "remove them or correct the poses"
+    finding = Finding("pose-outlier", message, remedy, file=str(scene.root))
+    return (replace(scene, views=kept) if few else scene), [finding]
 
 
 def duplicate_findings(scene: Scene) -> list[Finding]:
@@ -73,11 +87,11 @@ def duplicate_findings(scene: Scene) -> list[Finding]:
         return []
     count = sum(map(len, same))
     message = (
-        f"{count} photos share their pose with another ({' = '.join(same[0][:3])},"
-        f" {len(same)} groups)"
+        f"{count} photos share their pose with another, in {counted(len(same), 'group')}"
+        f" ({' = '.join(same[0][:3])})"
     )
     remedy = "correct the poses, unless these photos were taken from a tripod"
-    return [Finding("pose-duplicate", message, remedy)]
+    return [Finding("pose-duplicate", message, remedy, file=str(scene.root))]
 
 
 def baseline_findings(scene: Scene) -> list[Finding]:
@@ -91,9 +105,12 @@ def baseline_findings(scene: Scene) -> list[Finding]:
     scale = max(distance, float(np.abs(positions).max()) * 1e-6)
     if baseline > MIN_BASELINE * scale or baseline > 1e-6 and not distance:
         return []
-    message = (
-        "All cameras are at one position, so no depth can be found"
-        if baseline == 0
-        else f"All cameras are within {baseline:.2g} units, so no depth can be found"
-    )
-    return [Finding("pose-no-baseline", message, "use photos from different positions")]
+    if baseline == 0:
+        message = "All cameras are at one position, so no depth can be found"
+        remedy = "use photos from different positions"
+    else:
+        message = f"All cameras are within {baseline:.2g} units, so no depth can be found"
+        if distance:
+            message += f": the sparse points are {distance:.2g} units away"
+        remedy = "check the units of poses and points, or use photos from different positions"
+    return [Finding("pose-no-baseline", message, remedy, file=str(scene.root))]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.listing import is_passed_over
-from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.image_files import PHOTO_SUFFIXES, open_image
 from climatenerf.scene.images import SATURATED, load_depth, load_labels, load_mask
 from climatenerf.scene.scene import Scene, View
@@ -88,7 +88,7 @@ def depth_findings(scene: Scene) -> list[Finding]:
     views = _sample(scene.views, lambda view: view.depth_path)
     if not views:
         return []
-    findings, saturated = [], 0
+    findings, saturated, empty = [], 0, 0
     logs: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for view in views:
         saturated += _saturated(view.depth_path)
@@ -97,18 +97,23 @@ def depth_findings(scene: Scene) -> list[Finding]:
         except UserError as error:
             return [_unreadable(error, view.depth_path)]
         assert depth is not None
+        empty += not np.isfinite(depth).any()
         at = _projected(scene, view)
         value = depth[at.row, at.column]
         known = np.isfinite(value)
         if known.sum() >= MIN_POINTS:
             logs.append((np.log(value[known]), np.log(at.z[known]), np.log(at.length[known])))
+    folder = str(views[0].depth_path.parent) if views[0].depth_path else ""
+    if empty:
+        message = f"{empty} of {len(views)} depth files that were looked at hold no known depth"
+        findings.append(Finding("depth-empty", message, "replace or remove them", file=folder))
     if saturated:
         message = (
             f"{saturated} of {len(views)} depth files that were looked at hold the largest value"
             f" of their format, {SATURATED}, which is taken as unknown"
         )
-        findings.append(Finding("depth-saturated", message, severity="note"))
-    return [*findings, *_kind_of_depth(scene, logs)]
+        findings.append(Finding("depth-saturated", message, "", "note", folder))
+    return [*findings, *(replace(odd, file=folder) for odd in _kind_of_depth(scene, logs))]
 
 
 def _kind_of_depth(
@@ -185,7 +190,7 @@ def mask_findings(scene: Scene) -> list[Finding]:
         at = _projected(scene, view) if view.seen is not None else None
         if at is not None and len(at.z) >= MIN_POINTS:
             hidden_points.append(1 - float(usable[at.row, at.column].mean()))
-    findings = []
+    findings, folder = [], str(views[0].mask_path.parent) if views and views[0].mask_path else ""
     if full:
         message = (
             f"The masks of {len(full)} of {len(views)} photos that were looked at hide all of them"
@@ -194,17 +199,18 @@ def mask_findings(scene: Scene) -> list[Finding]:
         remedy = "correct them: black hides a pixel, any other value shows it"
         every = len(full) == len(views)
         severity = "error" if every and len(views) == len(scene.views) else "warning"
-        findings.append(Finding("mask-hides-all", message, remedy, severity))
+        findings.append(Finding("mask-hides-all", message, remedy, severity, folder))
     elif views and not hidden_by_any:
         message = f"None of {len(views)} masks that were looked at hides anything"
         remedy = "check that pixels to hide are black (0)"
-        findings.append(Finding("mask-hides-nothing", message, remedy, "note"))
+        findings.append(Finding("mask-hides-nothing", message, remedy, "note", folder))
     if hidden_points and np.median(hidden_points) > MIN_HIDDEN_POINTS:
         message = (
             f"The masks hide {np.median(hidden_points):.0%} of the points that the poses were"
             " found with, as if they were inverted"
         )
-        findings.append(Finding("mask-inverted", message, "black hides a pixel; invert the masks"))
+        remedy = "black hides a pixel; invert the masks"
+        findings.append(Finding("mask-inverted", message, remedy, file=folder))
     return findings
 
 
@@ -229,7 +235,8 @@ def label_findings(scene: Scene) -> list[Finding]:
         f"{np.median(on_sky):.0%} of the sparse points lie on what the labels call sky, as if the"
         " labels had another numbering"
     )
-    return [Finding("labels-disagree", message, "set --label-space, or leave labels out")]
+    remedy = "set --label-space, or leave labels out"
+    return [Finding("labels-disagree", message, remedy, file=str(scene.root / "labels"))]
 
 
 def _unreadable(error: UserError, path: Path | None, code: str = "unreadable") -> Finding:
@@ -253,7 +260,7 @@ def unused_findings(scene: Scene, posed: Sequence[View]) -> list[Finding]:
         left_out += [path for path in _photos(folder) if str(path) not in used]
     if left_out:
         message = (
-            f"{len(left_out)} photos have no pose and are left out"
+            f"{counted(len(left_out), 'photo')} without a pose, left out"
             f" ({examples([path.name for path in left_out])})"
         )
         findings.append(
@@ -265,7 +272,7 @@ def unused_findings(scene: Scene, posed: Sequence[View]) -> list[Finding]:
         extra = [path.name for path in files if str(path) not in used]
         if not extra or len(extra) == len(files):  # none used: `sidecar-partial` reports that
             continue
-        message = f"{len(extra)} files in {kind}/ belong to no photo with a pose"
+        message = f"{counted(len(extra), 'file')} in {kind}/ for no photo with a pose"
         findings.append(
             Finding("sidecar-unused", f"{message} ({examples(extra)})", "", "note", str(folder))
         )

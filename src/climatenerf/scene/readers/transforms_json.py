@@ -23,7 +23,7 @@ from climatenerf.core import parsing
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.scene.file_names import FileNames, normalised
-from climatenerf.scene.findings import Finding, examples
+from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.ply import read_points
@@ -125,11 +125,14 @@ def _named_data_findings(
         message = f"{unlisted} images are in none of the lists of {file.name}; they are left out"
         out.append(Finding("photo-unlisted", message, file=str(file)))
     if absent:
-        message = f"{len(absent)} files that {file.name} names are not on disk ({examples(absent)})"
+        message = (
+            f"{counted(len(absent), 'file')} named in {file.name} but not on disk"
+            f" ({examples(absent)})"
+        )
         remedy = "restore them if they matter"
         out.append(Finding("file-missing", message, remedy, file=str(file)))
     if unread:
-        counts = [f"{key} of {n} entries" for key, n in unread.items()]
+        counts = [f"{key} ({n} times)" if n > 1 else key for key, n in unread.items()]
         message = f"{file.name} has data that is not read: {examples(counts, 6)}"
         remedy = "convert it to a key that docs/formats.md lists if it matters"
         out.append(Finding("file-unread", message, remedy, file=str(file)))
