@@ -29,7 +29,8 @@ MAX_VALUES = 8_000_000
 """Values of one file; 100 000 poses have 3.5 million. They take up to 70 bytes each."""
 _BLOCK = 2**20
 _STRING = re.compile(rb'"(?:[^"\\]++|\\.)*+"?', re.DOTALL)
-_LONG_KEY = re.compile(rf"(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{MAX_NESTING}}}")
+# Tried at the first character of a part alone; at every one, the time would grow with its square.
+_LONG_KEY = re.compile(rf"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){{{MAX_NESTING}}}")
 _REQUIRED: Any = object()
 
 # Change of the nesting at each byte, and which bytes separate or open values.
