@@ -32,6 +32,7 @@ CODES: dict[str, str] = {
     "intrinsics-resolution": "The intrinsics belong to pictures of another size; scaled.",
     "focal-negative": "A focal length is negative; its absolute value is used.",
     "focal-unusual": "A focal length is unusual for its picture, or fx and fy differ much.",
+    "focal-disagrees": "Matches between photos agree with another focal length.",
     "focal-exif": "The focal length disagrees with that in the photos' EXIF records.",
     "principal-point": "The principal point is far from the middle of the picture.",
     "distortion-fold": "The lens distortion cannot be inverted everywhere in the picture.",

@@ -110,6 +110,16 @@ def test_far_cameras_of_small_captures_are_told(scene, count, far):
     assert len(found.views) == count - far * left_out
 
 
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("points", [True, False])
+def test_a_focal_length_that_contradicts_the_photos_is_found(scene, factor, points):
+    camera = replace(CAMERA, fx=factor * CAMERA.fx, fy=factor * CAMERA.fy)
+    given = unrecorded(replace(scene, cameras=(camera,)))
+    found = corrected(given if points else replace(given, points=None))
+    assert codes(found) == ["focal-disagrees"]
+    assert "about 260 pixels" in str(found.findings[0])
+
+
 def test_photos_without_matches_are_noted(scene, tmp_path):
     views = []
     for view in unrecorded(scene).views:

@@ -30,6 +30,7 @@ LOOSE_TOLERANCE = 4.0  # pixels, of imprecise poses such as those of a phone
 AGREE = 0.7  # share of matches that agree; right poses have 0.9, wrong matches are the rest
 BETTER = 0.2  # share that another convention must gain
 DISAGREE = 0.4  # wrong poses have up to 0.6: neighbouring epipolar lines are nearly parallel
+FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.71, 1.41, 2.0, 2.83, 4.0)
 MAX_ANGLE = 35.0  # degrees between the viewing directions of a pair
 
 Match = tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], float]
@@ -74,6 +75,8 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
         )
         finding = Finding("pose-axes", message, "correct the file to keep it from being guessed")
         return with_poses(scene, change), [finding]
+    if (finding := _other_focal_length(scene, pairs, matches, given)) is not None:
+        return scene, [finding]
     given = agreement(lambda pose: pose, LOOSE_TOLERANCE)
     if given >= DISAGREE:
         return scene, []
@@ -83,6 +86,36 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
     )
     remedy = "check that intrinsics, poses and photos belong together; a fit will be blurred"
     return scene, [Finding("matches-disagree", message, remedy)]
+
+
+def _other_focal_length(
+    scene: Scene, pairs: Sequence[tuple[View, View]], matches: Sequence[Match], given: float
+) -> Finding | None:
+    """Return a finding if matches agree much better with other focal lengths."""
+
+    def agreement(factor: float) -> float:
+        scaled = [tuple(each / (factor, factor, 1.0) for each in found[:2]) for found in matches]
+        shares = [
+            agreeing_share(
+                a.c2w,
+                b.c2w,
+                (*(each / np.linalg.norm(each, axis=1, keepdims=True) for each in rays), pixel),
+            )
+            for (a, b), rays, (*_, pixel) in zip(pairs, scaled, matches, strict=True)
+        ]
+        return float(np.median(shares))
+
+    shares = {factor: agreement(factor) for factor in FOCAL_FACTORS}
+    best = max(shares, key=lambda factor: shares[factor])
+    if shares[best] < AGREE or shares[best] < given + BETTER:
+        return None
+    focal = scene.cameras[pairs[0][0].camera].fx
+    message = (
+        f"{shares[best]:.0%} of the matches between neighbouring photos agree with a focal length"
+        f" of about {best * focal:.0f} pixels, {given:.0%} with the given {focal:.0f}"
+    )
+    remedy = "check that the intrinsics belong to photos of this size"
+    return Finding("focal-disagrees", message, remedy, file=str(scene.root))
 
 
 def neighbours(views: Sequence[View]) -> list[tuple[View, View]]:
