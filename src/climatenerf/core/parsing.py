@@ -69,15 +69,6 @@ def read_bytes(path: Path | str, what: str = "file", max_bytes: int = MAX_JSON_B
     return data
 
 
-def read_text(path: Path | str, what: str = "file", max_bytes: int = MAX_JSON_BYTES) -> str:
-    """Return the content of a UTF-8 file, with or without a byte order mark; see `read_bytes`.
-
-    Raises:
-        UserError: absent, unreadable, too large, or not text.
-    """
-    return _decoded(read_bytes(path, what, max_bytes), path, what)
-
-
 def read_json(path: Path | str, what: str = "file") -> dict[str, Any]:
     """Read a JSON object.
 
@@ -107,7 +98,7 @@ def parse_json(data: bytes | str, where: str) -> Any:
     raw = data.encode("utf-8", "surrogatepass") if isinstance(data, str) else data
     _check_nesting(raw, where)
     try:
-        return json.loads(_decoded(raw, where), parse_int=_bounded_integer)
+        return json.loads(decode(raw, where), parse_int=_bounded_integer)
     except RecursionError as error:
         raise _too_deep(where) from error
     except json.JSONDecodeError as error:
@@ -130,7 +121,7 @@ def read_toml(path: Path | str, what: str = "file") -> dict[str, Any]:
         UserError: absent, unreadable, not TOML, or beyond the bounds above.
     """
     where = f"{what}: {path}"
-    text = read_text(path, what, MAX_TOML_BYTES)
+    text = decode(read_bytes(path, what, MAX_TOML_BYTES), where)
     if _LONG_KEY.search(text):  # the library's time grows with the square of the parts of a key
         raise _too_deep(where)
     try:
@@ -285,10 +276,6 @@ def _wrong(key: str, where: str, meaning: str, value: Any) -> UserError:
     return UserError(
         f"{key} in {where} should be {meaning}, not {shown(value)}; correct it or restore the file"
     )
-
-
-def _decoded(data: bytes, path: Path | str, what: str = "") -> str:
-    return decode(data, f"{what}: {path}" if what else str(path))
 
 
 def _too_deep(where: str) -> UserError:

@@ -85,7 +85,7 @@ def _without_pixel_limit() -> Iterator[None]:
 
 
 def _register_heif(file: IO[bytes], name: str) -> None:
-    """Register the HEIC decoder with Pillow if the file is HEIC, whatever its suffix."""
+    """Register the HEIC decoder with Pillow if the content of the file is HEIC."""
     head = file.read(64)
     file.seek(0)
     brand = head[8:12] if head[4:8] == b"ftyp" else b""
