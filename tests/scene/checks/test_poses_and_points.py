@@ -7,6 +7,8 @@ from support.scene_builders import OPENGL
 from support.textured_scene import CAMERA, textured_scene
 
 from climatenerf.scene.checks.check import corrected
+from climatenerf.scene.checks.conventions import inverse
+from climatenerf.scene.checks.matching import agreeing_share
 from climatenerf.scene.checks.points import point_shares
 
 
@@ -118,6 +120,18 @@ def test_a_focal_length_that_contradicts_the_photos_is_found(scene, factor, poin
     found = corrected(given if points else replace(given, points=None))
     assert codes(found) == ["focal-disagrees"]
     assert "about 260 pixels" in str(found.findings[0])
+
+
+def test_matches_that_meet_behind_the_cameras_do_not_agree():
+    """Parallel cameras side by side: inverted poses keep the epipolar lines."""
+    random = np.random.default_rng(0)
+    points = random.uniform((-2, -2, 4), (2, 2, 8), (50, 3))
+    first, second = np.eye(4), np.eye(4)
+    second[0, 3] = 0.5
+    rays = [points - pose[:3, 3] for pose in (first, second)]
+    found = (*(each / np.linalg.norm(each, axis=1, keepdims=True) for each in rays), 1 / 300)
+    assert agreeing_share(first, second, found) == 1
+    assert agreeing_share(inverse(first), inverse(second), found) == 0
 
 
 def test_photos_without_matches_are_noted(scene, tmp_path):

@@ -205,8 +205,9 @@ def agreeing_share(
 ) -> float:
     """Return the share of matches on their epipolar lines and in front of both cameras.
 
-    Moving sideways, cameras with their axes exchanged have the same epipolar lines as before, but
-    their rays meet behind them. Nearly parallel rays count as in front.
+    Inverted poses of cameras with equal orientation have the same epipolar lines, since only the
+    baseline changes its sign, but their rays meet behind them. Nearly parallel rays count as in
+    front.
 
     Args:
         first: Camera-to-input pose of the first photo.
