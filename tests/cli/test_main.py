@@ -4,6 +4,7 @@ import pty
 import signal
 import subprocess
 import sys
+import time
 import types
 from dataclasses import dataclass
 
@@ -220,6 +221,22 @@ def test_unexpected_exceptions_are_one_line_to_report(verb, capsys, monkeypatch)
     assert cli.main(["fit", "--scene", "a"]) == 1
     err = capsys.readouterr().err
     assert "Traceback" in err and err.splitlines()[-1].startswith("climatenerf: internal error")
+
+
+def test_an_exception_that_follows_a_signal_is_the_interruption(verb, capsys):
+    """As where a library reports a signal by an exception of its own."""
+
+    def run(options):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        except KeyboardInterrupt:
+            raise SystemError("a call returned a result with an exception set") from None
+
+    verb.run = run
+    assert cli.main(["fit", "--scene", "a"]) == 143
+    err = capsys.readouterr().err
+    assert err.startswith("climatenerf: interrupted (SystemError") and err.count("\n") == 1
 
 
 def test_wrong_options_exit_with_2(verb, capsys):

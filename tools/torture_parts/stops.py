@@ -56,6 +56,7 @@ def stopped(campaign: Campaign, verb: str, seed: int) -> Trial:
     after = rng.random() * valid.seconds
     done = campaign.runner.run(*words, stop=[int(SIGNALS[name]), after])
     faults = _judged_stop(done.status, name, done.after_stop, done.err, verb)
+    said = done.err.strip()[-1500:]
     again = list(words)
     # A fit that saved its field says how it goes on.
     if verb == "fit" and (out / "optimiser.safetensors").exists():
@@ -69,7 +70,7 @@ def stopped(campaign: Campaign, verb: str, seed: int) -> Trial:
         if "--resume" not in again:
             faults += difference(reference, out)
     mutation = f"{name} after {after:.2f} s"
-    shown, said = " ".join(words), done.err.strip()[-1500:]
+    shown, said = " ".join(words), f"{said} | again: {done.err.strip()[-1500:]}"
     return Trial(f"stop-{verb}", seed, mutation, shown, done.status, tuple(faults), said)
 
 

@@ -77,9 +77,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     streams.open_all()
+    received: list[int] = []
     try:
         try:
-            with _stopped_like_ctrl_c(), _without_warnings():
+            with _stopped_like_ctrl_c(received), _without_warnings():
                 return _run(words)
         finally:
             streams.flush_output()
@@ -87,15 +88,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             if os.environ.get("CLIMATENERF_DEBUG"):
                 streams.complain("".join(traceback.format_exception(error)))
-            status, sentence = outcome(error)
+            status, sentence = outcome(error, received)
             streams.complain(sentence)
             return status
         except KeyboardInterrupt as again:  # a second signal
             return outcome(again)[0]
 
 
-def outcome(error: BaseException) -> tuple[int, str]:
-    """Return the exit status and the line on standard error for what ended a verb."""
+def outcome(error: BaseException, received: Sequence[int] = ()) -> tuple[int, str]:
+    """Return the exit status and the line on standard error for what ended a verb.
+
+    Args:
+        error: what ended it.
+        received: numbers of the signals that stopped it before.
+    """
     if isinstance(error, KeyboardInterrupt):
         number = error.args[0] if error.args else signal.SIGINT
         return 128 + number, "\nclimatenerf: interrupted\n"
@@ -120,6 +126,8 @@ def outcome(error: BaseException) -> tuple[int, str]:
         return _sentence(
             f"a name or a text is not UTF-8 ({error}); rename the file, or convert the text"
         )
+    if received:  # code that is not Python's may raise another exception for the interruption
+        return 128 + received[-1], one_line(f"climatenerf: interrupted ({_place(error)})") + "\n"
     return 1, one_line(
         f"climatenerf: internal error in version {climatenerf.__version__}: {_place(error)};"
         " please report it with this line, and with what CLIMATENERF_DEBUG=1 shows"
@@ -149,25 +157,31 @@ def _without_warnings() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _stopped_like_ctrl_c() -> Iterator[None]:
-    """Let `kill` and a closed terminal end a verb as Ctrl-C does: with clean-up and a message."""
-    replaced = []
+def _stopped_like_ctrl_c(received: list[int]) -> Iterator[None]:
+    """Let `kill` and a closed terminal end a verb as Ctrl-C does: with clean-up and a message.
+
+    Args:
+        received: gets the number of each signal.
+    """
+
+    def stop(number: int, frame: object) -> None:
+        received.append(number)
+        raise KeyboardInterrupt(number)
+
+    replaced = {}
     if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):  # Windows lacks the second
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows lacks the last
             number = getattr(signal, name, None)
             # Ignored signals (nohup) and foreign handlers stay as they are.
-            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-                signal.signal(number, _stop)
-                replaced.append(number)
+            usual = (signal.SIG_DFL, signal.default_int_handler)
+            if number is not None and (handler := signal.getsignal(number)) in usual:
+                replaced[number] = handler
+                signal.signal(number, stop)
     try:
         yield
     finally:
-        for number in replaced:
-            signal.signal(number, signal.SIG_DFL)
-
-
-def _stop(number: int, frame: object) -> None:
-    raise KeyboardInterrupt(number)
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
 
 
 def _run(words: list[str]) -> int:
