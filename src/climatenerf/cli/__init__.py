@@ -52,7 +52,7 @@ class Verb:
 
 VERBS = {
     "capture": Verb("climatenerf.cli.capture", "Capture", "find the poses of photos or a video"),
-    "check": Verb("climatenerf.cli.check", "Check", "hold a capture against itself"),
+    "check": Verb("climatenerf.cli.check", "Check", "check that the parts of a capture agree"),
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
     "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),

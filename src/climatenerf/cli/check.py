@@ -1,4 +1,4 @@
-"""``climatenerf check CAPTURE``: hold a capture against itself, before anything is computed."""
+"""``climatenerf check CAPTURE``: check that the parts of a capture agree."""
 
 import json
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from climatenerf.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Check:
-    """Hold a capture against itself: photos, intrinsics, poses, points, depths, masks, labels.
+    """Check that a capture's photos, intrinsics, poses, points, depths, masks and labels agree.
     Exit status 0, or 2 if it cannot be used."""
 
     capture: tyro.conf.Positional[Path]

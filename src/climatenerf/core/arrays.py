@@ -1,6 +1,6 @@
 """Reading of NPY and NPZ files whose headers may claim any size.
 
-NumPy takes memory for what a header claims before it reads. Here the claim is held against the size
+NumPy takes memory for what a header claims before it reads. Here the claim is compared with the size
 of the file, and against a bound on the size of an array, before that.
 """
 

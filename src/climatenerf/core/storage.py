@@ -248,7 +248,7 @@ def read_safetensors(path: Path | str, what: str = "file") -> tuple[dict[str, An
     try:
         with open(path, "rb"):  # the library does not tell a forbidden file from a damaged one
             pass
-        # The library maps the file, and holds sizes in its header against the file's.
+        # The library maps the file, and compares sizes in its header with the file's.
         with safe_open(path, framework="numpy") as file:
             return {name: file.get_tensor(name) for name in file.keys()}, file.metadata() or {}  # noqa: SIM118
     except OSError as error:

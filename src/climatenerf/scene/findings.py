@@ -42,7 +42,7 @@ CODES: dict[str, str] = {
     "pose-no-baseline": "All cameras are at one position, so depth cannot be found.",
     "pose-axes": "The poses have the axes of another convention; converted.",
     "pose-disagrees": "The pose of a photo contradicts the points that were seen in it.",
-    "matches-few": "Too few matches between photos to hold the poses against them.",
+    "matches-few": "Too few matches between photos to check the poses.",
     "matches-disagree": "Matches between neighbouring photos contradict their poses.",
     # Points.
     "points-outside": "Most sparse points lie in no picture.",

@@ -1,4 +1,4 @@
-"""Intrinsics held against the size of the photos, against each other and against EXIF."""
+"""Do intrinsics agree with the size of the photos, with each other and with EXIF?"""
 
 from __future__ import annotations
 

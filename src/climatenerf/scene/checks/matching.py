@@ -1,4 +1,4 @@
-"""Poses held against the photos where no points do it: matches meet in front of both cameras.
+"""Do poses agree with the photos? Matches must meet in front of both cameras.
 
 Corners (Harris & Stephens 1988) of neighbouring photos are matched by normalised patches. A match
 must lie in the plane of the two cameras and the ray of its partner (Longuet-Higgins 1981), and both
@@ -48,7 +48,7 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
     usable = [i for i, (first, _, _) in enumerate(matches) if len(first) >= MIN_MATCHES]
     if len(usable) < 2:
         message = (
-            "Neighbouring photos have too few matches to hold the poses against them"
+            "Neighbouring photos have too few matches to check the poses"
             f" ({counted(len(usable), 'pair')} of {len(pairs)} with {MIN_MATCHES} or more)"
         )
         remedy = "check that poses and photos belong together if photos overlap"

@@ -1,4 +1,4 @@
-"""Poses and intrinsics held against the sparse points: do points fall into the photos?
+"""Do poses and intrinsics agree with the sparse points? Points must fall into the photos.
 
 Where a capture records which photos show a point, nearly every such point falls into its photo.
 Otherwise a point falls into at least one photo. If few do, other conventions are tried: OpenGL's

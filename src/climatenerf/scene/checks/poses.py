@@ -1,4 +1,4 @@
-"""Poses held against each other: outliers, duplicates, and no baseline."""
+"""Consistency of the poses: outliers, duplicates, and no baseline."""
 
 from __future__ import annotations
 

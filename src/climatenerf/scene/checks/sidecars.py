@@ -1,4 +1,4 @@
-"""Depths, masks and labels held against the photos and the sparse points."""
+"""Do depths, masks and labels agree with the photos and the sparse points?"""
 
 from __future__ import annotations
 
