@@ -1,7 +1,7 @@
 """Reading of NPY and NPZ files whose headers may claim any size.
 
-NumPy takes memory for what a header claims before it reads. Here the claim is compared with the size
-of the file, and against a bound on the size of an array, before that.
+NumPy takes memory for what a header claims before it reads. Here the claim is first compared with
+the size of the file and with a bound on the size of an array.
 """
 
 import math
