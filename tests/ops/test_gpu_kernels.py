@@ -28,6 +28,7 @@ from climatenerf.ops import (
     optimiser,
     reference,
     visual_hull,
+    visual_hull_reference,
 )
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
@@ -395,7 +396,7 @@ def test_label_votes_match_the_twin(generator):
         ours = visual_hull.label_votes(
             x.to(DEVICE), radius.to(DEVICE), tuple(each.to(DEVICE) for each in views), minimums
         ).cpu()
-        real = reference.label_votes(
+        real = visual_hull_reference.label_votes(
             x, radius, [each.float() for each in maps], pinholes, c2w, minimums
         )
         # Rounding can move a position on a pixel border into the neighbouring pixel.

@@ -12,6 +12,7 @@ from support.random_field import directions, random_field
 from climatenerf.core.cameras import Camera
 from climatenerf.core.samples import MIN_TAU, Samples
 from climatenerf.render import integrator as trace_module
+from climatenerf.render import merging
 from climatenerf.render.frame import render_frame
 from climatenerf.render.integrator import trace
 from climatenerf.weather.flood.parameters import Flood
@@ -350,7 +351,7 @@ def test_snow_is_not_marched_behind_opaque_surfaces(monkeypatch):
     monkeypatch.setattr(type(world.matters[0]), "march", recorded)
     linear(world)
     assert 0.1 < torch.isfinite(torch.cat(limits)).float().mean() < 0.9
-    monkeypatch.setattr(trace_module, "HIDDEN", 0.0)
+    monkeypatch.setattr(merging, "HIDDEN", 0.0)
     every = linear(world)
     for name in ("rgb", "mask_snow", "snow_thickness"):
         assert (values(few, name) - values(every, name)).abs().max() < 2e-3, name
@@ -495,9 +496,11 @@ def test_the_fast_path_without_weather_equals_the_general_path(monkeypatch, wate
         field.geometry_net[-1] += 2.0
     if water is not None:
         water = dataclasses.replace(water, level=float(field.centre[2]))
-    original, calls = trace_module._trace_field, []
+    original, calls = trace_module.trace_field, []
     monkeypatch.setattr(
-        trace_module, "_trace_field", lambda *given: calls.append(given[1]) or original(*given)
+        trace_module,
+        "trace_field",
+        lambda *given, **named: calls.append(given[1]) or original(*given, **named),
     )
     d = directions(300)
     o = (field.centre + torch.tensor([0.0, 0.0, 1.5])).repeat(300, 1)

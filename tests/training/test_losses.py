@@ -12,7 +12,7 @@ from climatenerf.core.classes import ROAD, SKY, UNKNOWN
 from climatenerf.ops import compositing
 from climatenerf.training import losses
 from climatenerf.training.losses import scale_gradient
-from climatenerf.training.objective import RenderedRays
+from climatenerf.training.rendered_rays import RenderedRays
 from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import Losses
 

@@ -22,6 +22,7 @@ from climatenerf.training import trainer as module
 from climatenerf.training.dataset import HORIZON
 from climatenerf.training.evidence.sparse_depth import read_sparse_depth
 from climatenerf.training.optimiser import Diverged
+from climatenerf.training.pruning import raise_pruning_threshold
 from climatenerf.training.run import load_pixels
 from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import FitSettings, Losses
@@ -252,7 +253,9 @@ def test_the_pruning_threshold_increases_once_samples_are_dense(scene, steps):
         for step in range(steps):
             trainer.steps = step
             kept = tau[tau > field.pruning_threshold]
-            trainer.raise_pruning_threshold(kept, torch.ones_like(kept))
+            ones, progress = torch.ones_like(kept), trainer.progress
+            given = trainer.settings, progress, trainer.buffers
+            raise_pruning_threshold(field, kept, ones, *given)
             if step < Schedule().prune_from * steps:
                 assert field.pruning_threshold == MIN_TAU
         ends[kind] = field.pruning_threshold

@@ -69,21 +69,15 @@ class Field(nn.Module):
         self.pruning_threshold = MIN_TAU
         """Optical depth below which a sample of a camera ray counts as empty; a fit raises it."""
         self.register_buffer("centre", torch.tensor(centre, dtype=torch.float32, device="cpu"))
-        self.register_buffer(
-            "geometry_resolutions",
-            level_resolutions(size.coarsest, size.geometry_finest, size.geometry_levels),
-        )
-        self.register_buffer(
-            "appearance_resolutions",
-            level_resolutions(size.coarsest, size.appearance_finest, size.appearance_levels),
-        )
-        self.register_buffer(
-            "surface_resolutions",
-            level_resolutions(size.coarsest, size.surface_finest, size.surface_levels),
-        )
-        self.register_buffer(
-            "sky_resolutions", level_resolutions(size.coarsest, size.sky_finest, size.sky_levels)
-        )
+        levels = {
+            "geometry": (size.geometry_finest, size.geometry_levels),
+            "appearance": (size.appearance_finest, size.appearance_levels),
+            "surface": (size.surface_finest, size.surface_levels),
+            "sky": (size.sky_finest, size.sky_levels),
+        }
+        for grid, (finest, count) in levels.items():
+            resolutions = level_resolutions(size.coarsest, finest, count)
+            self.register_buffer(f"{grid}_resolutions", resolutions)
         self.geometry_grid = uniform_parameter(
             (size.geometry_levels, 2**size.geometry_log2_rows, 2), 1e-4, generator
         )
@@ -246,9 +240,8 @@ class Field(nn.Module):
     def raw_density(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Return the logarithm of the density per contracted length at unit-cube coordinates."""
         grid, resolutions = self.geometry_grid, self.geometry_resolutions
-        return network.encoded_mlp(u, grid, resolutions, weights_and_biases(self.geometry_net))[
-            :, 0
-        ]
+        layers = weights_and_biases(self.geometry_net)
+        return network.encoded_mlp(u, grid, resolutions, layers)[:, 0]
 
     def density_with_gradient(self, u: Float[Tensor, "s 3"]) -> Float[Tensor, "s"]:
         """Return the density (1/grid unit) at unit-cube coordinates, with gradients."""
@@ -260,24 +253,6 @@ class Field(nn.Module):
         Analytic, from the encoding's slopes; 0 where the density is constant. No gradient.
         """
         return -unit_vector(marching.density_slopes(q, self.density_net))
-
-    def finite_difference_normal(
-        self, q: Float[Tensor, "n 3"], step: Float[Tensor, "n"]
-    ) -> Float[Tensor, "n 3"]:
-        """Return what `density_normal` does from differences over `step`, with gradients.
-
-        Four densities at the corners of a tetrahedron give the slope. q and step: grid units.
-        """
-        k = torch.arange(4, device=q.device)
-        x, y = 1.0 - 2.0 * (k // 2), 1.0 - 2.0 * (k % 2)
-        corners = torch.stack([x, y, x * y], dim=-1)
-        around = q[:, None] + step[:, None, None] * corners
-        flat = around.reshape(-1, 3)
-        # Density per contracted length, to density per length: see `reference.density`.
-        contraction = flat.square().sum(-1).clamp_min(1.0).log()
-        raw = (self.raw_density(reference.contract(flat)) - contraction).view(-1, 4, 1)
-        # 1e-6: where the density is constant the gradient of its direction would be NaN.
-        return -unit_vector((raw * corners).sum(1), 1e-6)
 
     def observed_only(self) -> "Field":
         """Return the same field without cells that no training image has seen.

@@ -15,20 +15,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.core.samples import MIN_WEIGHT, Samples, offsets_of
+from climatenerf.core.samples import MIN_WEIGHT, offsets_of
 from climatenerf.field.compositing import (
     NEVER,
     RENDER_STEP,
     Checkpoints,
     chunks,
-    composited,
 )
 from climatenerf.ops import compositing
+from climatenerf.render.dry_rays import radiance_alone, trace_field
 from climatenerf.render.measurements import MIN_FRACTION, LightFractions, measure, total
+from climatenerf.render.merging import merged_samples, sample_colour
 from climatenerf.weather import media
 from climatenerf.weather.world import (
-    SKY_OPACITY,
-    TINY,
     RaySamples,
     RenderOutput,
     SurfaceHits,
@@ -36,7 +35,6 @@ from climatenerf.weather.world import (
     concatenate,
 )
 
-HIDDEN = 1e-3  # transmittance below which matter is not looked for
 BOUNCES = 2  # hits on surfaces; beyond, rays see the world without surfaces
 SECONDARY_STEP = 5.0  # marching step of rays behind a hit, which blur; RENDER_STEP: of camera rays
 
@@ -94,14 +92,15 @@ def _trace(
             meets |= (surface.distance(rays_o, rays_d) < torch.inf) | surface.inside(rays_o)
         if not bool(meets.all()):
             dry, wet = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
-            parts = [_trace_field(world, rays_o[dry], rays_d[dry], t_min[dry], bounces)]
+            given = rays_o[dry], rays_d[dry], t_min[dry], step_scale
+            parts = [trace_field(world, *given, measured=bounces == BOUNCES)]
             if wet.numel():
                 rotation = None if sample_rotation is None else sample_rotation[wet]
                 given = rays_o[wet], rays_d[wet], pixel_angle[wet], rotation, t_min[wet]
                 checkpoint()
                 parts.append(_trace(world, *given, bounces, checkpoint))
             return concatenate(parts, torch.cat([dry, wet]).argsort())
-    samples, kind = _all_samples(world, rays_o, rays_d, t_min, step_scale)
+    samples, kind = merged_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
     along = RaySamples(samples, ray, weights)
@@ -127,7 +126,7 @@ def _trace(
     checkpoint()
     # --- Light of the field and of matter in front of the surface ---------------------------------
     keep = (front > MIN_WEIGHT).nonzero()[:, 0]
-    colour = _sample_colour(world, samples, ray, kind, keep, rays_o, rays_d)
+    colour = sample_colour(world, samples, ray, kind, keep, rays_o, rays_d)
     colour = arrive(colour, ray[keep], samples.t[keep])
     offsets = offsets_of(ray[keep], n)
     rgb = compositing.accumulate(front[keep], colour, offsets)
@@ -166,7 +165,7 @@ def _trace(
             layers[name][hit] = values
 
     if bounces < BOUNCES:
-        return _radiance_alone(rgb)
+        return radiance_alone(rgb)
     shares = LightFractions(along, kind, front, surface_weight, sky_weight, t_surface)
     return measure(world, rays_o, rays_d, rgb, shares, normal, layers)
 
@@ -185,95 +184,6 @@ def _radiance(
     rgb = _trace(world, rays_o, rays_d, pixel_angle, None, start, bounces, checkpoint).rgb
     checkpoint()
     return rgb
-
-
-def _radiance_alone(rgb: Float[Tensor, "n 3"]) -> RenderOutput:
-    """Output of secondary rays, of which only the radiance is used."""
-    nothing = torch.zeros(rgb.shape[0], device=rgb.device)
-    return RenderOutput(rgb, nothing, torch.zeros_like(rgb), nothing)
-
-
-def _trace_field(
-    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, bounces: int
-) -> RenderOutput:
-    """What rays see of the scene without weather: as `_trace`, in one launch on a GPU."""
-    step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
-    rgb, transmittance, length = composited(
-        world.field, rays_o, rays_d, t_min, step_scale, appearance=world.appearance
-    )
-    skyward = (transmittance > MIN_WEIGHT).nonzero()[:, 0]
-    sky = world.field.sky(rays_d[skyward], world.appearance)
-    rgb = rgb.index_add(0, skyward, transmittance[skyward, None] * sky)
-    if bounces < BOUNCES:
-        return _radiance_alone(rgb)
-    depth = length / (1 - transmittance).clamp_min(TINY)
-    nothing = torch.zeros_like(depth)
-    return RenderOutput(
-        rgb,
-        torch.where(transmittance < SKY_OPACITY, depth, torch.full_like(depth, torch.inf)),
-        torch.zeros_like(rgb),
-        torch.ones_like(depth),
-        dict.fromkeys(world.layer_names, nothing),
-    )
-
-
-def _all_samples(
-    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
-) -> tuple[Samples, Int[Tensor, "s"]]:
-    """Samples of field and matter, merged, and the kind of each: 0 field, k the k-th matter."""
-    endless = torch.full_like(t_min, 1e9)
-    merged = world.field.march(rays_o, rays_d, t_min, endless, step_scale)
-    kind = torch.zeros_like(merged.t, dtype=torch.long)
-    for index, matter in enumerate(world.matters, start=1):
-        own = matter.march(rays_o, rays_d, t_min, _opaque_from(merged))
-        order, offsets = compositing.merge_order(merged.t, merged.offsets, own.t, own.offsets)
-        both = {
-            key: torch.cat([getattr(merged, key), getattr(own, key)])[order]
-            for key in ("t", "dt", "sigma")
-        }
-        ids = merged.ids
-        if ids is not None:
-            ids = torch.cat([ids, ids.new_full(own.t.shape, -1)])[order]
-        kind = torch.cat([kind, torch.full_like(own.t, index, dtype=torch.long)])[order]
-        merged = Samples(offsets, **both, ids=ids)
-    return merged, kind
-
-
-def _opaque_from(samples: Samples) -> Float[Tensor, "n"]:
-    """Ray length behind which nothing is visible; +inf where light is left."""
-    _, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
-    ends = torch.full_like(transmittance, torch.inf)
-    rays = (transmittance < HIDDEN).nonzero()[:, 0]
-    last = samples.offsets[rays + 1] - 1
-    # Somewhat further, since a cut through a clump of matter would move its middle.
-    ends[rays] = samples.t[last] + 2 * samples.dt[last]
-    return ends
-
-
-def _sample_colour(
-    world: World,
-    samples: Samples,
-    ray: Int[Tensor, "s"],
-    kind: Int[Tensor, "s"],
-    keep: Int[Tensor, "k"],
-    rays_o: Tensor,
-    rays_d: Tensor,
-) -> Float[Tensor, "k 3"]:
-    """Linear radiance of the samples `keep`."""
-    x = rays_o[ray[keep]] + samples.t[keep, None] * rays_d[ray[keep]]
-    ids = None if samples.ids is None else samples.ids[keep]
-    if not world.matters:
-        return world.field.colour(x, rays_d, ray[keep], ids=ids, appearance=world.appearance)
-    colour = torch.empty(keep.shape[0], 3, device=x.device)
-    for index, matter in enumerate(world.matters, start=1):
-        mine = kind[keep] == index
-        colour[mine] = matter.colour(x[mine])
-    own = kind[keep] == 0
-    ids = None if ids is None else ids[own]
-    colour[own] = world.field.colour(
-        x[own], rays_d, ray[keep][own], ids=ids, appearance=world.appearance
-    )
-    return colour
 
 
 def _arrive(

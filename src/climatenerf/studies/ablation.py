@@ -37,9 +37,9 @@ from climatenerf.field.hash_field import Field
 from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
 from climatenerf.training.folder import OPTIMISER, check_config, checked_metrics
+from climatenerf.training.progress import Report
 from climatenerf.training.run import METRICS, fit_scene
 from climatenerf.training.settings import FitSettings, Losses, as_config, settings_of
-from climatenerf.training.trainer import Report
 
 SCHEMA_VERSION = 1
 FILE_NAME, TEXT_NAME, SHEET = "ablation.json", "ablation.md", "ablation.jpg"

@@ -16,6 +16,7 @@ from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import to_device
 from climatenerf.core.samples import MIN_WEIGHT, Samples, offsets_of
 from climatenerf.core.vectors import unit
+from climatenerf.field.density_slope import finite_difference_normal
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import compositing
 from climatenerf.training import losses
@@ -23,40 +24,11 @@ from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels
 from climatenerf.training.evidence.free_space import is_ground
 from climatenerf.training.evidence.gather import Evidence
 from climatenerf.training.evidence.monocular_depth import DepthAlignment
+from climatenerf.training.rendered_rays import RenderedRays, VisibleSamples
 from climatenerf.training.schedule import Schedule
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.static_shapes import Buffers
 from climatenerf.training.transients import MASK_THRESHOLD, TransientMasks, mask_prices
-
-
-@dataclass(frozen=True)
-class RenderedRays:
-    """A batch's rays through the field, with gradients to the density."""
-
-    samples: Samples
-    t: Float[Tensor, "s"]
-    """Ray length of each sample's middle, grid units."""
-    dt: Float[Tensor, "s"]
-    """Extent of each sample along its ray, grid units."""
-    weights: Float[Tensor, "s"]
-    """Share of the ray's light that each sample absorbs."""
-    transmittance: Float[Tensor, "n"]
-    """Share of the light that passes all samples of a ray."""
-
-
-@dataclass(frozen=True)
-class VisibleSamples:
-    """The selected samples that weigh enough for colour, ascending."""
-
-    index: Int[Tensor, "k"]
-    """Rows among all samples of the batch."""
-    ray: Int[Tensor, "k"]
-    u: Float[Tensor, "k 3"]
-    """Unit-cube coordinates."""
-    weights: Float[Tensor, "k"]
-    """Weights over their inclusion probabilities: unbiased sums over all samples."""
-    gradient_scale: Float[Tensor, "k"]
-    """Factor on gradients, below 1 near cameras."""
 
 
 @dataclass
@@ -257,10 +229,8 @@ class Objective:
             loss = loss + weight.classes * losses.class_loss(logits, classes, classes != UNKNOWN)
         if weight.normal_consistency and q is not None:
             step = self.schedule.normal_step * samples.dt[index] / field.unit
-            normal, predicted = (
-                field.finite_difference_normal(q, step),
-                unit(raw[:, :3].detach(), 1e-6),
-            )
+            normal = finite_difference_normal(field.raw_density, q, step)
+            predicted = unit(raw[:, :3].detach(), 1e-6)
             difference = losses.normal_loss(weights, normal, predicted, n)
             loss = loss + weight.normal_consistency * difference
         return loss

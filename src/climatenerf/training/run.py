@@ -36,10 +36,11 @@ from climatenerf.training.folder import (
     check_resumable,
 )
 from climatenerf.training.optimiser import Diverged
+from climatenerf.training.progress import Report
 from climatenerf.training.settings import FitSettings, as_config
 from climatenerf.training.setup import compile_kernels, make_trainer
 from climatenerf.training.snapshot import METRICS, writing_run
-from climatenerf.training.trainer import Report, Trainer
+from climatenerf.training.trainer import Trainer
 
 CHECKPOINT_INTERVAL = 60.0  # seconds
 PREVIEW_INTERVAL = 20.0  # seconds

@@ -9,7 +9,7 @@ the photos in display values.
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from climatenerf.core.classes import SKY, UNKNOWN
 from climatenerf.core.device import uniform
-from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT, Samples, offsets_of
+from climatenerf.core.samples import MIN_WEIGHT, Samples, offsets_of
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import Extent
 from climatenerf.ops import compositing, marching, reference
@@ -27,31 +27,18 @@ from climatenerf.training.dataset import Batch
 from climatenerf.training.evidence.gather import Evidence
 from climatenerf.training.evidence.sparse_depth import concatenate
 from climatenerf.training.losses import scale_gradient
-from climatenerf.training.objective import Objective, RenderedRays, VisibleSamples
+from climatenerf.training.objective import Objective
 from climatenerf.training.optimiser import DiscardedSteps, GridAdam, all_finite, clear_unless
+from climatenerf.training.parameter_groups import parameter_groups
 from climatenerf.training.poses import PoseCorrections
+from climatenerf.training.progress import Report
+from climatenerf.training.pruning import raise_pruning_threshold, update_occupancy
+from climatenerf.training.rendered_rays import RenderedRays, VisibleSamples
 from climatenerf.training.sample_selection import select_samples
-from climatenerf.training.schedule import Rates
 from climatenerf.training.static_shapes import Buffers
 
 FAR = 1e9  # m, the end of rays to infinity
 STOP = 1e-4  # transmittance at which a marched ray ends
-
-
-@dataclass(frozen=True)
-class Report:
-    """State of a fit after a step."""
-
-    step: int
-    seconds: float
-    progress: float
-    """Fraction of the time or steps that has passed, [0,1]."""
-    psnr: float
-    """Of the training pixels, running mean, dB."""
-    rays_per_second: float
-    samples_per_ray: float
-    samples: int
-    """Samples evaluated so far."""
 
 
 class Trainer:
@@ -86,7 +73,11 @@ class Trainer:
         self.grid_adam = GridAdam(grids, decays)
         # 1e-15: a parameter whose gradient was always 0 has moments of 0, 0/0.
         self.net_adam = torch.optim.Adam(
-            self.parameter_groups(), self.settings.net_rate, (0.9, 0.99), eps=1e-15, fused=True
+            parameter_groups(field, self.masks, self.poses, self.settings, self.evidence.knows_sky),
+            self.settings.net_rate,
+            betas=(0.9, 0.99),
+            eps=1e-15,
+            fused=True,
         )
         self.discarded = DiscardedSteps()
         self.steps = 0
@@ -96,25 +87,6 @@ class Trainer:
         self.rays = self.schedule.first_rays
         self.step_scale = self.schedule.max_step_scale
         self.error = 0.0  # running mean of the squared error
-
-    def parameter_groups(self) -> list[dict]:
-        """Return the networks' parameters, grouped by their `rates` (see `Schedule`)."""
-        schedule, whole = self.schedule, (1.0, 1.0)
-        named = dict(self.field.named_parameters())
-
-        def group(rates: Rates, *prefixes: str) -> dict:
-            chosen = [p for name, p in named.items() if name.startswith(prefixes)]
-            return {"params": chosen, "rates": rates}
-
-        return [
-            group(whole, "geometry_net", "colour_net"),
-            group(whole, "surface_net"),
-            group(schedule.view if self.settings.warm_up else whole, "view_net"),
-            group(whole if self.evidence.knows_sky else schedule.unlabelled_sky, "sky_net"),
-            group(schedule.embeddings, "embeddings"),
-            {"params": list(self.masks.parameters()), "rates": schedule.masks},
-            {"params": list(self.poses.parameters()), "rates": schedule.poses},
-        ]
 
     @property
     def evidence(self) -> Evidence:
@@ -150,7 +122,13 @@ class Trainer:
         """Step until time or steps are over, and call `report` after each step."""
         while self.elapsed < 1:
             start = time.perf_counter()
-            self.update_occupancy()
+            update_occupancy(
+                self.field,
+                self.steps,
+                self.schedule.surfaces_found(self.progress),
+                self.evidence.free_space,
+                self.generator,
+            )
             batch = self.draw_batch()
             error, samples = self.step(batch)
             seconds = time.perf_counter() - start
@@ -204,7 +182,7 @@ class Trainer:
         weights, _ = compositing.render_weights(tau, samples.offsets)
         heavy = self.buffers.indices("heavy", weights > self.schedule.occupied_weight)
         field.sampler.record_density(rays_o, rays_d, samples, heavy)
-        self.raise_pruning_threshold(tau, weights)
+        raise_pruning_threshold(field, tau, weights, self.settings, progress, self.buffers)
 
         selected, probability = select_samples(
             weights, samples.dt > 0, self.schedule, self.buffers, self.generator
@@ -374,34 +352,3 @@ class Trainer:
             group["lr"] = settings.net_rate * rate * group["rates"][found]
         self.net_adam.step()
         self.grid_adam.step(settings.grid_rate * rate)
-
-    def raise_pruning_threshold(self, tau: Float[Tensor, "s"], weights: Float[Tensor, "s"]) -> None:
-        """Raise the optical depth below which samples count as empty, unless much light ends there.
-
-        Once surfaces are found, samples of low density are veils, above all between leaves and the
-        sky.
-        """
-        field = self.field
-        goal = self.schedule.pruning_threshold(
-            MIN_TAU, self.settings.pruning_threshold, self.progress
-        )
-        if goal <= field.pruning_threshold:
-            return
-        doubled = 2 * field.pruning_threshold
-        fraction = (weights * (tau < doubled)).sum() / weights.sum()  # no light at all: NaN, not <
-        # A name for each doubling: deferred read-back must not return a lower threshold's fraction.
-        name = f"pruned light at {round(math.log2(doubled / MIN_TAU))}"
-        if self.buffers.read(name, fraction, math.inf) < self.schedule.max_pruned_light:
-            field.pruning_threshold = min(goal, doubled)
-
-    def update_occupancy(self) -> None:
-        """Evaluate every cell of the occupancy grid in the first steps, a fraction later."""
-        occupancy, step = self.field.occupancy, self.steps
-        if step in (16, 32, 64, 128):
-            occupancy.update(self.field.grid_density, 1.0, 0.9, self.generator)
-        elif step % 16 == 0 and step > 128:
-            occupancy.update(self.field.grid_density, 0.04, 0.8, self.generator)
-        refine = self.schedule.surfaces_found(self.progress) and step > 128
-        if refine and occupancy.side < self.field.size.occupancy_side:
-            occupancy.refine()
-            self.evidence.free_space.force_empty(everywhere=False)

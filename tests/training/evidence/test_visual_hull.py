@@ -6,7 +6,7 @@ from support.tower import CAMERA, in_matter, labels, poses
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import BUILDING, SKY, UNKNOWN
-from climatenerf.ops import reference
+from climatenerf.ops import visual_hull_reference
 from climatenerf.training.evidence import visual_hull
 from climatenerf.training.evidence.visual_hull import VisualHull, border_distance
 
@@ -129,7 +129,7 @@ def test_kernel_matches_the_reference():
         for start, (h, w) in zip(starts.tolist(), sizes.tolist(), strict=True)
     ]
     needed = (visual_hull.MIN_VOTES, hull.min_fraction, hull.min_baseline)
-    expected = reference.label_votes(x, radius, distances, *views, needed)
+    expected = visual_hull_reference.label_votes(x, radius, distances, *views, needed)
     ours = hull.consensus(x, radius)
     # Rounding can move a projection on a pixel's border into the neighbouring pixel.
     assert (ours == expected).float().mean() > 0.999

@@ -1,4 +1,4 @@
-"""CPU kernel in Numba: label votes. The slow twin is `reference.label_votes`."""
+"""CPU kernel in Numba: label votes. The slow twin is `visual_hull_reference.label_votes`."""
 
 import numpy as np
 from numba import njit, prange
@@ -6,7 +6,7 @@ from numba import njit, prange
 
 @njit(cache=True, parallel=True)
 def label_votes(x, radius, views, thresholds, consensus):
-    """Write on which balls (x, radius) the views' masks agree; see `reference.label_votes`.
+    """Write on which balls (x, radius) the views' masks agree; the twin says how.
 
     views: (depths inside the masks, flat; start of each view; sizes [v,2]; pinholes [v,4]; c2w).
     """

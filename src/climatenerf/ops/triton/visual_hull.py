@@ -1,4 +1,4 @@
-"""GPU kernel in Triton: label votes. The twin is `reference.label_votes`."""
+"""GPU kernel in Triton: label votes. The twin is `visual_hull_reference.label_votes`."""
 
 # pyright cannot know the types of Triton's functions.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportAttributeAccessIssue=false

@@ -77,7 +77,7 @@ class VisualHull:
         A view votes for a ball if its whole projection falls on the hull's classes. Consensus
         needs `MIN_VOTES` votes, votes of the fraction `min_fraction` of the views whose image
         contains the centre, and two votes of cameras more than `min_baseline` apart (see
-        `reference.label_votes`).
+        `visual_hull_reference.label_votes`).
 
         Args:
             x: Ball centres, world m.

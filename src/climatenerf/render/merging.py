@@ -1,0 +1,70 @@
+"""Samples of the field and of matter on the same rays, merged front to back."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from climatenerf.core.samples import Samples
+from climatenerf.ops import compositing
+from climatenerf.weather.world import World
+
+HIDDEN = 1e-3  # transmittance below which matter is not looked for
+
+
+def merged_samples(
+    world: World, rays_o: Tensor, rays_d: Tensor, t_min: Tensor, step_scale: float
+) -> tuple[Samples, Int[Tensor, "s"]]:
+    """Samples of field and matter, merged, and the kind of each: 0 field, k the k-th matter."""
+    endless = torch.full_like(t_min, 1e9)
+    merged = world.field.march(rays_o, rays_d, t_min, endless, step_scale)
+    kind = torch.zeros_like(merged.t, dtype=torch.long)
+    for index, matter in enumerate(world.matters, start=1):
+        own = matter.march(rays_o, rays_d, t_min, opaque_from(merged))
+        order, offsets = compositing.merge_order(merged.t, merged.offsets, own.t, own.offsets)
+        both = {
+            key: torch.cat([getattr(merged, key), getattr(own, key)])[order]
+            for key in ("t", "dt", "sigma")
+        }
+        ids = merged.ids
+        if ids is not None:
+            ids = torch.cat([ids, ids.new_full(own.t.shape, -1)])[order]
+        kind = torch.cat([kind, torch.full_like(own.t, index, dtype=torch.long)])[order]
+        merged = Samples(offsets, **both, ids=ids)
+    return merged, kind
+
+
+def opaque_from(samples: Samples) -> Float[Tensor, "n"]:
+    """Ray length behind which nothing is visible; +inf where light is left."""
+    _, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    ends = torch.full_like(transmittance, torch.inf)
+    rays = (transmittance < HIDDEN).nonzero()[:, 0]
+    last = samples.offsets[rays + 1] - 1
+    # Somewhat further, since a cut through a clump of matter would move its middle.
+    ends[rays] = samples.t[last] + 2 * samples.dt[last]
+    return ends
+
+
+def sample_colour(
+    world: World,
+    samples: Samples,
+    ray: Int[Tensor, "s"],
+    kind: Int[Tensor, "s"],
+    keep: Int[Tensor, "k"],
+    rays_o: Tensor,
+    rays_d: Tensor,
+) -> Float[Tensor, "k 3"]:
+    """Linear radiance of the samples `keep`."""
+    x = rays_o[ray[keep]] + samples.t[keep, None] * rays_d[ray[keep]]
+    ids = None if samples.ids is None else samples.ids[keep]
+    if not world.matters:
+        return world.field.colour(x, rays_d, ray[keep], ids=ids, appearance=world.appearance)
+    colour = torch.empty(keep.shape[0], 3, device=x.device)
+    for index, matter in enumerate(world.matters, start=1):
+        mine = kind[keep] == index
+        colour[mine] = matter.colour(x[mine])
+    own = kind[keep] == 0
+    ids = None if ids is None else ids[own]
+    colour[own] = world.field.colour(
+        x[own], rays_d, ray[keep][own], ids=ids, appearance=world.appearance
+    )
+    return colour
