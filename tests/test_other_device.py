@@ -113,7 +113,7 @@ def test_steps_with_every_loss_stay_on_the_device(runs):
         trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene, TOY))
         assert trainer.evidence.knows_sky and trainer.evidence.free_space.ground is not None
         trainer.run(ignore)
-        assert trainer.field.embeddings.device == TOY and trainer.poses.shift.device == TOY
+        assert trainer.field.embeddings.device == TOY and trainer.poses.translation.device == TOY
 
 
 def test_stereo_depth_and_free_space_are_equal_on_both_devices():
