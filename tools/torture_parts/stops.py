@@ -55,7 +55,7 @@ def stopped(campaign: Campaign, verb: str, seed: int) -> Trial:
     valid = campaign.valid["stop-" + verb, 0]
     after = rng.random() * valid.seconds
     done = campaign.runner.run(*words, stop=[int(SIGNALS[name]), after])
-    faults = _judged_stop(done.status, name, done.after_stop, done.err, verb)
+    faults = _judged_stop(done.status, name, done.after_stop, done.err)
     said = done.err.strip()[-1500:]
     again = list(words)
     # A fit that saved its field says how it goes on.
@@ -74,7 +74,7 @@ def stopped(campaign: Campaign, verb: str, seed: int) -> Trial:
     return Trial(f"stop-{verb}", seed, mutation, shown, done.status, tuple(faults), said)
 
 
-def _judged_stop(status: int, name: str, seconds: float | None, err: str, verb: str) -> list[str]:
+def _judged_stop(status: int, name: str, seconds: float | None, err: str) -> list[str]:
     """Return what is wrong with the end of a verb that got a signal."""
     if seconds is None:  # it ended before
         return []
