@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from climatenerf.ops import marching, reference
-from climatenerf.ops.limits import MAX_STEPS
+from climatenerf.ops.step_limits import MAX_STEPS
 
 RAYS = 64
 HOSTILE = (float("nan"), float("inf"), 1e38, -1e38, 1e30, 1e12, 1e7, 1e-38)
