@@ -13,7 +13,7 @@ from tools.torture_parts.zygote import Outcome
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 FIRST_SEED = 1000
-"""Of the quick trials; the longer campaign begins at twice that."""
+"""Seed of the quick trials; that of the longer campaign is twice as large."""
 QUICK = ["transforms", "colmap-binary", "weather", "camera-path", "run-scene", "field"]
 REGRESSIONS = ("two-fit:0",)  # two fits into one folder, before run folders were locked
 

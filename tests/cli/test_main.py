@@ -224,7 +224,7 @@ def test_unexpected_exceptions_are_one_line_to_report(verb, capsys, monkeypatch)
 
 
 def test_an_exception_that_follows_a_signal_is_the_interruption(verb, capsys):
-    """As where a library reports a signal by an exception of its own."""
+    """Some libraries report a signal by their own exception."""
 
     def run(options):
         try:

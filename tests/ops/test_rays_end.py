@@ -1,4 +1,4 @@
-"""Every ray ends, whatever numbers it holds: these tests end, or the kernels do not."""
+"""Marching ends for all numbers that a ray can hold; otherwise these tests would hang."""
 
 import numpy as np
 import pytest

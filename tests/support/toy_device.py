@@ -16,7 +16,7 @@ from climatenerf.ops import dispatch
 _setup_privateuseone_for_python_backend("toy")
 TOY = torch.device("toy:0")
 TRANSFERS = {torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default}
-"""Operations that may mix tensors of both devices."""
+"""Operations that may have tensors of both devices."""
 
 
 class Toy(torch.Tensor):

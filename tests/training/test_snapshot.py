@@ -1,4 +1,4 @@
-"""Checkpoints are read and replaced as one, whatever stops the writer."""
+"""Checkpoints are read and replaced atomically, also if the writer is stopped."""
 
 import contextlib
 import os
