@@ -4,7 +4,7 @@ python benchmarks/check_capture.py
 python benchmarks/check_capture.py --photos 100 1000 --points 20000
 
 Captures are made from the photos of the embedded street: COLMAP models with as many photos as
-asked for, each with a label, a mask and the points that it shows; and the same as transforms.json
+requested, each with a label, a mask and the points that it shows; and the same as transforms.json
 without points, whose photos are matched.
 """
 

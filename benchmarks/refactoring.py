@@ -128,7 +128,7 @@ def compare(
 
 
 def main() -> None:
-    """Measure the parts asked for and print the comparison."""
+    """Measure the requested parts and print the comparison."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

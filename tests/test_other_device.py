@@ -1,6 +1,6 @@
-"""Fits and frames on another device than the CPU: a toy one that computes as the CPU does.
+"""Fits and renders on a device other than the CPU, simulated by `support.toy_device`.
 
-A tensor that is created on the CPU by mistake raises an error where it meets one of the toy device.
+It computes as the CPU does, and raises an error if an operation mixes its tensors with CPU tensors.
 """
 
 import contextlib
@@ -39,65 +39,56 @@ WEATHER = {
     "snow": {"depth": "10 cm"},
     "sun": {"elevation": "40 deg"},
 }
-
-
 DEVICES = {"cpu": (CPU, contextlib.nullcontext), "toy": (TOY, kernels_for_toys)}
 
 
-def nothing(*_):
-    pass
+def ignore(*_):
+    """A progress callback that does nothing."""
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """A run of each device, both stopped and resumed."""
+    """A scene and a folder with one run per device, each interrupted and resumed."""
     folder = tmp_path_factory.mktemp("runs")
     scene = make_scene(folder)
     for name, (device, kernels) in DEVICES.items():
         with kernels():
-            # Few: sooner or later a rounding decides whether a ray has one sample more, and
-            # Adam, whose steps know no size of gradients, makes another fit of it.
+            # Few steps: in a longer fit, rounding changes the sample count of some ray, and Adam,
+            # whose step size is independent of the gradient's, amplifies the difference.
             for steps in (12, 24):
-                chosen = {"size": TINY, "minutes": None, "samples_per_step": 2**12}
-                settings = FitSettings(steps=steps, refine_poses=True, **chosen)
-                fit_scene(
-                    scene,
-                    folder / name,
-                    settings,
-                    1,
-                    steps > 12,
-                    lambda _: None,
-                    lambda *_: None,
-                    device,
+                settings = FitSettings(
+                    size=TINY, minutes=None, steps=steps, samples_per_step=2**12, refine_poses=True
                 )
+                resume = steps > 12
+                fit_scene(scene, folder / name, settings, 1, resume, ignore, ignore, device)
     return scene, folder
 
 
-def test_the_toy_device_refuses_to_meet_the_cpu():
-    there = torch.arange(3, device=TOY)
-    assert there.device == TOY and (there + 1).cpu().tolist() == [1, 2, 3]
-    with pytest.raises(RuntimeError, match="of the CPU"):
-        there + torch.ones(3)
+def test_mixing_toy_and_cpu_tensors_raises_an_error():
+    tensor = torch.arange(3, device=TOY)
+    assert tensor.device == TOY and (tensor + 1).cpu().tolist() == [1, 2, 3]
+    with pytest.raises(RuntimeError, match="on the CPU"):
+        tensor + torch.ones(3)
 
 
 @pytest.mark.slow
-def test_a_fit_is_the_same_on_both(runs):
+def test_fits_on_both_devices_are_equal(runs):
     _, folder = runs
-    ours, theirs = load_field(folder / "cpu"), load_field(folder / "toy")
-    for (name, a), b in zip(ours.state_dict().items(), theirs.state_dict().values(), strict=True):
-        # Activations round otherwise there.
-        alike = torch.isclose(a.float(), b.float(), rtol=1e-3, atol=1e-4).float().mean()
-        assert alike > 0.99, (name, alike)
-    found = [read_json(folder / name / "metrics.json")["psnr"] for name in ("cpu", "toy")]
-    assert abs(found[0] - found[1]) < 0.005, found
+    on_cpu, on_toy = (load_field(folder / name).state_dict() for name in DEVICES)
+    for (name, a), b in zip(on_cpu.items(), on_toy.values(), strict=True):
+        # Activations round differently on the toy device.
+        close = torch.isclose(a.float(), b.float(), rtol=1e-3, atol=1e-4).float().mean()
+        assert close > 0.99, (name, close)
+    psnr = [read_json(folder / name / "metrics.json")["psnr"] for name in DEVICES]
+    assert abs(psnr[0] - psnr[1]) < 0.005, psnr
 
 
 @pytest.mark.slow
-def test_a_step_with_every_loss_stays_on_its_device(runs):
-    """Sky, ground, points, relative depth, moving cameras, normals that move matter."""
+def test_steps_with_every_loss_stay_on_the_device(runs):
+    """Sky, ground, points, relative depth, pose refinement, and normals that shape the density."""
     scene, _ = runs
-    place = np.random.default_rng(0).uniform(-2, 2, (200, 2))
-    points = np.concatenate([place, np.zeros((200, 1))], axis=1)
+    positions = np.random.default_rng(0).uniform(-2, 2, (200, 2))
+    points = np.concatenate([positions, np.zeros((200, 1))], axis=1)
     views = [replace(view, seen=np.arange(200)) for view in scene.views]
     scene = replace(scene, views=tuple(views), points=points)
     with kernels_for_toys():
@@ -121,30 +112,29 @@ def test_a_step_with_every_loss_stays_on_its_device(runs):
         extent = find_extent(poses, None)
         trainer = make_trainer(pixels, extent, settings, read_sparse_depth(scene, TOY))
         assert trainer.evidence.knows_sky and trainer.evidence.free_space.ground is not None
-        trainer.run(nothing)
-        assert trainer.field.embeddings.device == TOY and trainer.poses.shift.device == TOY
+        trainer.run(ignore)
+        assert trainer.field.embeddings.device == TOY and trainer.poses.translation.device == TOY
 
 
-def test_photos_are_matched_alike_on_both():
-    """And what is nearer to cameras than the points so found is the same."""
-    grey, found, empty = pattern(), [], []
+def test_stereo_depth_and_free_space_are_equal_on_both_devices():
+    grey, depths, empty = pattern(), [], []
     for device, kernels in DEVICES.values():
         with kernels():
             pixels = photos(DISTORTED, lambda i, t, x: grey(x), device=device)
             matched = plane_sweep_depth(pixels, None, (1.5, 4.0), 0)
             assert matched is not None
             field = Field(TINY, 5, np.array([0.0, 3.0, 0.0]), 3.0, 0.1).to(device)
-            carving = FreeSpace(field, pixels, matched, FitSettings())
-            place = matched.rays_o + 0.3 * matched.depth[:, None] * matched.rays_d
-            before = carving.too_near_camera(place, torch.full_like(matched.depth, 0.01))
-            found.append(to_numpy(matched.depth))
-            empty.append(to_numpy(before))
-    assert len(found[0]) > 300 and np.array_equal(*found)
+            free_space = FreeSpace(field, pixels, matched, FitSettings())
+            positions = matched.rays_o + 0.3 * matched.depth[:, None] * matched.rays_d
+            radius = torch.full_like(matched.depth, 0.01)
+            depths.append(to_numpy(matched.depth))
+            empty.append(to_numpy(free_space.too_near_camera(positions, radius)))
+    assert len(depths[0]) > 300 and np.array_equal(*depths)
     assert empty[0].any() and np.array_equal(*empty)
 
 
 @pytest.mark.slow
-def test_a_frame_in_all_weathers_is_the_same_on_both(runs):
+def test_frames_with_all_weather_are_equal_on_both_devices(runs):
     scene, folder = runs
     pose = scene.c2w_world(scene.views[0])
     frames = []
@@ -157,38 +147,38 @@ def test_a_frame_in_all_weathers_is_the_same_on_both(runs):
             small = CAMERA.resized(16, 12)
             options = FrameOptions(2, normals=True, labels=True)
             frames.append(render_frame(session.world(0.0), small, pose, options))
-    (ours, layers), (theirs, others) = frames
-    assert ours.std() > 5 and np.array_equal(ours, theirs)
-    assert {"mask_water", "mask_snow", "mask_smog", "normal"} <= set(layers)
-    for name, values in layers.items():
-        assert np.array_equal(values, others[name], equal_nan=True), name
+    (on_cpu, cpu_layers), (on_toy, toy_layers) = frames
+    assert on_cpu.std() > 5 and np.array_equal(on_cpu, on_toy)
+    assert {"mask_water", "mask_snow", "mask_smog", "normal"} <= set(cpu_layers)
+    for name, values in cpu_layers.items():
+        assert np.array_equal(values, toy_layers[name], equal_nan=True), name
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_refused(tmp_path, capsys):
-    for words in (["fit", "capture", "-o", "run"], ["render", "run", "-o", "out"]):
-        assert cli.main([*words, "--device", "cuda"]) == 2
-        said = capsys.readouterr().err
-        assert "NVIDIA GPU" in said and "Traceback" not in said
+def test_device_cuda_without_a_gpu_is_an_error(tmp_path, capsys):
+    for args in (["fit", "capture", "-o", "run"], ["render", "run", "-o", "out"]):
+        assert cli.main([*args, "--device", "cuda"]) == 2
+        message = capsys.readouterr().err
+        assert "NVIDIA GPU" in message and "Traceback" not in message
     with pytest.raises(UserError, match="NVIDIA GPU"):
         load_run(tmp_path, device="cuda")
 
 
-def test_what_a_gpu_needs_beside_it_is_asked_for(monkeypatch, tmp_path):
+def test_errors_name_what_triton_lacks(monkeypatch, tmp_path):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("importlib.metadata.version", lambda name: "3.4.0+git")
     monkeypatch.delenv("CC", raising=False)
-    there = {"clang": "/usr/bin/clang", "/usr/bin/clang": "/usr/bin/clang"}
-    monkeypatch.setattr("shutil.which", there.get)
+    compilers = {"clang": "/usr/bin/clang", "/usr/bin/clang": "/usr/bin/clang"}
+    monkeypatch.setattr("shutil.which", compilers.get)
     monkeypatch.setattr("sysconfig.get_path", lambda name: str(tmp_path))
     with pytest.raises(UserError, match="Python's headers"):
         check_triton()
     (tmp_path / "Python.h").touch()
     check_triton()
-    monkeypatch.setenv("CC", "not-there")
+    monkeypatch.setenv("CC", "missing-compiler")
     with pytest.raises(UserError, match="C compiler"):
         check_triton()
     for version in ("3.3.1", "2.9", "0"):
-        monkeypatch.setattr("importlib.metadata.version", lambda name, own=version: own)
+        monkeypatch.setattr("importlib.metadata.version", lambda name, version=version: version)
         with pytest.raises(UserError, match=r"needs Triton 3\.4"):
             resolve_device("cuda")

@@ -13,7 +13,7 @@ from tools.torture_parts.zygote import Outcome
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 FIRST_SEED = 1000
-"""Of the quick trials; the longer campaign begins at twice that."""
+"""Seed of the quick trials; that of the longer campaign is twice as large."""
 QUICK = ["transforms", "colmap-binary", "weather", "camera-path", "run-scene", "field"]
 REGRESSIONS = ("two-fit:0",)  # two fits into one folder, before run folders were locked
 
@@ -24,7 +24,7 @@ def passed(found):
 
 
 def test_some_mutations_of_quick_kinds(tmp_path):
-    """The others begin with fits, and are tried by the slow test."""
+    """The other kinds begin with fits, so only the slow test covers them."""
     options = {"seconds": 600.0, "trials": 2 * len(QUICK), "first_seed": FIRST_SEED}
     counts = passed(torture.campaign(tmp_path, only=QUICK, **options))
     assert {kind: row["trials"] for kind, row in counts.items()} == dict.fromkeys(QUICK, 2)
@@ -32,7 +32,7 @@ def test_some_mutations_of_quick_kinds(tmp_path):
 
 @pytest.mark.slow
 def test_many_mutations_and_full_disks(tmp_path):
-    """Kills at random moments have tests of their own, beside what they interrupt."""
+    """Kills at random moments are tested next to the code that they interrupt."""
     others = ["disk-export", "disk-fit", "disk-render", "two-fit", "two-render"]
     options = {"seconds": 240, "first_seed": 2 * FIRST_SEED, "only": [*trials.KINDS, *others]}
     counts = passed(torture.campaign(tmp_path, **options))
@@ -40,7 +40,7 @@ def test_many_mutations_and_full_disks(tmp_path):
 
 
 @pytest.mark.slow
-def test_trials_that_once_failed(tmp_path):
+def test_trials_that_failed_earlier_pass(tmp_path):
     passed(torture.campaign(tmp_path, replay=REGRESSIONS))
 
 
@@ -65,7 +65,7 @@ def ended(status=0, err="", seconds=1.0, peak=100_000_000, hung=False):
 
 
 @pytest.mark.parametrize(
-    ("done", "words"),
+    ("done", "messages"),
     [
         (ended(1, "climatenerf: internal error\n"), ["status 1", "internal error"]),
         (ended(-9, hung=True), ["hangs"]),
@@ -77,18 +77,18 @@ def ended(status=0, err="", seconds=1.0, peak=100_000_000, hung=False):
         (ended(peak=10**9), ["1000 MB instead of 100"]),
     ],
 )
-def test_the_judge_refuses(done, words):
-    faults = "; ".join(trials.judged(done, ended()))
-    assert all(word in faults for word in words), faults
+def test_faults_of_an_outcome_are_found(done, messages):
+    faults = "; ".join(trials.outcome_faults(done, ended()))
+    assert all(message in faults for message in messages), faults
 
 
-def test_the_judge_accepts():
-    assert trials.judged(ended(), ended()) == []
-    assert trials.judged(ended(2, "warning: so\nclimatenerf: no photos; take some\n")) == []
+def test_sound_outcomes_have_no_faults():
+    assert trials.outcome_faults(ended(), ended()) == []
+    assert trials.outcome_faults(ended(2, "warning: so\nclimatenerf: no photos; take some\n")) == []
 
 
-def test_the_judge_sees_nan(tmp_path):
+def test_nan_in_output_files_is_a_fault(tmp_path):
     (tmp_path / "a.json").write_text('{"x": NaN}')
     np.savez(tmp_path / "b.npz", depth=np.array([1.0, np.nan]))
     np.savez(tmp_path / "c.npz", depth=np.array([1.0, np.inf]))
-    assert trials.unsound(tmp_path) == ["a.json holds NaN", "b.npz holds NaN"]
+    assert trials.nan_faults(tmp_path) == ["a.json holds NaN", "b.npz holds NaN"]

@@ -1,4 +1,4 @@
-"""The wheel holds the whole package and starts in an environment that holds nothing else."""
+"""The wheel contains the whole package and starts in an otherwise empty environment."""
 
 import shutil
 import subprocess

@@ -77,9 +77,9 @@ def campaign(
     skipped: dict[str, str] = {}
     (folder / "a").mkdir()
     with Runner(folder / "a") as runner:
-        state = Campaign(folder / "nest", folder / "a", runner)
-        state.nest.mkdir()
-        inputs.build(state.nest, runner)
+        state = Campaign(folder / "originals", folder / "a", runner)
+        state.originals.mkdir()
+        inputs.build(state.originals, runner)
         if replay:
             pairs = [name.rpartition(":")[::2] for name in replay]
             for kind, seed in pairs:
@@ -107,7 +107,7 @@ def campaign(
 
 
 def _disturbances() -> dict[str, Callable[[Campaign, int, Path], Trial | str]]:
-    """Return what runs each kind of trial that is no mutation."""
+    """Return the functions that run trials other than mutations, by kind."""
     found: dict[str, Callable[[Campaign, int, Path], Trial | str]] = {}
     for verb in STOPPED:
         found[f"stop-{verb}"] = lambda state, seed, _, verb=verb: stops.stopped(state, verb, seed)
@@ -144,7 +144,7 @@ def _kept(result: Trial | str, kind: str, skipped: dict[str, str]) -> list[Trial
 
 
 def _noted(trial: Trial) -> Trial:
-    """Print a line on standard error: a campaign that is stopped has shown what it found."""
+    """Print the result on standard error at once, in case the campaign is stopped."""
     verdict = "; ".join(trial.faults) or "passes"
     line = f"{trial.name} [{trial.mutation}] status {trial.status}: {verdict}"
     print(ascii(line), file=sys.stderr, flush=True)

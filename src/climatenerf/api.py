@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.limits import check_seed
+from climatenerf.core.input_limits import check_seed
 from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, read_weather
 from climatenerf.weather.effect import Effect

@@ -17,7 +17,7 @@ FAULTS = ROOT.parent / "shared" / "faults"
 
 @pytest.fixture
 def capture(tmp_path):
-    """A folder with transforms.json, and a function that writes it anew with changes."""
+    """A folder with transforms.json, and a function that rewrites it with changes."""
     scene = textured_scene(tmp_path / "images", 12, seen=False)
     write_points(tmp_path / "points.ply", scene.points)
 
@@ -48,7 +48,7 @@ def test_a_consistent_capture_has_no_findings(capture, capsys):
     assert status == 0 and report["findings"] == []
     assert report["used"]["photos"] == 12 and report["used"]["sparse points"] > 1000
     assert main(["check", str(capture())]) == 0
-    assert "Nothing is odd." in capsys.readouterr().out
+    assert "No problems found." in capsys.readouterr().out
 
 
 def test_findings_have_code_severity_file_message_and_remedy(capture, capsys):
@@ -59,7 +59,7 @@ def test_findings_have_code_severity_file_message_and_remedy(capture, capsys):
     assert finding["severity"] == "warning" and finding["message"].endswith(".")
 
 
-def test_named_data_that_is_absent_or_not_read_is_told(capture, capsys):
+def test_named_data_that_is_absent_or_not_read_is_reported(capture, capsys):
     folder = capture(ply_file_path="other.ply", semantics_path="images/000.png", k5=0.2)
     _, report = checked(folder, capsys)
     messages = {each["code"]: each["message"] for each in report["findings"]}
@@ -75,7 +75,7 @@ def test_an_unusable_capture_has_status_2_and_one_sentence(tmp_path, capsys):
     assert status == 2 and [each["code"] for each in report["findings"]] == ["unreadable"]
 
 
-def test_fit_export_and_scene_file_tell_the_same(capture, tmp_path, capsys):
+def test_export_warns_and_its_output_has_no_findings(capture, tmp_path, capsys):
     folder = capture(lambda pose: pose @ OPENGL)
     assert main(["export", str(folder), "-o", str(tmp_path / "out")]) == 0
     assert "OpenGL's camera axes" in capsys.readouterr().err
@@ -85,7 +85,7 @@ def test_fit_export_and_scene_file_tell_the_same(capture, tmp_path, capsys):
         shutil.copy(path, tmp_path / "out" / "images")
     assert len(again["frames"]) == 12
     assert main(["check", str(tmp_path / "out")]) == 0
-    assert "Nothing is odd." in capsys.readouterr().out
+    assert "No problems found." in capsys.readouterr().out
 
 
 def test_the_guide_lists_every_code():
@@ -110,7 +110,7 @@ def test_the_guide_lists_every_code():
         ("13-sky-65535/scene", ["depth-disagrees", "depth-saturated"]),
     ],
 )
-def test_situations_from_public_reports(folder, codes, capsys):
+def test_captures_from_public_reports_have_the_expected_findings(folder, codes, capsys):
     status, report = checked(FAULTS / folder, capsys)
     found = sorted(each["code"] for each in report["findings"])
     assert status == 0 and found == codes

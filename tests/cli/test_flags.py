@@ -9,7 +9,7 @@ RENDER = ("render", "run", "-o", "out")
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("args", "expected"),
     [
         (
             (*RENDER, "--flood.level", "3 kg"),
@@ -22,17 +22,17 @@ RENDER = ("render", "run", "-o", "out")
         ((*RENDER, "--size"), "missing value for argument '--size'"),
     ],
 )  # fmt: skip
-def test_a_wrong_flag_is_one_sentence_with_status_2(words, expected, capsys):
-    found = error_message(capsys, *words)
+def test_a_wrong_flag_is_one_sentence_with_status_2(args, expected, capsys):
+    found = error_message(capsys, *args)
     assert expected in found and "None" not in found
     assert "\n" not in found
 
 
 def test_boxes_of_utf_8_and_of_ascii_give_the_same_sentence():
-    words = [sys.executable, "-m", "climatenerf", "fit", "a", "--preset", "x"]
+    args = [sys.executable, "-m", "climatenerf", "fit", "a", "--preset", "x"]
     for encoding in ("utf-8", "ascii"):
         environment = {**os.environ, "PYTHONIOENCODING": encoding}
-        done = subprocess.run(words, capture_output=True, text=True, env=environment)
+        done = subprocess.run(args, capture_output=True, text=True, env=environment)
         assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
         assert done.stderr.startswith("climatenerf: invalid choice 'x'")
 

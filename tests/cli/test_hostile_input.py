@@ -49,7 +49,7 @@ def weather(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "expected"),
     [
         (lambda d: d.update(scale_report=[]), "scale_report in .* should be a table"),
         (lambda d: d.update(scale_report={"gps": 3}), "gps in scale_report"),
@@ -74,12 +74,12 @@ def weather(tmp_path, text):
         (lambda d: d.update(ground_z=1e300), "ground_z in"),
     ],
 )
-def test_scene_files_of_other_types_and_sizes(street, tmp_path, capsys, change, words):
+def test_scene_files_of_other_types_and_sizes(street, tmp_path, capsys, change, expected):
     edited(street / "scene.json", change)
-    said = error_message(capsys, "export", street, "-o", tmp_path / "out")
+    message = error_message(capsys, "export", street, "-o", tmp_path / "out")
     import re
 
-    assert re.search(words, said), said
+    assert re.search(expected, message), message
 
 
 def test_names_that_no_disk_can_hold(capture, tmp_path, capsys):
@@ -93,10 +93,10 @@ def test_names_that_no_disk_can_hold(capture, tmp_path, capsys):
     assert run_cli("export", capture, "-o", tmp_path / "out") == 0
     exported = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert len(exported["frames"]) == 4, "images that are not on disk are left out"
-    said = error_message(capsys, "export", capture, "-o", tmp_path / ("n" * 300))
-    assert "longer than the disk allows" in said
-    said = error_message(capsys, "export", tmp_path / ("n" * 300), "-o", tmp_path / "other")
-    assert "longer than the disk allows" in said
+    message = error_message(capsys, "export", capture, "-o", tmp_path / ("n" * 300))
+    assert "longer than the disk allows" in message
+    message = error_message(capsys, "export", tmp_path / ("n" * 300), "-o", tmp_path / "other")
+    assert "longer than the disk allows" in message
 
 
 def test_photo_names_that_are_not_utf8_are_exported(capture, tmp_path):
@@ -126,8 +126,8 @@ def test_photo_names_that_are_not_utf8_are_exported(capture, tmp_path):
 )  # fmt: skip
 def test_weather_files(tmp_path, capsys, text):
     path = weather(tmp_path, text)
-    said = error_message(capsys, "render", tmp_path, "-o", tmp_path / "out", "--weather", path)
-    assert "weather.toml" in said and len(said) < 600
+    message = error_message(capsys, "render", tmp_path, "-o", tmp_path / "out", "--weather", path)
+    assert "weather.toml" in message and len(message) < 600
 
 
 @pytest.mark.parametrize("text", ["9" * 400, "nan, 1", '"x", 1', "true, 1"])
@@ -139,7 +139,7 @@ def test_marks(tmp_path, capsys, text):
 
 
 @pytest.mark.parametrize(
-    ("flags", "words"),
+    ("flags", "expected"),
     [
         (["--camera-height", "1e300 m"], "at most 100000 m"),
         (["--camera-height", "1e-320 m"], "scale|32 bits|above 0"),
@@ -150,15 +150,15 @@ def test_marks(tmp_path, capsys, text):
         (["--downscale", str(10**30)], "downscaled|downscale"),
     ],
 )
-def test_flags_of_fit(tmp_path, capsys, flags, words):
+def test_flags_of_fit(tmp_path, capsys, flags, expected):
     import re
 
-    said = error_message(capsys, "fit", STREET, "-o", tmp_path / "out", *flags)
-    assert re.search(words, said), said
+    message = error_message(capsys, "fit", STREET, "-o", tmp_path / "out", *flags)
+    assert re.search(expected, message), message
 
 
 @pytest.mark.parametrize(
-    ("flags", "words"),
+    ("flags", "expected"),
     [
         (["--frames", str(10**21)], "--frames"),
         (["--frames", str(10**9)], "--frames"),
@@ -171,9 +171,9 @@ def test_flags_of_fit(tmp_path, capsys, flags, words):
         (["--path", "n" * 300 + ".json"], "longer than the disk allows"),
     ],
 )
-def test_flags_of_render(run_folder, tmp_path, capsys, flags, words):
-    said = error_message(capsys, "render", run_folder, "-o", tmp_path / "out", *flags)
-    assert words in said and len(said) < 1500 and not (tmp_path / "out").exists()
+def test_flags_of_render(run_folder, tmp_path, capsys, flags, expected):
+    message = error_message(capsys, "render", run_folder, "-o", tmp_path / "out", *flags)
+    assert expected in message and len(message) < 1500 and not (tmp_path / "out").exists()
 
 
 PATH = {
@@ -203,8 +203,8 @@ def test_camera_paths(run_folder, tmp_path, capsys, change):
     text = json.dumps({**PATH, **change}) if change.get("camera_path") != 10**399 else ""
     path.write_text(text or f'{{"camera_path": {"9" * 400}}}')
     out = tmp_path / "out"
-    said = error_message(capsys, "render", run_folder, "-o", out, "--path", path)
-    assert "camera path" in said and len(said) < 500 and not out.exists()
+    message = error_message(capsys, "render", run_folder, "-o", out, "--path", path)
+    assert "camera path" in message and len(message) < 500 and not out.exists()
 
 
 @pytest.mark.parametrize("scale", ["NaN", "1e-320", "0", "-1", "1e300", "null", '"1"', "[]"])
@@ -213,8 +213,8 @@ def test_scales_of_nerfstudio(run_folder, tmp_path, capsys, scale):
     transform = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]"
     text = f'{{"transform": {transform}, "scale": {scale}}}'
     (tmp_path / "dataparser_transforms.json").write_text(text)
-    words = ["render", run_folder, "-o", tmp_path / "out", "--path", tmp_path / "camera_path.json"]
-    assert "scale in" in error_message(capsys, *words)
+    args = ["render", run_folder, "-o", tmp_path / "out", "--path", tmp_path / "camera_path.json"]
+    assert "scale in" in error_message(capsys, *args)
 
 
 @pytest.mark.parametrize("verb", ["render", "fit"])
@@ -222,11 +222,11 @@ def test_settings_of_another_type(run_folder, tmp_path, capsys, verb):
     run = tmp_path / "run"
     shutil.copytree(run_folder, run)
     edited(run / "config.json", lambda d: d.update(settings=5))
-    words = {
+    args = {
         "render": ["render", run, "-o", tmp_path / "out"],
         "fit": ["fit", STREET, "-o", run, "--resume", "--downscale", "6"],
     }
-    assert "settings in" in error_message(capsys, *words[verb])
+    assert "settings in" in error_message(capsys, *args[verb])
 
 
 def test_arrays_that_claim_terabytes(capture, tmp_path, capsys):
@@ -235,15 +235,15 @@ def test_arrays_that_claim_terabytes(capture, tmp_path, capsys):
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }"
     packed = header.ljust(117) + b"\n"
     depth.write_bytes(b"\x93NUMPY\x01\x00\x76\x00" + packed + bytes(12))
-    said = error_message(capsys, "fit", capture, "-o", tmp_path / "run", "--steps", "1")
-    assert "001.npy cannot be read (its header claims" in said
+    message = error_message(capsys, "fit", capture, "-o", tmp_path / "run", "--steps", "1")
+    assert "001.npy cannot be read (its header claims" in message
 
 
 def test_pictures_that_take_too_much_memory(capture, tmp_path, capsys):
     big = capture / "images" / "000.png"
     Image.new("1", (24_000, 20_000)).save(big)
-    said = error_message(capsys, "export", capture, "-o", tmp_path / "out")
-    assert "000.png has 24000x20000 pixels, above the limit of 400 megapixels" in said
+    message = error_message(capsys, "export", capture, "-o", tmp_path / "out")
+    assert "000.png has 24000x20000 pixels, above the limit of 400 megapixels" in message
 
 
 def test_more_frames_than_can_be_read(capture, tmp_path, capsys):
@@ -258,27 +258,27 @@ def test_poses_that_32_bits_cannot_hold(capture, tmp_path, capsys):
         capture / "transforms.json",
         lambda d: d["frames"][0]["transform_matrix"][0].__setitem__(3, 1e10),
     )
-    said = error_message(capsys, "export", capture, "-o", tmp_path / "out")
-    assert "units from the origin" in said and "32 bits" in said
+    message = error_message(capsys, "export", capture, "-o", tmp_path / "out")
+    assert "units from the origin" in message and "32 bits" in message
 
 
-def program(*words, cwd=None, environment=(), **streams):
-    """Start the command line as a process of its own."""
+def program(*args, cwd=None, environment=(), **streams):
+    """Run the command line in a new process."""
     return subprocess.run(
-        [sys.executable, "-m", "climatenerf", *map(str, words)],
+        [sys.executable, "-m", "climatenerf", *map(str, args)],
         cwd=cwd, env={**os.environ, **dict(environment)}, text=True, timeout=120, **streams,
     )  # fmt: skip
 
 
-def shell(command, *words):
+def shell(command, *args):
     """Run `command`, in which "$@" is the command line, in a shell."""
-    words = [sys.executable, "-m", "climatenerf", *map(str, words)]
+    args = [sys.executable, "-m", "climatenerf", *map(str, args)]
     return subprocess.run(
-        ["sh", "-c", command, "sh", *words], capture_output=True, text=True, timeout=120
+        ["sh", "-c", command, "sh", *args], capture_output=True, text=True, timeout=120
     )
 
 
-def test_a_closed_standard_output_is_reported_and_ends_nothing(capture, tmp_path):
+def test_a_closed_standard_output_is_only_a_warning(capture, tmp_path):
     done = shell('"$@" >&-', "export", capture, "-o", tmp_path / "out")
     assert done.returncode == 0 and (tmp_path / "out" / "transforms.json").exists()
     assert "standard output is closed" in done.stderr and "Error" not in done.stderr
@@ -305,7 +305,7 @@ def test_ascii_output_with_another_path(capture, tmp_path):
     assert r"Stra\xdfe \u96ea" in done.stdout and out.is_dir()
 
 
-def test_a_working_folder_that_is_gone(tmp_path):
+def test_a_removed_working_folder_is_a_user_error(tmp_path):
     gone = tmp_path / "gone"
     gone.mkdir()
     command = f'cd "{gone}" && rmdir "{gone}" && "$@"'

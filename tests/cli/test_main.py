@@ -56,10 +56,10 @@ def test_help_lists_every_verb_and_does_not_import_torch():
 
 
 @pytest.mark.parametrize("verb", cli.VERBS)
-@pytest.mark.parametrize("words", [("-o", ""), ("--out", " "), ("--out=",), ("-o", "", "--seed")])
-def test_an_empty_output_folder_is_refused(tmp_path, monkeypatch, capsys, verb, words):
+@pytest.mark.parametrize("args", [("-o", ""), ("--out", " "), ("--out=",), ("-o", "", "--seed")])
+def test_an_empty_output_folder_is_refused(tmp_path, monkeypatch, capsys, verb, args):
     monkeypatch.chdir(tmp_path)
-    assert cli.main([verb, *(() if verb == "demo" else ("in",)), *words]) == 2
+    assert cli.main([verb, *(() if verb == "demo" else ("in",)), *args]) == 2
     err = capsys.readouterr().err
     assert err == (
         "climatenerf: -o is empty; name the folder to write into, or give . for the working"
@@ -224,7 +224,7 @@ def test_unexpected_exceptions_are_one_line_to_report(verb, capsys, monkeypatch)
 
 
 def test_an_exception_that_follows_a_signal_is_the_interruption(verb, capsys):
-    """As where a library reports a signal by an exception of its own."""
+    """Some libraries report a signal by their own exception."""
 
     def run(options):
         try:

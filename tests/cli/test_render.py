@@ -62,7 +62,7 @@ def test_a_render_overwrites_no_foreign_file(run_folder, tmp_path, capsys, name)
 
 
 def test_a_preview_changes_no_frame_and_is_removed(run_folder, tmp_path):
-    """Also a preview that a killed render left."""
+    """A preview of a killed render is removed, too."""
     (tmp_path / "early").mkdir()
     left_over = tmp_path / "early" / "preview.png"
     write_png(left_over, np.zeros((2, 2, 3), np.uint8), "killed")

@@ -47,7 +47,7 @@ def test_arrays_are_read(tmp_path):
         header("('x', 4)") + bytes(96),
     ],
 )
-def test_headers_that_claim_what_is_not_there_are_refused(tmp_path, data, monkeypatch):
+def test_headers_that_contradict_the_content_are_refused(tmp_path, data, monkeypatch):
     path = tmp_path / "a.npy"
     path.write_bytes(data)
     monkeypatch.setattr(np, "load", None)  # nothing is read
@@ -58,7 +58,7 @@ def test_headers_that_claim_what_is_not_there_are_refused(tmp_path, data, monkey
         arrays.read_npz(packed)
 
 
-def test_archives_that_unpack_to_too_much_are_refused(tmp_path, monkeypatch):
+def test_archives_above_the_size_limit_are_refused(tmp_path, monkeypatch):
     body = header("(2000000, 1)") + bytes(16_000_000)
     path = zipped(tmp_path / "bomb.npz", ("depth.npy", body))
     assert path.stat().st_size < 100_000

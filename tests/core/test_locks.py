@@ -12,20 +12,24 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.locks import LOCK, only_writer
 
 
-def test_a_second_writer_is_refused_until_the_first_one_is_dead(tmp_path):
+def test_a_second_writer_is_refused_until_the_first_one_exits(tmp_path):
     folder = tmp_path / "run"
     with holder(folder) as process:
         refused = pytest.raises(UserError, match=f"another process is writing into {folder}; wait")
         with refused, only_writer(folder):
             pytest.fail("two writers")
-        assert [p for p in folder.iterdir() if storage.is_temporary(p.name)], "its file stays"
+        assert [p for p in folder.iterdir() if storage.is_temporary(p.name)], (
+            "a temporary file of the first writer"
+        )
         process.kill()
         process.join()
         with only_writer(folder):
-            assert [p.name for p in folder.iterdir()] == [LOCK], "nothing of the dead one is left"
+            assert [p.name for p in folder.iterdir()] == [LOCK], (
+                "files of the dead process are removed"
+            )
 
 
-def test_a_lock_is_for_one_thread_which_may_take_it_again(tmp_path):
+def test_a_lock_is_reentrant_within_one_thread_only(tmp_path):
     refused = []
 
     def other():
@@ -47,7 +51,7 @@ def test_a_lock_is_for_one_thread_which_may_take_it_again(tmp_path):
 
 
 @pytest.mark.parametrize("filled", [False, True])
-def test_a_folder_in_which_nothing_was_written_does_not_stay(tmp_path, filled):
+def test_a_new_folder_is_removed_if_nothing_was_written(tmp_path, filled):
     with pytest.raises(UserError), only_writer(tmp_path / "new"):
         if filled:
             (tmp_path / "new" / "file").write_text("")

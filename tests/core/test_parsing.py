@@ -8,7 +8,7 @@ import pytest
 from climatenerf.core import parsing
 from climatenerf.core.errors import MAX_LINE, UserError, one_line, shown
 
-PLACE = "scene.json"
+SOURCE = "scene.json"
 
 
 def written(tmp_path, text, name="a.json"):
@@ -18,7 +18,7 @@ def written(tmp_path, text, name="a.json"):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("[" * 20_000, "nested too deeply"),
         ('{"a":' * 20_000, "nested too deeply"),
@@ -32,8 +32,8 @@ def written(tmp_path, text, name="a.json"):
         ('{"a": 1}'.encode("utf-16"), "encoding"),
     ],
 )
-def test_json_that_is_refused(tmp_path, text, words):
-    with pytest.raises(UserError, match=words) as caught:
+def test_invalid_json_is_refused(tmp_path, text, message):
+    with pytest.raises(UserError, match=message) as caught:
         parsing.read_json(written(tmp_path, text), "scene")
     assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
 
@@ -54,7 +54,7 @@ def test_too_many_values_are_refused_before_they_are_parsed(tmp_path, monkeypatc
         parsing.read_json(written(tmp_path, json.dumps({"a": [0] * 2000})))
 
 
-def test_no_more_than_the_greatest_size_is_read(tmp_path):
+def test_reading_stops_at_the_size_limit(tmp_path):
     path = written(tmp_path, "x" * 101)
     with pytest.raises(UserError, match="has more than"):
         parsing.read_bytes(path, "file", 100)
@@ -63,7 +63,7 @@ def test_no_more_than_the_greatest_size_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("a = " + "[" * 20_000, "nested too deeply"),
         ("a = " + "{a=" * 20_000, "nested too deeply"),
@@ -77,13 +77,13 @@ def test_no_more_than_the_greatest_size_is_read(tmp_path):
         ("# " + "x" * parsing.MAX_TOML_BYTES, "has more than"),
     ],
 )
-def test_toml_that_is_refused(tmp_path, text, words):
-    with pytest.raises(UserError, match=words) as caught:
+def test_invalid_toml_is_refused(tmp_path, text, message):
+    with pytest.raises(UserError, match=message) as caught:
         parsing.read_toml(written(tmp_path, text, "a.toml"), "the weather file")
     assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
 
 
-def test_files_that_cannot_be_opened(tmp_path, monkeypatch):
+def test_unreadable_files_give_a_user_error(tmp_path, monkeypatch):
     with pytest.raises(UserError, match="does not exist"):
         parsing.read_json(tmp_path / "absent")
     with pytest.raises(UserError, match="longer than the disk allows"):
@@ -104,28 +104,28 @@ def test_files_that_cannot_be_opened(tmp_path, monkeypatch):
 @pytest.mark.parametrize("value", [None, True, "1", [], {}, float("nan"), float("inf"), 11, -1])
 def test_numbers_of_other_types_and_out_of_range_are_refused(value):
     with pytest.raises(UserError, match="width in scene.json should be a finite number from 0"):
-        parsing.number({"width": value}, "width", PLACE, 0, 10)
+        parsing.number({"width": value}, "width", SOURCE, 0, 10)
 
 
 def test_typed_values():
     table = {"n": 3, "t": "x", "b": True, "d": {"k": 1}, "l": [1], "m": [[1, 0.5], [2, 3]]}
-    assert parsing.number(table, "n", PLACE) == 3.0
-    assert parsing.number(table, "absent", PLACE, default=None) is None
-    assert parsing.integer(table, "n", PLACE, 0, 5) == 3
-    assert parsing.text(table, "t", PLACE) == "x" and parsing.flag(table, "b", PLACE) is True
-    assert parsing.entries(table, "d", PLACE) == {"k": 1}
-    assert parsing.items(table, "l", PLACE) == [1]
-    assert np.array_equal(parsing.matrix(table["m"], [(2, 2)], PLACE), [[1, 0.5], [2, 3]])
+    assert parsing.number(table, "n", SOURCE) == 3.0
+    assert parsing.number(table, "absent", SOURCE, default=None) is None
+    assert parsing.integer(table, "n", SOURCE, 0, 5) == 3
+    assert parsing.text(table, "t", SOURCE) == "x" and parsing.flag(table, "b", SOURCE) is True
+    assert parsing.entries(table, "d", SOURCE) == {"k": 1}
+    assert parsing.items(table, "l", SOURCE) == [1]
+    assert np.array_equal(parsing.matrix(table["m"], [(2, 2)], SOURCE), [[1, 0.5], [2, 3]])
     for read in (parsing.text, parsing.flag, parsing.entries, parsing.items):
         with pytest.raises(UserError, match=r"n in scene\.json should be"):
-            read(table, "n", PLACE)
+            read(table, "n", SOURCE)
         with pytest.raises(UserError, match="has no absent"):
-            read(table, "absent", PLACE)
+            read(table, "absent", SOURCE)
     for value in (2.5, True, "3", 6, 10**30):
         with pytest.raises(UserError, match="a whole number from 0 to 5"):
-            parsing.integer({"n": value}, "n", PLACE, 0, 5)
+            parsing.integer({"n": value}, "n", SOURCE, 0, 5)
     with pytest.raises(UserError, match="should be a table"):
-        parsing.number([1], "n", PLACE)  # type: ignore[arg-type]
+        parsing.number([1], "n", SOURCE)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_typed_values():
 )  # fmt: skip
 def test_matrices_of_other_shapes_and_values_are_refused(value):
     with pytest.raises(UserError, match="2x2 finite numbers up to 1000"):
-        parsing.matrix(value, [(2, 2)], PLACE, 1000.0)
+        parsing.matrix(value, [(2, 2)], SOURCE, 1000.0)
 
 
 def test_messages_are_one_line_of_bounded_length():
@@ -148,8 +148,8 @@ def test_messages_are_one_line_of_bounded_length():
     assert shown(deep) == "a list" and len(shown("x" * 10**6)) < 80
 
 
-def test_every_reading_of_json_and_toml_is_here():
-    """One place bounds what is parsed; `json.loads` elsewhere reads this program's own pipes."""
+def test_json_and_toml_are_parsed_in_this_module_only():
+    """This module bounds the size of input; `sfm/worker.py` parses the program's own pipes."""
     root = Path(parsing.__file__).parents[1]
     allowed = {"core/parsing.py", "sfm/worker.py"}
     found = {

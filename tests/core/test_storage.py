@@ -134,7 +134,7 @@ def test_new_files_have_default_permissions(tmp_path):
     assert len({(tmp_path / name).stat().st_mode for name in "abc"}) == 1
 
 
-def test_a_file_that_may_not_be_read_is_called_that():
+def test_a_forbidden_file_is_reported_as_such():
     with open_folder() as folder:
         storage.write_safetensors(folder / "f.safetensors", {"a": np.zeros(2)})
         storage.write_json(folder / "a.json", {})

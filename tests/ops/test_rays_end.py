@@ -1,11 +1,11 @@
-"""Every ray ends, whatever numbers it holds: these tests end, or the kernels do not."""
+"""Marching ends for all numbers that a ray can hold; otherwise these tests would hang."""
 
 import numpy as np
 import pytest
 import torch
 
 from climatenerf.ops import marching, reference
-from climatenerf.ops.limits import MAX_STEPS
+from climatenerf.ops.step_limits import MAX_STEPS
 
 RAYS = 64
 HOSTILE = (float("nan"), float("inf"), 1e38, -1e38, 1e30, 1e12, 1e7, 1e-38)

@@ -120,11 +120,11 @@ def full_disk(patch, allowed, place):
     owner = storage.Path if place == "in files" else os
     real = getattr(owner, name)
 
-    def limited(*words):
+    def limited(*args):
         count[0] += 1
         if count[0] > allowed:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return real(*words)
+        return real(*args)
 
     patch.setattr(owner, name, limited)
 
@@ -162,11 +162,11 @@ def test_ctrl_c_during_the_promotion_takes_effect_after_it(tmp_path, expected, m
     render_frames(later, tmp_path, lambda: noise_of(later), range(FRAMES))
     real, moved = render_folder.move, []
 
-    def interrupted(*words):
-        moved.append(words)
+    def interrupted(*args):
+        moved.append(args)
         if len(moved) == 5:
             raise KeyboardInterrupt
-        real(*words)
+        real(*args)
 
     monkeypatch.setattr(render_folder, "move", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -205,7 +205,7 @@ def test_a_stopped_part_does_not_replace_the_sidecar_of_the_whole(tmp_path, expe
     assert files_of(tmp_path) == expected[LATER]
 
 
-def test_what_dead_processes_left_is_removed_and_what_live_ones_use_is_kept(tmp_path):
+def test_files_of_dead_processes_are_removed_and_files_of_live_ones_kept(tmp_path):
     job = make_job(4)
     with contextlib.ExitStack() as live:
         used = live.enter_context(storage.atomic_path(tmp_path / "preview.png"))

@@ -63,7 +63,7 @@ def test_names_without_a_file_are_not_found(tmp_path, name):
     assert FileNames(tmp_path / "inner").find(name) is None
 
 
-def test_links_to_folders_above_end(tmp_path):
+def test_cyclic_links_are_not_followed_forever(tmp_path):
     touch(tmp_path, "images/a.jpg")
     (tmp_path / "images" / "loop").symlink_to(tmp_path)
     assert FileNames(tmp_path).find("IMAGES/A.JPG") == tmp_path / "images" / "a.jpg"

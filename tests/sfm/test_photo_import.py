@@ -272,7 +272,7 @@ def test_pictures_of_every_mode_are_rotated_once(tmp_path, kind, mode):
 
 
 @pytest.mark.parametrize("name", ["HLG", "PQ"])
-def test_hdr_photos_are_tone_mapped_and_told_once(tmp_path, name):
+def test_hdr_photos_are_tone_mapped_and_reported_once(tmp_path, name):
     """A chart of 10 bits with an nclx box, written by pillow-heif 1.8."""
     pytest.importorskip("pi_heif")
     for i in range(3):
@@ -299,7 +299,7 @@ def test_hdr_photos_are_reduced(monkeypatch):
     assert np.abs(np.asarray(small)[4, 4].astype(int) - CHART[0]).max() <= 3
 
 
-def test_gain_maps_are_told_once_and_not_used(tmp_path):
+def test_gain_maps_are_reported_once_and_not_used(tmp_path):
     for i in range(3):
         xmp = b'<rdf:Description hdrgm:Version="1.0"/>'
         photo(tmp_path / "in" / f"{i}.jpg", seed=i, xmp=xmp)

@@ -98,7 +98,7 @@ def test_orientations_equal_pillow(tmp_path, orientation):
 
 @pytest.mark.parametrize("as_stored", [False, True])
 def test_half_turned_photos_follow_quarter_turned_ones(scene, tmp_path, as_stored):
-    """Only quarter turns show in the shape of a file."""
+    """Only quarter turns change the shape of a file."""
     (tmp_path / "labels").mkdir()
     true, orientations = classes(FLAT)[0], {"a.jpg": 3, "b.jpg": 6, "c.jpg": 1}
     photos = {}

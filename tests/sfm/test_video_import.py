@@ -64,7 +64,7 @@ def test_unnamed_matrix_of_hdr_video_is_that_of_bt2020(tmp_path):
     assert np.abs(found - CHART)[BELOW_KNEE].max() <= 4
 
 
-def test_sdr_video_of_ten_bits_is_left_alone(tmp_path):
+def test_sdr_video_of_ten_bits_is_unchanged(tmp_path):
     """The frames are those of ffmpeg's plain conversion, byte for byte."""
     import imageio_ffmpeg
 

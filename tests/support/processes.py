@@ -16,11 +16,11 @@ from climatenerf.training.snapshot import CONFIG, FIELD, OPTIMISER, SCENE, new_c
 MODULES = ["support.processes"]
 
 
-def start(target, *words) -> multiprocessing.Process:
+def start(target, *args) -> multiprocessing.Process:
     """Start a process quickly: its server has imported this module already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(MODULES)
-    process = context.Process(target=target, args=words, daemon=True)
+    process = context.Process(target=target, args=args, daemon=True)
     process.start()
     return process
 

@@ -64,11 +64,11 @@ def render_whole(out: Path, frames: int, visibility: float) -> None:
     render_movie(job, SCENE, out, lambda: noise_of(job))
 
 
-def start(target, *words) -> multiprocessing.Process:
+def start(target, *args) -> multiprocessing.Process:
     """Start a process quickly: its server has imported this module already."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["support.render_jobs"])
-    process = context.Process(target=target, args=words)
+    process = context.Process(target=target, args=args)
     process.start()
     return process
 

@@ -1,7 +1,7 @@
-"""A device that is none: its tensors lie on the CPU, but refuse to meet tensors that do.
+"""A simulated device for PyTorch: tensors in CPU memory that report another device.
 
-Where no GPU is at hand this shows which code would fail on one. Kernels read its tensors as they
-would a GPU's (`kernels_for_toys`).
+An operation that mixes them with CPU tensors raises an error, as it would with a GPU's, so tests
+find missing transfers without a GPU. `kernels_for_toys` lets the CPU kernels read their memory.
 """
 
 import contextlib
@@ -15,11 +15,12 @@ from climatenerf.ops import dispatch
 
 _setup_privateuseone_for_python_backend("toy")
 TOY = torch.device("toy:0")
-CROSSING = {torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default}
+TRANSFERS = {torch.ops.aten._to_copy.default, torch.ops.aten.copy_.default}
+"""Operations that may have tensors of both devices."""
 
 
 class Toy(torch.Tensor):
-    """A tensor of that device, around one of the CPU."""
+    """A tensor of the toy device that wraps a CPU tensor, `raw`."""
 
     raw: torch.Tensor
 
@@ -45,44 +46,50 @@ class Toy(torch.Tensor):
 
 
 def _call(func, args, kwargs):
-    given, _ = pytree.tree_flatten((args, kwargs))
-    toys = {id(x.raw): x for x in given if isinstance(x, Toy)}
-    for x in given:
-        foreign = isinstance(x, torch.Tensor) and not isinstance(x, Toy)
-        if foreign and x.dim() and toys and func not in CROSSING:
-            raise RuntimeError(f"{func}: tensors of the device and of the CPU")
+    """Call an operation on the wrapped CPU tensors and wrap its result.
+
+    Raises:
+        RuntimeError: it mixes devices: CPU tensors that are not scalars, or a CPU generator.
+    """
+    inputs, _ = pytree.tree_flatten((args, kwargs))
+    toys = {id(x.raw): x for x in inputs if isinstance(x, Toy)}
+    for x in inputs:
+        on_cpu = isinstance(x, torch.Tensor) and not isinstance(x, Toy)
+        if on_cpu and x.dim() and toys and func not in TRANSFERS:
+            raise RuntimeError(f"{func}: tensors on the toy device and on the CPU")
     device = kwargs.get("device")
-    here = device is not None and torch.device(device).type == "toy"
-    if (here or toys) and kwargs.get("generator") is not None:
-        raise RuntimeError(f"{func}: a generator of the CPU on the device")
-    args, kwargs = pytree.tree_map(_bare, (args, kwargs))
+    target = None if device is None else torch.device(device).type
+    if (target == "toy" or toys) and kwargs.get("generator") is not None:
+        raise RuntimeError(f"{func}: a CPU generator for the toy device")
+    args, kwargs = pytree.tree_map(_unwrap, (args, kwargs))
     out = func(*args, **kwargs)
-    leaves = device is not None and torch.device(device).type == "cpu"
-    if leaves or not isinstance(out, (torch.Tensor, tuple, list)):
+    if target == "cpu" or not isinstance(out, (torch.Tensor, tuple, list)):
         return out
-    return pytree.tree_map(lambda x: _dressed(x, toys), out)
+    return pytree.tree_map(lambda x: _wrap(x, toys), out)
 
 
-def _bare(x):
+def _unwrap(x):
+    """Return the CPU tensor or CPU device of a toy one; anything else as it is."""
     if isinstance(x, Toy):
         return x.raw
     return torch.device("cpu") if isinstance(x, torch.device) and x.type == "toy" else x
 
 
-def _dressed(x, toys):
+def _wrap(x, toys):
+    """Return a CPU tensor as a toy one: that of `toys` (id of CPU tensor: wrapper), else new."""
     if not isinstance(x, torch.Tensor) or isinstance(x, Toy):
         return x
-    return toys.get(id(x)) if id(x) in toys else Toy(x)  # in-place: the tensor itself
+    return toys.get(id(x)) if id(x) in toys else Toy(x)  # in-place operations return their input
 
 
-def _as_kernel(func):
+def _toy_kernel(func):
     return lambda *args, **kwargs: _call(func, args, kwargs)
 
 
-_rest = torch.library.Library("_", "IMPL")
-_rest.fallback(lambda func, *args, **kwargs: _call(func, args, kwargs), "PrivateUse1")
+_fallback = torch.library.Library("_", "IMPL")
+_fallback.fallback(lambda func, *args, **kwargs: _call(func, args, kwargs), "PrivateUse1")
 _aten = torch.library.Library("aten", "IMPL")
-# Those that PyTorch would make of others before the fallback is asked, and arange by resizing.
+# PyTorch decomposes these before it calls the fallback; `arange` would resize its output.
 for _name in (
     "_to_copy",
     "empty.memory_format",
@@ -98,12 +105,12 @@ for _name in (
 ):
     _packet, _, _overload = _name.partition(".")
     _func = getattr(getattr(torch.ops.aten, _packet), _overload or "default")
-    _aten.impl(_name, _as_kernel(_func), "PrivateUse1")
+    _aten.impl(_name, _toy_kernel(_func), "PrivateUse1")
 
 
 @contextlib.contextmanager
 def kernels_for_toys():
-    """Within it the CPU's kernels compute for the device."""
+    """Run the CPU kernels on toy tensors within the context."""
 
     def backend(*tensors):
         if any(t.dtype not in (torch.float32, torch.int64, torch.uint8) for t in tensors):
@@ -113,8 +120,8 @@ def kernels_for_toys():
         return "cpu"
 
     def kernel_array(tensor):
-        bare = tensor.detach().contiguous()
-        return (bare.raw if isinstance(bare, Toy) else bare).numpy()
+        tensor = tensor.detach().contiguous()
+        return (tensor.raw if isinstance(tensor, Toy) else tensor).numpy()
 
     with mock.patch.multiple(dispatch, backend=backend, kernel_array=kernel_array):
         yield

@@ -40,12 +40,12 @@ def test_perturbed_poses_are_recovered_in_part(tmp_path):
     assert after < 0.8 * before, (before, after)
     still = make_trainer(pixels, extent, replace(settings, refine_poses=False, steps=100))
     still.run(lambda _: None)
-    assert torch.equal(still.poses.turn, torch.zeros_like(still.poses.turn))
+    assert torch.equal(still.poses.rotation, torch.zeros_like(still.poses.rotation))
 
 
 def test_rotations_are_orthonormal_and_have_known_values():
-    turn = torch.randn(20, 3)
-    r = rotations(turn)
+    vectors = torch.randn(20, 3)
+    r = rotations(vectors)
     assert torch.allclose(r @ r.transpose(1, 2), torch.eye(3).expand(20, 3, 3), atol=1e-5)
     assert torch.allclose(torch.linalg.det(r), torch.ones(20), atol=1e-5)
     quarter = rotations(torch.tensor([[0.0, 0.0, torch.pi / 2]]))[0]
@@ -56,18 +56,18 @@ def test_rotations_are_orthonormal_and_have_known_values():
 def test_rotations_equal_the_matrix_exponential_with_gradients(size):
     """Also on both sides of the angle below which series are used."""
     generator = torch.Generator().manual_seed(0)
-    turn = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1) * size
+    vectors = torch.nn.functional.normalize(torch.randn(20, 3, generator=generator), dim=-1) * size
     weights = torch.randn(20, 3, 3, generator=generator)
 
-    def exponential(turn):
-        x, y, z = turn.unbind(-1)
+    def exponential(vectors):
+        x, y, z = vectors.unbind(-1)
         none = 0 * x
         rows = [none, -z, y, z, none, -x, -y, x, none]
         return torch.linalg.matrix_exp(torch.stack(rows, dim=-1).view(-1, 3, 3))
 
     found = []
     for function, kind in ((rotations, torch.float32), (exponential, torch.float64)):
-        given = turn.detach().clone().to(kind).requires_grad_()
+        given = vectors.detach().clone().to(kind).requires_grad_()
         out = function(given)
         (out * weights.to(kind)).sum().backward()
         assert given.grad is not None
@@ -83,8 +83,8 @@ def test_zero_corrections_change_nothing_and_have_finite_gradients():
     o2, d2 = poses.rays(o, d, image, 5.0)
     assert torch.equal(o2, o) and torch.allclose(d2, d)
     (o2.sum() + (d2 * torch.randn(3, 3)).sum() + poses.loss()).backward()
-    assert poses.turn.grad is not None and torch.isfinite(poses.turn.grad).all()
-    assert (poses.turn.grad != 0).any()
+    assert poses.rotation.grad is not None and torch.isfinite(poses.rotation.grad).all()
+    assert (poses.rotation.grad != 0).any()
     c2w = torch.eye(4).repeat(3, 1, 1)
     assert torch.allclose(poses.corrected(c2w, 5.0), c2w)
 
@@ -92,8 +92,8 @@ def test_zero_corrections_change_nothing_and_have_finite_gradients():
 def test_corrected_poses_give_the_corrected_rays():
     poses = PoseCorrections(2)
     with torch.no_grad():
-        poses.turn.copy_(0.1 * torch.randn(2, 3))
-        poses.shift.copy_(0.1 * torch.randn(2, 3))
+        poses.rotation.copy_(0.1 * torch.randn(2, 3))
+        poses.translation.copy_(0.1 * torch.randn(2, 3))
     c2w = torch.eye(4).repeat(2, 1, 1)
     c2w[1, :3, :3] = rotations(torch.randn(1, 3))[0]
     c2w[:, :3, 3] = torch.randn(2, 3)

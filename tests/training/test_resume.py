@@ -99,8 +99,8 @@ def test_a_restored_fit_with_labels_is_bit_identical(scene, tmp_path):
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
     assert torch.equal(again.field.occupancy.forced_empty, trainer.field.occupancy.forced_empty)
-    assert again.field.knows_classes and again.objective.classes_trusted_at < 0.5
-    assert again.objective.classes_trusted_at == trainer.objective.classes_trusted_at
+    assert again.field.knows_classes and again.objective.classes_used_from < 0.5
+    assert again.objective.classes_used_from == trainer.objective.classes_used_from
     trainer.run(nothing)
     again.run(nothing)
     trainer.seconds = again.seconds
@@ -114,8 +114,8 @@ def test_new_labels_of_a_resumed_run_are_used_later(scene, tmp_path):
     again = labelled(begin(scene, steps=40))
     restore(again, tmp_path)
     assert again.field.knows_classes and not trainer.field.knows_classes
-    expected = 0.5 + trainer.objective.classes_trusted_at
-    assert again.objective.classes_trusted_at == pytest.approx(expected)
+    expected = 0.5 + trainer.objective.classes_used_from
+    assert again.objective.classes_used_from == pytest.approx(expected)
 
 
 def test_refined_poses_are_saved_and_need_the_flag_to_resume(scene, tmp_path):
@@ -176,6 +176,21 @@ def test_progress_does_not_decrease_when_a_run_is_resumed_for_more_steps(scene, 
     before = begin(scene, steps=800)
     restore(before, tmp_path / "run")
     assert before.steps == 8 and before.progress == before.elapsed
+
+
+def test_pose_corrections_of_earlier_versions_are_restored(scene, tmp_path):
+    fitted(scene, tmp_path / "run", steps=4, refine_poses=True)
+    path = tmp_path / "run" / "optimiser.safetensors"
+    arrays, _ = read_safetensors(path, "state")
+    state = {name: torch.from_numpy(np.array(values)) for name, values in arrays.items()}
+    saved = {name: state.pop(f"poses.{name}") for name in ("rotation", "translation")}
+    assert all((values != 0).any() for values in saved.values())
+    state |= {"poses.turn": saved["rotation"], "poses.shift": saved["translation"]}
+    write_safetensors(path, state, {})
+    again = begin(scene, steps=8, refine_poses=True)
+    restore(again, tmp_path / "run")
+    for name, values in again.poses.state_dict().items():
+        assert torch.equal(values, saved[name]), name
 
 
 def test_a_run_resumed_after_refinement_protects_the_cells_of_points(scene, tmp_path):

@@ -1,4 +1,4 @@
-"""Checkpoints are read and replaced as one, whatever stops the writer."""
+"""Checkpoints are read and replaced atomically, also if the writer is stopped."""
 
 import contextlib
 import os
@@ -47,11 +47,11 @@ def crash_at(patch, step):
     """Raise before the `step`-th file that a writer moves or finishes."""
     real, count = os.replace, [0]
 
-    def replace(*words):
+    def replace(*args):
         count[0] += 1
         if count[0] == step:
             raise Crash
-        real(*words)
+        real(*args)
 
     patch.setattr(os, "replace", replace)
     return count
@@ -67,7 +67,7 @@ def test_a_writer_that_dies_at_any_point_leaves_one_checkpoint(tmp_path, earlier
         with pytest.MonkeyPatch.context() as patch:
             count = crash_at(patch, step)
             # As a kill: the clean-up of the block does not run either.
-            patch.setattr(snapshot.shutil, "rmtree", lambda *words, **options: None)
+            patch.setattr(snapshot.shutil, "rmtree", lambda *args, **options: None)
             with contextlib.suppress(Crash):
                 write_checkpoint(run, 2)
         swapped = identity_of(run / FIELD) == "2"

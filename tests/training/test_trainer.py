@@ -444,7 +444,7 @@ def test_gradients_are_finite_with_every_loss(scene):
     trainer.run(lambda _: None)
     grads = [p.grad for p in [*trainer.masks.parameters(), *trainer.poses.parameters()]]
     assert all(grad is not None and torch.isfinite(grad).all() for grad in grads)
-    assert any((grad != 0).any() for grad in grads[-2:]) and (trainer.poses.turn != 0).any()
+    assert any((grad != 0).any() for grad in grads[-2:]) and (trainer.poses.rotation != 0).any()
     assert (trainer.objective.depth_alignment.sums[:, 0] > 0).any()
     assert trainer.field.knows_classes and trainer.field.knows_normals
 

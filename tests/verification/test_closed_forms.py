@@ -22,7 +22,7 @@ from climatenerf.verification.closed_forms import (
 N = 1.333
 
 
-def test_they_import_nothing_of_the_program():
+def test_closed_forms_are_independent_of_the_program():
     tree = ast.parse(Path(closed_forms.__file__).read_text())
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
     names = {getattr(node, "module", None) or node.names[0].name for node in imports}
@@ -38,7 +38,7 @@ def test_fresnel_at_published_angles():
 
 
 @pytest.mark.parametrize("ior", [1.333, 1.5])
-def test_walsh_s_formula_is_the_mean_of_fresnel_s(ior):
+def test_diffuse_reflectance_is_the_mean_fresnel_reflectance(ior):
     cosine, weight = np.polynomial.legendre.leggauss(200)
     cosine, weight = (cosine + 1) / 2, weight / 2
     mean = (weight * 2 * cosine * fresnel(np.arccos(cosine), ior)).sum()

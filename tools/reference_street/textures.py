@@ -243,7 +243,7 @@ def _foliage(dark, bright):
     return draw
 
 
-def _glass(rng) -> Image:
+def _glass(_rng) -> Image:
     shape = (128, 128)  # one pane: dark room, a paler sky-like gradient, a curtain each side
     x, y = _metres(shape, 1.0, 1.0)
     image = _flat(shape, (44, 52, 60))
@@ -277,7 +277,7 @@ def _paint(colour, rough: float = 0.03):
     return draw
 
 
-def _tyre(rng) -> Image:
+def _tyre(_rng) -> Image:
     shape = (128, 128)  # the end cap: u, v in the square around the disc
     x, y = _metres(shape, 1.0, 1.0)
     r, angle = np.hypot(x - 0.5, y - 0.5), np.arctan2(y - 0.5, x - 0.5)
@@ -288,7 +288,7 @@ def _tyre(rng) -> Image:
 
 
 def _car(part: str):
-    def draw(rng) -> Image:
+    def draw(_rng) -> Image:
         from tools.reference_street.objects import paint_car
 
         return paint_car(part)
@@ -332,6 +332,7 @@ _DRAW = {
     "car-body": _car("body"),
     "car-cabin": _car("cabin"),
 }
+"""Functions that draw a texture; each is called with a random generator, needed or not."""
 NAMES = tuple(_DRAW)
 
 

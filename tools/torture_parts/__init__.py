@@ -1,1 +1,1 @@
-"""Parts of `tools/torture.py`: valid inputs, mutations, the process that runs verbs, the judge."""
+"""Parts of `tools/torture.py`: valid inputs, mutations, the process that runs verbs, faults."""

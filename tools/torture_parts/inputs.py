@@ -38,41 +38,41 @@ CAMERA_PATH = {
 }
 
 
-def build(nest: Path, runner: Runner) -> None:
+def build(originals: Path, runner: Runner) -> None:
     """Write `scene/`, `colmap-text/`, `colmap/`, `transforms/`, `run/` and single files.
 
     Args:
-        nest: an empty folder.
+        originals: an empty folder.
         runner: runs the verbs that make the derived inputs.
 
     Raises:
         RuntimeError: a verb fails on them.
     """
-    _write_scene(nest / "scene")
+    _write_scene(originals / "scene")
     for format_ in ("transforms", "colmap"):
-        out = nest / f"exported-{format_}"
-        _valid(runner, "export", nest / "scene", "-o", out, "--format", format_)
-    _with_photos(nest, "exported-colmap", "colmap-text")
-    _with_photos(nest, "exported-transforms", "transforms")
-    _with_photos(nest, "exported-colmap", "colmap")
-    _to_binary(nest / "colmap" / "sparse" / "0")
-    data = json.loads((nest / "transforms" / "transforms.json").read_text())
+        out = originals / f"exported-{format_}"
+        _valid(runner, "export", originals / "scene", "-o", out, "--format", format_)
+    _with_photos(originals, "exported-colmap", "colmap-text")
+    _with_photos(originals, "exported-transforms", "transforms")
+    _with_photos(originals, "exported-colmap", "colmap")
+    _to_binary(originals / "colmap" / "sparse" / "0")
+    data = json.loads((originals / "transforms" / "transforms.json").read_text())
     for frame in data["frames"]:
         del frame["mask_path"]
-    text = json.dumps(data).replace(f"{nest / 'scene'}/", "")
-    (nest / "transforms" / "transforms.json").write_text(text)
-    _valid(runner, "fit", nest / "scene", "-o", nest / "run", "--steps", STEPS)
-    (nest / "weather.toml").write_text(WEATHER)
-    (nest / "path").mkdir()
-    (nest / "path" / "camera_path.json").write_text(json.dumps(CAMERA_PATH))
+    text = json.dumps(data).replace(f"{originals / 'scene'}/", "")
+    (originals / "transforms" / "transforms.json").write_text(text)
+    _valid(runner, "fit", originals / "scene", "-o", originals / "run", "--steps", STEPS)
+    (originals / "weather.toml").write_text(WEATHER)
+    (originals / "path").mkdir()
+    (originals / "path" / "camera_path.json").write_text(json.dumps(CAMERA_PATH))
     moved = {"transform": [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}
-    (nest / "path" / "dataparser_transforms.json").write_text(json.dumps(moved))
+    (originals / "path" / "dataparser_transforms.json").write_text(json.dumps(moved))
 
 
-def _valid(runner: Runner, *words: object) -> None:
-    done = runner.run(*words)
+def _valid(runner: Runner, *args: object) -> None:
+    done = runner.run(*args)
     if done.status:
-        raise RuntimeError(f"the valid input fails: {words}: {done.err}")
+        raise RuntimeError(f"the valid input fails: {args}: {done.err}")
 
 
 def _write_scene(folder: Path) -> None:
@@ -113,10 +113,13 @@ def label_name(view: dict) -> str:
     return f"{Path(view['name']).stem}.png"
 
 
-def _with_photos(nest: Path, exported: str, name: str) -> None:
+def _with_photos(originals: Path, exported: str, name: str) -> None:
     """Copy exported poses beside copies of the photos."""
-    folder = nest / name
-    for base, target in ((nest / exported, folder), (nest / "scene" / "images", folder / "images")):
+    folder = originals / name
+    for base, target in (
+        (originals / exported, folder),
+        (originals / "scene" / "images", folder / "images"),
+    ):
         for path in base.rglob("*"):
             if path.is_file():
                 copy = target / path.relative_to(base)

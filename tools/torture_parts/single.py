@@ -1,4 +1,4 @@
-"""Run one verb with the small field of the trials: `python -m tools.torture_parts.single WORDS`."""
+"""Run one verb with the small field of the trials: `python -m tools.torture_parts.single ARGS`."""
 
 import sys
 

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 
 from tools.torture_parts.inputs import STILL
-from tools.torture_parts.trials import Campaign, Trial, judged, unsound
+from tools.torture_parts.trials import Campaign, Trial, nan_faults, outcome_faults
 from tools.torture_parts.zygote import ROOT, Runner
 
 SIGNALS = {"SIGKILL": signal.SIGKILL, "SIGTERM": signal.SIGTERM, "SIGINT": signal.SIGINT}
@@ -23,27 +23,27 @@ DISKS = {"export": ("20k", "200k"), "fit": ("100k", "2m"), "render": ("8k", "60k
 
 
 def commands(campaign: Campaign, out: Path) -> dict[str, list[str]]:
-    """Return the words of the verbs that are stopped."""
-    nest = campaign.nest
+    """Return the arguments of the verbs that are stopped."""
+    originals = campaign.originals
     found = {
-        "fit": ["fit", nest / "scene", "-o", out, "--steps", "60"],
-        "render": ["render", nest / "run", "-o", out, *MOVIE],
+        "fit": ["fit", originals / "scene", "-o", out, "--steps", "60"],
+        "render": ["render", originals / "run", "-o", out, *MOVIE],
     }
     try:
         import pycolmap  # noqa: F401
 
-        photos = nest / "scene" / "images"
-        found["capture"] = ["capture", photos, "-o", out, "--from-colmap", nest / "colmap"]
+        photos = originals / "scene" / "images"
+        found["capture"] = ["capture", photos, "-o", out, "--from-colmap", originals / "colmap"]
     except ImportError:
         pass
-    return {verb: [str(word) for word in words] for verb, words in found.items()}
+    return {verb: [str(arg) for arg in args] for verb, args in found.items()}
 
 
 def stopped(campaign: Campaign, verb: str, seed: int) -> Trial:
     """Stop a verb at a random moment, run it again, and compare with an undisturbed result."""
     rng, out = random.Random(f"stop-{verb}:{seed}"), campaign.work / "out"
-    words = commands(campaign, out)[verb]
-    reference = campaign.nest / f"undisturbed-{verb}"
+    args = commands(campaign, out)[verb]
+    reference = campaign.originals / f"undisturbed-{verb}"
     if not reference.exists():
         undisturbed = commands(campaign, reference)[verb]
         done = campaign.runner.run(*undisturbed)
@@ -54,27 +54,27 @@ def stopped(campaign: Campaign, verb: str, seed: int) -> Trial:
     name = rng.choice(sorted(SIGNALS))
     valid = campaign.valid["stop-" + verb, 0]
     after = rng.random() * valid.seconds
-    done = campaign.runner.run(*words, stop=[int(SIGNALS[name]), after])
-    faults = _judged_stop(done.status, name, done.after_stop, done.err, verb)
-    said = done.err.strip()[-1500:]
-    again = list(words)
-    # A fit that saved its field says how it goes on.
+    done = campaign.runner.run(*args, stop=[int(SIGNALS[name]), after])
+    faults = _stop_faults(done.status, name, done.after_stop, done.err)
+    stderr = done.err.strip()[-1500:]
+    again = list(args)
+    # A fit that saved a checkpoint is continued by `--resume`.
     if verb == "fit" and (out / "optimiser.safetensors").exists():
         again.append("--resume")
     done = campaign.runner.run(*again)
-    faults += [f"again: {fault}" for fault in judged(done)]
+    faults += [f"again: {fault}" for fault in outcome_faults(done)]
     if done.status:
         faults.append(f"the same command fails afterwards with status {done.status}")
     else:
-        faults += unsound(out)
+        faults += nan_faults(out)
         if "--resume" not in again:
             faults += difference(reference, out)
     mutation = f"{name} after {after:.2f} s"
-    shown, said = " ".join(words), f"{said} | again: {done.err.strip()[-1500:]}"
-    return Trial(f"stop-{verb}", seed, mutation, shown, done.status, tuple(faults), said)
+    command, stderr = " ".join(args), f"{stderr} | again: {done.err.strip()[-1500:]}"
+    return Trial(f"stop-{verb}", seed, mutation, command, done.status, tuple(faults), stderr)
 
 
-def _judged_stop(status: int, name: str, seconds: float | None, err: str, verb: str) -> list[str]:
+def _stop_faults(status: int, name: str, seconds: float | None, err: str) -> list[str]:
     """Return what is wrong with the end of a verb that got a signal."""
     if seconds is None:  # it ended before
         return []
@@ -104,12 +104,12 @@ def difference(one: Path, other: Path) -> list[str]:
                 faults.append(f"{relative} is in one of the results only")
             elif folder is one and _content(path) != _content(against / relative):
                 faults.append(f"{relative} differs")
-    left = [p.name for p in other.rglob("*") if ".tmp" in p.name]
-    return faults + [f"{name} is left" for name in left]
+    temporary = [p.name for p in other.rglob("*") if ".tmp" in p.name]
+    return faults + [f"{name} is left over" for name in temporary]
 
 
 def _content(path: Path) -> str:
-    """Return a hash of what matters in a file; "" where that may differ."""
+    """Return a hash of the content that must be reproducible; "" for other files."""
     if path.suffix == ".png":
         with Image.open(path) as picture:
             return hashlib.sha256(np.asarray(picture).tobytes()).hexdigest()
@@ -120,28 +120,28 @@ def _content(path: Path) -> str:
 
 
 def on_full_disk(campaign: Campaign, verb: str, seed: int) -> Trial | str:
-    """Run a verb into a disk that is too small; a text says why that is not possible here."""
+    """Run a verb with a disk that is too small; return a text if disks cannot be mounted here."""
     disk = campaign.work / "disk"
     _empty(campaign.work)
     disk.mkdir()
-    words = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
+    args = ["unshare", "--map-root-user", "--mount", "sh", "-c"]
     size = random.Random(f"disk-{verb}:{seed}").choice(DISKS[verb])
     inner = f'mount -t tmpfs -o size={size} tmpfs "$0" && exec "$@"'
     possible = (
         shutil.which("unshare") is not None
-        and not subprocess.run([*words, inner, str(disk), "true"], capture_output=True).returncode
+        and not subprocess.run([*args, inner, str(disk), "true"], capture_output=True).returncode
     )
     if not possible:
         return "no permission to mount a disk in a user namespace"
-    nest = campaign.nest
+    originals = campaign.originals
     verbs = {
-        "export": ["export", nest / "scene", "-o", disk / "out"],
-        "fit": ["fit", nest / "scene", "-o", disk / "out", "--steps", "2"],
-        "render": ["render", nest / "run", "-o", disk / "out", *STILL, "--layers", "depth"],
+        "export": ["export", originals / "scene", "-o", disk / "out"],
+        "fit": ["fit", originals / "scene", "-o", disk / "out", "--steps", "2"],
+        "render": ["render", originals / "run", "-o", disk / "out", *STILL, "--layers", "depth"],
     }
     program = [sys.executable, "-m", "tools.torture_parts.single", *map(str, verbs[verb])]
     done = subprocess.run(
-        [*words, inner, str(disk), *program], capture_output=True, text=True, cwd=ROOT
+        [*args, inner, str(disk), *program], capture_output=True, text=True, cwd=ROOT
     )
     last = done.stderr.replace("\r", "\n").strip().splitlines()[-1:]
     faults = []
@@ -151,24 +151,24 @@ def on_full_disk(campaign: Campaign, verb: str, seed: int) -> Trial | str:
         faults.append(f"status {done.returncode}")
     if "Traceback" in done.stderr:
         faults.append("a traceback")
-    said = done.stderr.strip()[-1500:]
-    return Trial(f"disk-{verb}", seed, size, verb, done.returncode, tuple(faults), said)
+    stderr = done.stderr.strip()[-1500:]
+    return Trial(f"disk-{verb}", seed, size, verb, done.returncode, tuple(faults), stderr)
 
 
 def two_at_once(campaign: Campaign, verb: str, seed: int, other: Runner) -> Trial:
-    """Run a verb twice into one folder at once; what is there afterwards must be of one of them."""
+    """Run a verb twice into one folder at once; the result must be that of one of them."""
     _empty(campaign.work)
     _empty(other.work)
     out = campaign.work / "out"
-    words = commands(campaign, out)[verb]
-    later = [*words, "--seed", "1"] if verb == "fit" else words
-    campaign.runner.start(words)
+    args = commands(campaign, out)[verb]
+    later = [*args, "--seed", "1"] if verb == "fit" else args
+    campaign.runner.start(args)
     other.start(later)
     ends = [campaign.runner.result(), other.result()]
-    faults = [f"one: {fault}" for done in ends for fault in judged(done)]
+    faults = [f"one: {fault}" for done in ends for fault in outcome_faults(done)]
     if not any(done.status == 0 for done in ends):
         faults.append("neither ends with status 0")
-    faults += unsound(out)
+    faults += nan_faults(out)
     if verb == "fit":
         check = campaign.work / "check"
         done = campaign.runner.run("render", out, "-o", check, *STILL)
@@ -177,8 +177,8 @@ def two_at_once(campaign: Campaign, verb: str, seed: int, other: Runner) -> Tria
         saved = json.loads((out / "config.json").read_text())["settings"]["seed"]
         if sum(done.status == 0 for done in ends) > 1:
             faults.append(f"both fits claim one folder (its settings have seed {saved})")
-    said = " | ".join(done.err.strip()[-300:] for done in ends)
-    return Trial(f"two-{verb}", seed, "", " ".join(words), ends[0].status, tuple(faults), said)
+    stderr = " | ".join(done.err.strip()[-300:] for done in ends)
+    return Trial(f"two-{verb}", seed, "", " ".join(args), ends[0].status, tuple(faults), stderr)
 
 
 def _empty(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Trials: a mutated copy of a valid input, the verb that reads it, and the judgement."""
+"""Trials: a mutated copy of a valid input, the verb that reads it, and the faults found."""
 
 import random
 import re
@@ -29,10 +29,11 @@ class Kind:
     """One kind of input.
 
     Attributes:
-        base: its folder in the nest, which a trial copies.
+        base: its folder or file among the originals, which a trial copies.
         files: pattern of the files of which one is mutated.
-        verbs: words of command lines of which one is chosen; {in} is the copy, {out} the output.
-        extra: further entries of the nest that are copied.
+        verbs: arguments of the command lines of which one is chosen; {in} is the copy, {out} the
+            output, {originals} the folder of originals.
+        extra: further originals that are copied.
     """
 
     base: str
@@ -44,9 +45,9 @@ class Kind:
 EXPORT = ("export", "{in}", "-o", "{out}")
 FIT = ("fit", "{in}", "-o", "{out}", "--steps", "2")
 RENDER = ("render", "{in}", "-o", "{out}", *STILL, "--layers", "depth", "normal")
-RESUME = ("fit", "{nest}/scene", "-o", "{in}", "--resume", "--steps", str(STEPS + 2))
-WEATHERED = ("render", "{nest}/run", "-o", "{out}", *STILL, "--weather", "{in}")
-DRAWN = ("render", "{nest}/run", "-o", "{out}", "--path", "{in}/camera_path.json")
+RESUME = ("fit", "{originals}/scene", "-o", "{in}", "--resume", "--steps", str(STEPS + 2))
+WEATHERED = ("render", "{originals}/run", "-o", "{out}", *STILL, "--weather", "{in}")
+DRAWN = ("render", "{originals}/run", "-o", "{out}", "--path", "{in}/camera_path.json")
 KINDS = {
     "colmap-binary": Kind("colmap", "sparse/0/*", (EXPORT, EXPORT, EXPORT, FIT)),
     "colmap-text": Kind("colmap-text", "sparse/0/*", (EXPORT, EXPORT, EXPORT, FIT)),
@@ -68,9 +69,16 @@ KINDS = {
 
 @dataclass
 class Campaign:
-    """What trials need and gather."""
+    """The folders and the runner of trials, and the outcomes of valid inputs.
 
-    nest: Path
+    Attributes:
+        originals: folder of the valid inputs.
+        work: folder of the current trial.
+        runner: runs the verbs.
+        valid: outcomes of valid inputs by kind and verb.
+    """
+
+    originals: Path
     work: Path
     runner: Runner
     valid: dict[tuple[str, int], Outcome] = field(default_factory=dict)
@@ -83,10 +91,10 @@ class Trial:
     kind: str
     seed: int
     mutation: str
-    words: str
+    command: str
     status: int
     faults: tuple[str, ...]
-    said: str
+    stderr: str
 
     @property
     def name(self) -> str:
@@ -95,55 +103,55 @@ class Trial:
 
 
 def run_trial(campaign: Campaign, kind_name: str, seed: int) -> Trial:
-    """Mutate a copy of an input by a seed, run a verb on it, and judge how it ends."""
+    """Mutate a copy of an input by a seed, run a verb on it, and return its faults."""
     kind, rng = KINDS[kind_name], random.Random(f"{kind_name}:{seed}")
     verb = rng.randrange(len(kind.verbs))
     if (kind_name, verb) not in campaign.valid:
-        copy, words = _prepared(campaign, kind, verb)
-        done = campaign.runner.run(*words)
+        copy, args = _prepared(campaign, kind, verb)
+        done = campaign.runner.run(*args)
         if done.status:
             raise RuntimeError(f"the valid {kind_name} fails: {done.err}")
         campaign.valid[kind_name, verb] = done
-    copy, words = _prepared(campaign, kind, verb)
+    copy, args = _prepared(campaign, kind, verb)
     files = [copy] if copy.is_file() else sorted(p for p in copy.glob(kind.files) if p.is_file())
     mutation = mutate(rng.choice(files), rng)
     out = campaign.work / "out"
     owned = [out, copy] if kind.verbs[verb] is RESUME else [out]
     before = _listing(campaign.work, owned)
     valid = campaign.valid[kind_name, verb]
-    done = campaign.runner.run(*words, limit=valid.seconds + SLACK_SECONDS)
-    faults = judged(done, valid)
+    done = campaign.runner.run(*args, limit=valid.seconds + SLACK_SECONDS)
+    faults = outcome_faults(done, valid)
     if _listing(campaign.work, owned) != before:
         faults.append("wrote outside its output folder")
     if done.status == 0:
-        faults += unsound(out)
-        faults += unsound(copy) if copy in owned else []
-    said = done.err.strip()[-1500:]
-    shown = " ".join(str(word) for word in words)
-    return Trial(kind_name, seed, mutation, shown, done.status, tuple(faults), said)
+        faults += nan_faults(out)
+        faults += nan_faults(copy) if copy in owned else []
+    stderr = done.err.strip()[-1500:]
+    command = " ".join(str(arg) for arg in args)
+    return Trial(kind_name, seed, mutation, command, done.status, tuple(faults), stderr)
 
 
 def _prepared(campaign: Campaign, kind: Kind, verb: int) -> tuple[Path, list[str]]:
-    """Return a fresh copy of an input, and the words of a verb that reads it."""
+    """Return a fresh copy of an input, and the arguments of a verb that reads it."""
     shutil.rmtree(campaign.work, ignore_errors=True)
     campaign.work.mkdir(parents=True)
     for name in (kind.base, *kind.extra):
-        source, target = campaign.nest / name, campaign.work / name
+        source, target = campaign.originals / name, campaign.work / name
         if source.is_dir():
             shutil.copytree(source, target)
         else:
             shutil.copyfile(source, target)
-    places = {
+    paths = {
         "{in}": campaign.work / kind.base,
         "{out}": campaign.work / "out",
-        "{nest}": campaign.nest,
+        "{originals}": campaign.originals,
     }
-    words = []
-    for word in kind.verbs[verb]:
-        for key, path in places.items():
-            word = word.replace(key, str(path))
-        words.append(word)
-    return campaign.work / kind.base, words
+    args = []
+    for arg in kind.verbs[verb]:
+        for key, path in paths.items():
+            arg = arg.replace(key, str(path))
+        args.append(arg)
+    return campaign.work / kind.base, args
 
 
 def _listing(folder: Path, owned: Sequence[Path]) -> dict[str, tuple[int, int]]:
@@ -159,12 +167,12 @@ def _listing(folder: Path, owned: Sequence[Path]) -> dict[str, tuple[int, int]]:
     return found
 
 
-def judged(done: Outcome, valid: Outcome | None = None) -> list[str]:
+def outcome_faults(done: Outcome, valid: Outcome | None = None) -> list[str]:
     """Return what is wrong with the end of a verb, apart from what it wrote.
 
     Args:
         done: how it ended.
-        valid: how the valid input ended; None: its time and memory do not count.
+        valid: how the valid input ended; None skips the comparison of memory.
     """
     faults = []
     if done.hung:
@@ -183,7 +191,7 @@ def judged(done: Outcome, valid: Outcome | None = None) -> list[str]:
     return faults
 
 
-def unsound(folder: Path) -> list[str]:
+def nan_faults(folder: Path) -> list[str]:
     """Return which files of an output hold NaN."""
     from safetensors.numpy import load_file
 
@@ -208,7 +216,7 @@ def unsound(folder: Path) -> list[str]:
 
 
 def summary(trials: Sequence[Trial]) -> dict:
-    """Return counts by kind, and all failures with what replays them."""
+    """Return counts by kind, and all failures with their names for `--replay`."""
     counts: dict[str, dict[str, int]] = {}
     for trial in trials:
         row = counts.setdefault(trial.kind, {"trials": 0, "read": 0, "refused": 0, "failed": 0})
@@ -216,7 +224,7 @@ def summary(trials: Sequence[Trial]) -> dict:
         key = "failed" if trial.faults else "read" if trial.status == 0 else "refused"
         row[key] += 1
     failures = [
-        {"replay": t.name, "faults": t.faults, "mutation": t.mutation, "stderr": t.said}
+        {"replay": t.name, "faults": t.faults, "mutation": t.mutation, "stderr": t.stderr}
         for t in trials
         if t.faults
     ]

@@ -1,4 +1,4 @@
-"""Run verbs of the command line in forked processes: warm as one process, apart as many.
+"""Run verbs of the command line in forked processes: imported once, isolated from each other.
 
 The parent imports everything and computes nothing (OpenMP does not survive a fork). It reads one
 request a line from standard input, and answers with one line. `Runner` is the other end.
@@ -51,7 +51,7 @@ class Runner:
     """The warm process, as a context."""
 
     def __init__(self, work: Path):
-        """Start nothing yet; `work` receives what verbs print."""
+        """Prepare the process; `work` receives the output of verbs."""
         self.work = work
         self.process: subprocess.Popen[str] | None = None
 
@@ -72,16 +72,16 @@ class Runner:
         self.process.stdin.close()
         self.process.wait(30)
 
-    def start(self, words: Sequence[object], **options: Any) -> None:
+    def start(self, args: Sequence[object], **options: Any) -> None:
         """Begin a verb.
 
         Args:
-            words: of the command line.
+            args: arguments of the command line.
             options: `limit` (s); `stop` ([signal, seconds after which it is sent]); `cwd`;
                 `environment` (added); `closed` (numbers of streams to close).
         """
         assert self.process is not None and self.process.stdin is not None
-        request = {"words": [os.fspath(w) if isinstance(w, Path) else str(w) for w in words]}
+        request = {"args": [os.fspath(a) if isinstance(a, Path) else str(a) for a in args]}
         request |= {"out": str(self.work / "stdout"), "err": str(self.work / "stderr"), **options}
         self.process.stdin.write(json.dumps(request) + "\n")
         self.process.stdin.flush()
@@ -93,14 +93,14 @@ class Runner:
         texts = ((self.work / name).read_text(errors="replace") for name in ("stdout", "stderr"))
         return Outcome(**answer, **dict(zip(("out", "err"), texts, strict=True)))
 
-    def run(self, *words: object, **options: Any) -> Outcome:
+    def run(self, *args: object, **options: Any) -> Outcome:
         """Run a verb; see `start`."""
-        self.start(words, **options)
+        self.start(args, **options)
         return self.result()
 
 
 def serve() -> None:
-    """Import the program, then run what standard input asks for."""
+    """Import the program, then run the requests on standard input."""
     _warm_up()
     for line in sys.stdin:
         request = json.loads(line)
@@ -197,9 +197,9 @@ def _child(request: dict[str, Any]) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         from climatenerf import cli
 
-        words = [os.fsdecode(os.fsencode(word)) for word in request["words"]]
+        args = [os.fsdecode(os.fsencode(arg)) for arg in request["args"]]
         try:
-            status = cli.main(words)
+            status = cli.main(args)
         except SystemExit as end:
             status = end.code
     except BaseException:

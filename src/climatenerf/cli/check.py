@@ -115,7 +115,7 @@ def table(scene: Scene | None, findings: Sequence[Finding]) -> str:
             "",
         ]
     if not findings:
-        return "\n".join([*lines, "Nothing is odd."])
+        return "\n".join([*lines, "No problems found."])
     width = max(len(each.code) for each in findings)
     for severity in ("error", "warning", "note"):
         for each in findings:

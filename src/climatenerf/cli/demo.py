@@ -11,7 +11,7 @@ from climatenerf.cli import progress
 from climatenerf.cli.fit import Fit, fit_with_bars, summary
 from climatenerf.cli.render import parse_size
 from climatenerf.core.errors import UserError
-from climatenerf.core.limits import MAX_FRAMES
+from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.training.folder import checked_metrics
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.smog.parameters import Smog

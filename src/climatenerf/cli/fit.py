@@ -9,7 +9,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError
-from climatenerf.core.limits import check_seed
+from climatenerf.core.input_limits import check_seed
 from climatenerf.scene import Scene, read_scene
 from climatenerf.scene.alignment.known_length import (
     FILE_NAME,

@@ -10,7 +10,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError, one_line
-from climatenerf.core.limits import MAX_FRAMES
+from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects

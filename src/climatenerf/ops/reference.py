@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, Integer
 from torch import Tensor
 
 from climatenerf.core.vectors import unit
-from climatenerf.ops.limits import MAX_STEPS
+from climatenerf.ops.step_limits import MAX_STEPS
 
 
 def contract(q: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.limits import MAX_FRAMES
+from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.core.locks import in_use
 from climatenerf.core.locks import locked as locked_file
 from climatenerf.core.storage import (

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError, shown
-from climatenerf.core.limits import MAX_FRAMES
+from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.paths.framing import (
     check_size,
     fit_to_size,

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from climatenerf.core import parsing
 from climatenerf.core.errors import UserError, shown
-from climatenerf.core.limits import MAX_FRAMES
+from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.scene import Scene
 from climatenerf.scene.readers.ply import MAX_POSITION
 from climatenerf.scene.scene import MAX_SCALE, MAX_WORLD

@@ -33,6 +33,8 @@ from climatenerf.training.snapshot import (
 )
 from climatenerf.training.trainer import Trainer
 
+RENAMED_CORRECTIONS = {"turn": "rotation", "shift": "translation"}
+"""Parameters of `PoseCorrections` by their names in files of earlier versions."""
 OBSERVED_BATCHES, OBSERVED_RAYS = 4, 16384  # that find the cells which training photos show
 
 
@@ -140,7 +142,7 @@ def restore(trainer: Trainer, run: Path) -> None:
         ) from error
     if not saved.knows_classes:  # the labels are new, so the class head begins to learn now
         objective = trainer.objective
-        objective.classes_trusted_at = trainer.progress + trainer.schedule.refine_at
+        objective.classes_used_from = trainer.progress + trainer.schedule.refine_at
 
 
 def _check_state(arrays: dict[str, np.ndarray], about: object) -> None:
@@ -163,7 +165,7 @@ def _check_state(arrays: dict[str, np.ndarray], about: object) -> None:
 def _restore_state(trainer: Trainer, arrays: dict) -> None:
     state = {k: torch.from_numpy(np.array(v)) for k, v in arrays.items()}
 
-    def part(prefix: str) -> dict:
+    def part(prefix: str) -> dict[str, torch.Tensor]:
         return {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
 
     trainer.grid_adam.load(part("grid."))
@@ -174,7 +176,8 @@ def _restore_state(trainer: Trainer, arrays: dict) -> None:
     groups = trainer.net_adam.state_dict()["param_groups"]
     trainer.net_adam.load_state_dict({"state": moments, "param_groups": groups})
     trainer.masks.load_state_dict(part("masks."))
-    trainer.poses.load_state_dict(part("poses."))
+    poses = {RENAMED_CORRECTIONS.get(k, k): v for k, v in part("poses.").items()}
+    trainer.poses.load_state_dict(poses)
     trainer.objective.depth_alignment.sums.copy_(state["relative"])
     barred = trainer.field.occupancy.forced_empty
     bits = np.unpackbits(state["barred"].numpy(), count=barred.numel())

@@ -42,7 +42,7 @@ class Objective:
     depth_alignment: DepthAlignment
     buffers: Buffers
     learns_classes: bool
-    classes_trusted_at: float
+    classes_used_from: float
     """Progress from which the field's own classes decide what is ground."""
     logit_of_class: Int[Tensor, "256"] = field(init=False)
     """Class logit of each merged class, `UNKNOWN` for sky and unlabelled pixels."""
@@ -167,7 +167,7 @@ class Objective:
         x = batch.rays_o.detach()[ray[index]] + samples.t[index, None] * d
         # Later the field's own classes separate ground from obstacles, so clutter next to obstacles
         # is moved as well, and all of it with a larger weight.
-        classified = progress > self.classes_trusted_at and self.learns_classes
+        classified = progress > self.classes_used_from and self.learns_classes
         far, goal, applies = self.evidence.free_space.ground_offsets(
             field.to_grid(x), d, rays.t[index], self.buffers, classified
         )

@@ -14,8 +14,8 @@ class PoseCorrections(nn.Module):
     def __init__(self, images: int):
         """Begin with no corrections of `images` images, on the CPU; `.to(device)` moves them."""
         super().__init__()
-        self.turn = nn.Parameter(torch.zeros(images, 3, device="cpu"))
-        self.shift = nn.Parameter(torch.zeros(images, 3, device="cpu"))
+        self.rotation = nn.Parameter(torch.zeros(images, 3, device="cpu"))
+        self.translation = nn.Parameter(torch.zeros(images, 3, device="cpu"))
 
     def rays(
         self,
@@ -32,37 +32,37 @@ class PoseCorrections(nn.Module):
             image: index of each ray's image.
             unit: metres per unit of the translations.
         """
-        turned = (rotations(self.turn)[image] @ rays_d[:, :, None])[:, :, 0]
-        return rays_o + unit * self.shift[image], turned
+        rotated = (rotations(self.rotation)[image] @ rays_d[:, :, None])[:, :, 0]
+        return rays_o + unit * self.translation[image], rotated
 
     def loss(self) -> Float[Tensor, ""]:
         """Return the mean squared correction (rad, grid units) times `PULL`."""
-        return PULL * (self.turn.square().sum(-1) + self.shift.square().sum(-1)).mean()
+        return PULL * (self.rotation.square().sum(-1) + self.translation.square().sum(-1)).mean()
 
     @torch.no_grad()
     def corrected(self, c2w: Float[Tensor, "v 4 4"], unit: float) -> Float[Tensor, "v 4 4"]:
         """Return the corrected poses (world m); `unit`: metres per grid unit."""
         out = c2w.clone()
-        out[:, :3, :3] = rotations(self.turn) @ c2w[:, :3, :3]
-        out[:, :3, 3] += unit * self.shift
+        out[:, :3, :3] = rotations(self.rotation) @ c2w[:, :3, :3]
+        out[:, :3, 3] += unit * self.translation
         return out
 
 
-def rotations(turn: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
+def rotations(vectors: Float[Tensor, "v 3"]) -> Float[Tensor, "v 3 3"]:
     """Return the rotation matrices of rotation vectors (rad), by Rodrigues' formula.
 
     They are the exponentials of the cross-product matrices; `torch.linalg.matrix_exp` would
     synchronise with a GPU.
     """
-    x, y, z = turn.unbind(-1)
+    x, y, z = vectors.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).view(-1, 3, 3)
-    squared = turn.square().sum(-1)
+    squared = vectors.square().sum(-1)
     small = squared < SMALL_ANGLE
     # At angle 0 the root has no gradient and the quotients are 0/0: series replace them.
     angle = torch.where(small, 1.0, squared).sqrt()
     first = torch.where(small, 1 - squared / 6, angle.sin() / angle)
     half = angle / 2  # (1 - cos) / angle², without its loss of digits
     second = torch.where(small, 0.5 - squared / 24, 0.5 * (half.sin() / half).square())
-    one = torch.eye(3, dtype=turn.dtype, device=turn.device)
+    one = torch.eye(3, dtype=vectors.dtype, device=vectors.device)
     return one + first[:, None, None] * cross + second[:, None, None] * (cross @ cross)

@@ -55,7 +55,7 @@ def make_trainer(
         depth_alignment=DepthAlignment(images, device),
         buffers=buffers_for(device),
         learns_classes=learns_classes,
-        classes_trusted_at=settings.schedule.refine_at,
+        classes_used_from=settings.schedule.refine_at,
     )
     first_near = settings.schedule.first_near * extent.unit if settings.warm_up else 0.0
     if points is not None:  # along a street surfaces may be nearer than that

@@ -18,7 +18,7 @@ def test_vertical_lines_correct_a_common_pitch(tmp_path):
     out = align_scene(scene)
     assert angle(up_of(out), up) < 1
     assert out.up_report["cameras"] > 5 and "lines" in out.up_report["used"]
-    # The pitch that cameras have in common may be 8 degrees, so nothing is odd.
+    # The pitch that cameras have in common may be 8 degrees, so there is no warning.
     assert not any("Up is uncertain" in w for w in out.warnings)
 
 

@@ -19,7 +19,7 @@ def close(a: Camera, b: Camera):
     )
 
 
-def test_usual_cameras_are_left_alone():
+def test_usual_cameras_are_unchanged():
     for camera in (
         CAMERA,
         replace(CAMERA, cx=310.0, cy=260.0),  # a shifted lens

@@ -99,7 +99,7 @@ def test_a_camera_far_away_is_left_out(scene):
 
 
 @pytest.mark.parametrize(("count", "far"), [(8, 1), (5, 1), (12, 2), (12, 3), (24, 2)])
-def test_far_cameras_of_small_captures_are_told(scene, count, far):
+def test_far_cameras_of_small_captures_are_reported(scene, count, far):
     """One is left out of any capture, and of more at most a tenth."""
     views = list(scene.views[:: len(scene.views) // count][:count])
     for i in range(far):

@@ -49,7 +49,7 @@ ALONG_RAY = 1 / CAMERA.directions()[..., 2]
         (lambda depth: np.full_like(depth, np.nan), ["depth-empty"]),
     ],
 )
-def test_depth_files_are_held_against_the_points(scene, tmp_path, change, expected):
+def test_depth_files_are_compared_with_the_points(scene, tmp_path, change, expected):
     given = with_files(scene, tmp_path, "depth_path", lambda view: change(depth_of(view.c2w)))
     assert codes(depth_findings(given)) == expected
 

@@ -265,8 +265,8 @@ def test_every_image_of_an_edited_text_model_is_read(tmp_path, edit):
     assert [view.name for view in capture.views] == names_of(4)
     for view, pose in zip(capture.views, ring(4), strict=True):
         np.testing.assert_allclose(view.c2w, pose, atol=1e-9)
-    told = any(each.code == "model-lines" for each in capture.findings)
-    assert told == ("no features" in edit or "alone" in edit)
+    reported = any(each.code == "model-lines" for each in capture.findings)
+    assert reported == ("no features" in edit or "alone" in edit)
 
 
 def test_a_line_that_is_neither_image_nor_features_is_named(tmp_path):
@@ -286,7 +286,7 @@ def test_unusual_names_are_read(tmp_path, name, binary):
     assert sorted(view.name for view in read_scene(tmp_path).views) == sorted(names)
 
 
-def test_a_name_in_another_encoding_is_told(tmp_path):
+def test_a_name_in_another_encoding_is_reported(tmp_path):
     write_images(tmp_path / "images", names_of(3))
     write_colmap(tmp_path / "sparse/0", ring(3), names_of(3))
     path = tmp_path / "sparse/0/images.bin"

@@ -10,7 +10,7 @@ from numba import njit, prange
 
 from climatenerf.ops.cpu import simd
 from climatenerf.ops.cpu.simd import LANES
-from climatenerf.ops.limits import MAX_STEPS
+from climatenerf.ops.step_limits import MAX_STEPS
 
 SIMD_DIGEST = "2210a987a87b"  # of `simd.py`, which explains why
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float32, Int
 from numba import njit, prange
 
 from climatenerf.ops.cpu.simd_metaballs import BALL_SUPPORT, ball_means, ball_sums
-from climatenerf.ops.limits import MAX_METABALL_STEPS
+from climatenerf.ops.step_limits import MAX_METABALL_STEPS
 
 SIMD_DIGEST = "ee9d1f67a672"  # of `simd.py` and `simd_metaballs.py`; the former explains why
 BRICK = 8

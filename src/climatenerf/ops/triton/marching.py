@@ -16,7 +16,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from climatenerf.ops.limits import MAX_STEPS
+from climatenerf.ops.step_limits import MAX_STEPS
 from climatenerf.ops.triton.encoding import features_at, slopes_of
 from climatenerf.ops.triton.network import EXACT, first_layer, hidden_of, sizes_of
 from climatenerf.ops.triton.tiles import RAY_LISTS, launch, points, ray_lists

@@ -1,11 +1,11 @@
-"""Greatest values of numbers that users give."""
+"""Largest accepted values of numbers that users give."""
 
 from climatenerf.core.errors import UserError, shown
 
 MAX_FRAMES = 100_000
 """Frames of a movie: over an hour at 24 per second."""
 MAX_SEED = 2**63 - 1
-"""Random generators take 64 bits with a sign."""
+"""Random generators take a signed 64-bit seed."""
 
 
 def check_seed(seed: int) -> int:
