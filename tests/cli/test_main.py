@@ -265,3 +265,16 @@ def test_help_of_a_verb_does_not_load_torch(verb):
     done = subprocess.run(args, capture_output=True, text=True, timeout=60)
     assert done.stdout.rstrip().endswith("HEAVY [] STATUS 0"), done.stdout + done.stderr
     assert f"climatenerf {verb}" in done.stdout
+
+
+def test_a_signal_within_executed_text_keeps_its_status(tmp_path):
+    """Imports execute text, that of dataclasses; `python -m` then ends with SIGINT by itself."""
+    text = "import os, signal; os.kill(os.getpid(), signal.SIGTERM)"
+    code = (
+        "import sys\nfrom climatenerf import cli\n"
+        f"cli._run = lambda words: exec({text!r})\nsys.exit(cli.main([]))\n"
+    )
+    (tmp_path / "stopped.py").write_text(code)
+    words = [sys.executable, "-m", "stopped"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (143, "\nclimatenerf: interrupted\n")

@@ -90,9 +90,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 streams.complain("".join(traceback.format_exception(error)))
             status, sentence = outcome(error, received)
             streams.complain(sentence)
-            return status
         except KeyboardInterrupt as again:  # a second signal
-            return outcome(again)[0]
+            status = outcome(again)[0]
+        _forget_interruption()
+        return status
+
+
+def _forget_interruption() -> None:
+    """Let Python end with the status of `main` after an interruption within `exec`.
+
+    CPython notes that a KeyboardInterrupt left code that was executed from text, such as that of
+    every dataclass of an import, and at its end kills itself with SIGINT. Executing another text
+    clears the note.
+    """
+    exec("")
 
 
 def outcome(error: BaseException, received: Sequence[int] = ()) -> tuple[int, str]:
