@@ -59,6 +59,17 @@ def test_findings_have_code_severity_file_message_and_remedy(capture, capsys):
     assert finding["severity"] == "warning" and finding["message"].endswith(".")
 
 
+def test_every_finding_names_a_file(capture, capsys):
+    twice = {"w": 2 * CAMERA.width, "h": 2 * CAMERA.height, "fl_x": 2 * CAMERA.fx}
+    folder = capture(fl_y=-2 * CAMERA.fy, **twice)
+    _, report = checked(folder, capsys)
+    found = {each["code"]: each for each in report["findings"]}
+    assert set(found) == {"photo-resized", "focal-negative"}
+    assert found["photo-resized"]["file"] == str(folder / "images" / "000.png")
+    assert found["photo-resized"]["severity"] == "note", "nothing needs doing"
+    assert found["focal-negative"]["file"] == str(folder)
+
+
 def test_named_data_that_is_absent_or_not_read_is_told(capture, capsys):
     folder = capture(ply_file_path="other.ply", semantics_path="images/000.png", k5=0.2)
     _, report = checked(folder, capsys)

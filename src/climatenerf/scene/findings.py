@@ -80,9 +80,10 @@ class Finding:
     Attributes:
         code: Key of `CODES`.
         message: What is odd, without a full stop.
-        remedy: What the user can do, without a full stop; empty if nothing needs doing.
+        remedy: What the user can do, without a full stop; empty if nothing needs doing, as for
+            some notes.
         severity: "note", "warning" or "error".
-        file: The file or folder it is about, empty if none.
+        file: The file or folder it is about; `read_scene` puts the capture where it is empty.
     """
 
     code: str

@@ -107,6 +107,8 @@ def read_scene(
     aligned = _aligned(scene, saved, camera_height, metric_input, capture.metric, gravity)
     aligned = checked_world(aligned, str(path))
     odd = (*aligned.findings, *sidecar_findings(aligned), *unused_findings(aligned, capture.views))
+    # What concerns no single file concerns the capture.
+    odd = (each if each.file else replace(each, file=str(path)) for each in odd)
     return replace(aligned, findings=without_repeats(odd))
 
 
@@ -228,37 +230,43 @@ def _check_images(capture: Capture) -> Capture:
         )
     if missing:
         first = next(v.name for v in capture.views if not is_file(v.path))
+        folder = next(v.path.parent for v in capture.views if not is_file(v.path))
         message = (
             f"{missing} of the {len(capture.views)} images with poses are not on disk "
             f"(first: {first}); they are left out"
         )
-        findings.append(Finding("photo-missing", message, file=str(capture.root)))
+        remedy = "restore them, or remove their poses"
+        findings.append(Finding("photo-missing", message, remedy, file=str(folder)))
     present = sorted(_with_inner_names(present), key=lambda v: v.name)
     for a, b in zip(present, present[1:], strict=False):
         if a.name == b.name:
             raise UserError(f"The image {a.name} has two poses; remove one of them.")
     cameras: dict[Camera, int] = {}
-    views, scaled, transparent, hdr = [], 0, 0, 0
+    views: list[View] = []
+    scaled: list[Path] = []
+    transparent: list[Path] = []
+    hdr: list[Path] = []
     for view in present:
         camera = capture.cameras[view.camera]
         header = read_header(view.path)
         fitted = _fit_camera(view, camera, header)
-        scaled += fitted != camera
-        transparent += header.alpha
-        hdr += header.hdr
+        scaled += [view.path] * (fitted != camera)
+        transparent += [view.path] * header.alpha
+        hdr += [view.path] * header.hdr
         views.append(replace(view, camera=cameras.setdefault(fitted, len(cameras))))
     if scaled:
         message = (
-            f"{scaled} images differ in size from their cameras but have the same shape; their "
-            "intrinsics are scaled"
+            f"{len(scaled)} images differ in size from their cameras but have the same shape;"
+            " their intrinsics are scaled"
         )
-        findings.append(Finding("photo-resized", message))
+        findings.append(Finding("photo-resized", message, "", "note", str(scaled[0])))
     if hdr:
-        message = f"{hdr} images are HDR (HLG or PQ) and are tone-mapped to sRGB"
-        findings.append(Finding("photo-hdr", message, severity="note"))
+        message = f"{len(hdr)} images are HDR (HLG or PQ) and are tone-mapped to sRGB"
+        findings.append(Finding("photo-hdr", message, "", "note", str(hdr[0])))
     if transparent:
-        message = f"{transparent} images have an alpha channel, which is ignored"
-        findings.append(Finding("photo-alpha", message, "use masks to exclude pixels"))
+        message = f"{len(transparent)} images have an alpha channel, which is ignored"
+        remedy = "use masks to exclude pixels"
+        findings.append(Finding("photo-alpha", message, remedy, file=str(transparent[0])))
     for camera in cameras:
         error = _round_trip_error(corrected_camera(camera)[0])
         if error > MAX_ROUND_TRIP:

@@ -158,7 +158,8 @@ def _largest(root: Path) -> tuple[Path, list[_Image], tuple[Finding, ...]]:
         f"COLMAP produced {len(models)} separate models (images in each: {sizes}); "
         f"{model.name} is used, the others are left out"
     )
-    return model, chosen, (Finding("model-parts", message, file=str(model)),)
+    remedy = "take more photos between the parts"
+    return model, chosen, (Finding("model-parts", message, remedy, file=str(model)),)
 
 
 def _suffix(folder: Path) -> str | None:

@@ -123,7 +123,8 @@ def _named_data_findings(
     out = []
     if unlisted:
         message = f"{unlisted} images are in none of the lists of {file.name}; they are left out"
-        out.append(Finding("photo-unlisted", message, file=str(file)))
+        remedy = "add them to train_filenames, or remove the lists"
+        out.append(Finding("photo-unlisted", message, remedy, file=str(file)))
     if absent:
         message = (
             f"{counted(len(absent), 'file')} named in {file.name} but not on disk"
