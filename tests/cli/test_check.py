@@ -79,6 +79,38 @@ def test_named_data_that_is_absent_or_not_read_is_told(capture, capsys):
     assert "semantics_path" in messages["file-unread"] and "k5" in messages["file-unread"]
 
 
+def test_files_of_unknown_keys_of_frames_are_told(capture, capsys):
+    folder = capture()
+    data = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(data["frames"]):
+        frame |= {"semantic_path": f"semantics/{i:03}.png", "normal": f"normals\\{i:03}.npy"}
+        frame |= {"source_path": "images/", "url_path": "https://a.org/b.png", "note": "a.b/c d"}
+        frame |= {"features_path": f"features/{i:03}"}
+    (folder / "features").mkdir()
+    (folder / "features" / "003").write_bytes(b"")
+    (folder / "semantics").mkdir()
+    for i in range(10):
+        (folder / "semantics" / f"{i:03}.png").write_bytes(b"")
+    (folder / "transforms.json").write_text(json.dumps(data))
+    _, report = checked(folder, capsys)
+    messages = {each["code"]: each["message"] for each in report["findings"]}
+    assert set(messages) == {"file-missing", "file-unread"}
+    assert messages["file-missing"].startswith("25 files named in"), "2 + 12 + 11"
+    assert "semantic_path (10 times), features_path" in messages["file-unread"]
+
+
+@pytest.mark.parametrize("suffix", [".png", ""])
+def test_an_ambiguous_name_is_told_once(capture, capsys, suffix):
+    folder = capture()
+    photo = folder / "images" / "003.png"
+    shutil.copy(photo, folder / "images" / "Photo.png")
+    photo.rename(folder / "images" / "PHOTO.png")
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").write_text(text.replace("003.png", f"photo{suffix}"))
+    _, report = checked(folder, capsys)
+    assert [each["code"] for each in report["findings"]] == ["name-ambiguous"]
+
+
 def test_an_unusable_capture_has_status_2_and_one_sentence(tmp_path, capsys):
     assert main(["check", str(tmp_path / "absent")]) == 2
     assert capsys.readouterr().err.count("\n") == 1

@@ -10,7 +10,7 @@ import contextlib
 import os
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -70,6 +70,18 @@ class FileNames:
                 return None
         return None
 
+    def find_any(self, names: Iterable[str]) -> Path | None:
+        """Return the file of the first name that has one; None if none has.
+
+        Names that are ambiguous count as such only if no other name has a file.
+        """
+        known = dict(self.ambiguous)
+        for name in names:
+            if (found := self.find(name)) is not None:
+                self.ambiguous = known
+                return found
+        return None
+
     def _below(self, name: str, absolute: str) -> Path | None:
         """Return the file whose path ends as an absolute path of another machine does."""
         parts = [part for part in absolute.split("/") if part not in ("", ".", "..")]
@@ -89,6 +101,13 @@ class FileNames:
             for file in files:
                 index[form(file)].append(file)
         return indices
+
+    def ambiguous_paths(self) -> dict[Path, list[Path]]:
+        """Return the paths that ambiguous names would have, with the files that they match."""
+        return {
+            self.folder / normalised(name): [self.folder / file for file in files]
+            for name, files in self.ambiguous.items()
+        }
 
     def findings(self) -> list[Finding]:
         """Return what was found under another spelling, and what is ambiguous."""

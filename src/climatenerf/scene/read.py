@@ -17,7 +17,7 @@ from climatenerf.scene.alignment.world_frame import align_scene
 from climatenerf.scene.checks.check import corrected
 from climatenerf.scene.checks.intrinsics import corrected_camera
 from climatenerf.scene.checks.sidecars import sidecar_findings, unused_findings
-from climatenerf.scene.findings import Finding, without_repeats
+from climatenerf.scene.findings import Finding, counted, without_repeats
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import Header, read_header
 from climatenerf.scene.label_spaces import checked_label_space
@@ -106,7 +106,9 @@ def read_scene(
     )
     aligned = _aligned(scene, saved, camera_height, metric_input, capture.metric, gravity)
     aligned = checked_world(aligned, str(path))
-    odd = (*aligned.findings, *sidecar_findings(aligned), *unused_findings(aligned, capture.views))
+    matching = [file for files in capture.ambiguous.values() for file in files]
+    unused = unused_findings(aligned, capture.views, matching)
+    odd = (*aligned.findings, *sidecar_findings(aligned), *unused)
     # What concerns no single file concerns the capture.
     odd = (each if each.file else replace(each, file=str(path)) for each in odd)
     return replace(aligned, findings=without_repeats(odd))
@@ -221,22 +223,23 @@ def _check_images(capture: Capture) -> Capture:
     """Leave out missing images, fit the cameras to the image sizes, and sort views by name."""
     findings = list(capture.findings)
     present = [v for v in capture.views if is_file(v.path)]
-    missing = len(capture.views) - len(present)
+    absent = [v for v in capture.views if not is_file(v.path) and v.path not in capture.ambiguous]
     if len(present) < MIN_IMAGES:
         folder = capture.views[0].path.parent if capture.views else capture.root
+        count = len(capture.ambiguous)
+        several = f" ({counted(count, 'name')} with several matching files)" if count else ""
         raise UserError(
             f"Only {len(present)} of the {len(capture.views)} images with poses exist in {folder}; "
-            f"at least {MIN_IMAGES} are needed, so restore them or correct the names."
+            f"at least {MIN_IMAGES} are needed, so restore them or correct the names{several}."
         )
-    if missing:
-        first = next(v.name for v in capture.views if not is_file(v.path))
-        folder = next(v.path.parent for v in capture.views if not is_file(v.path))
+    if absent:
         message = (
-            f"{missing} of the {len(capture.views)} images with poses are not on disk "
-            f"(first: {first}); they are left out"
+            f"{len(absent)} of the {len(capture.views)} images with poses are not on disk "
+            f"(first: {absent[0].name}); they are left out"
         )
         remedy = "restore them, or remove their poses"
-        findings.append(Finding("photo-missing", message, remedy, file=str(folder)))
+        file = str(absent[0].path.parent)
+        findings.append(Finding("photo-missing", message, remedy, file=file))
     present = sorted(_with_inner_names(present), key=lambda v: v.name)
     for a, b in zip(present, present[1:], strict=False):
         if a.name == b.name:

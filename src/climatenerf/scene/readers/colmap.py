@@ -113,6 +113,7 @@ def read_colmap(root: Path) -> Capture:
         views=views,
         points=points if len(points) else None,
         findings=(*findings, *_feature_lines(model, chosen), *files.findings()),
+        ambiguous=files.ambiguous_paths(),
     )
 
 
