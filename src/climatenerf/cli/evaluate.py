@@ -22,13 +22,13 @@ class Evaluate:
     """Run folder from `climatenerf fit reference/street`; with --ablation the reference set."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
-    reference: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    reference: bool = False
     """Compare with the reference set that the run was fitted to: geometry, weather, baselines."""
     views: tuple[str, ...] = ()
     """Test views to score, such as t01 t04. Default: all."""
     weathers: tuple[str, ...] = ()
     """Weathers to score, such as flood-low smog-near. Default: all."""
-    ablation: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    ablation: bool = False
     """Fit a reference set with one part of the method left out at a time, and score each fit: eight
     rows, an hour and a half with the defaults. Re-run the same command to resume."""
     minutes: float = 4.0
