@@ -12,6 +12,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError
+from climatenerf.core.locks import only_writer
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,6 @@ def run(options: Evaluate) -> int:
     measured = options.run / "metrics.json"  # absent after an interrupted fit
     metrics = checked_metrics(measured) if measured.exists() else {}
     names = ["clean", *(case.name for case in reference.weathers)]
-    old = check_folder(options.out, names)
-    with progress.Bar("evaluate", len(names) + 7) as bar:
-        scores = evaluate(
-            EvaluatedRun(field, scene, reference), lambda step: bar.advance(1, {"now": step})
-        )
     description = {
         "run": options.run.resolve().name,
         "capture": scene.root.name,
@@ -84,7 +80,14 @@ def run(options: Evaluate) -> int:
         "downscale": config.get("downscale"),
         "views": [Path(truth.name).stem for truth in reference.truths],
     }
-    write_report(scores, description, options.out, old)
+    check_folder(options.out, names)
+    with only_writer(options.out):
+        old = check_folder(options.out, names)
+        with progress.Bar("evaluate", len(names) + 7) as bar:
+            scores = evaluate(
+                EvaluatedRun(field, scene, reference), lambda step: bar.advance(1, {"now": step})
+            )
+        write_report(scores, description, options.out, old)
     progress.result(table_text(scores.table))
     progress.result(f"report: {options.out / 'report.md'}")
     return 0
