@@ -239,6 +239,28 @@ def test_an_exception_that_follows_a_signal_is_the_interruption(verb, capsys):
     assert err.startswith("climatenerf: interrupted (SystemError") and err.count("\n") == 1
 
 
+def test_a_signal_within_a_finaliser_ends_the_verb(verb, capsys):
+    """Python drops exceptions that leave finalisers and callbacks, such as those of imports."""
+
+    class Dying:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+            sum(range(1000))
+
+    def run(options):
+        del_me = Dying()
+        del del_me
+        time.sleep(5)
+        return 0
+
+    verb.run = run
+    hook, start = sys.unraisablehook, time.monotonic()
+    assert cli.main(["fit", "--scene", "a"]) == 143
+    assert time.monotonic() - start < 4
+    assert capsys.readouterr().err == "\nclimatenerf: interrupted\n"
+    assert sys.unraisablehook is hook
+
+
 def test_wrong_options_exit_with_2(verb, capsys):
     assert cli.main(["fit", "--scene", "a", "--minutse", "2"]) == 2
     assert "did you mean --minutes?" in capsys.readouterr().err

@@ -179,7 +179,7 @@ def _with_focal(photo: _Photo, factor: float) -> _Photo:
 
 def _inside(pixel: Float[np.ndarray, "n k 2"], photo: _Photo) -> np.ndarray:
     height, width = photo.values.shape
-    return ((pixel > 1) & (pixel < (width - 1, height - 1))).all(axis=(1, 2))
+    return np.all((pixel > 1) & (pixel < (width - 1, height - 1)), axis=(1, 2))
 
 
 def _focal_finding(
