@@ -2,8 +2,10 @@ import json
 import re
 import shutil
 from pathlib import Path
+from unicodedata import normalize
 
 import pytest
+from PIL import Image
 from support.scene_builders import OPENGL
 from support.textured_scene import CAMERA, textured_scene
 
@@ -109,6 +111,23 @@ def test_an_ambiguous_name_is_told_once(capture, capsys, suffix):
     (folder / "transforms.json").write_text(text.replace("003.png", f"photo{suffix}"))
     _, report = checked(folder, capsys)
     assert [each["code"] for each in report["findings"]] == ["name-ambiguous"]
+
+
+def test_sidecars_are_matched_as_photos_are(capture, capsys):
+    folder = capture()
+    (folder / "labels").mkdir()
+    for photo in sorted((folder / "images").iterdir()):
+        label = Image.new("L", (CAMERA.width, CAMERA.height))
+        label.save(folder / "labels" / photo.name)
+    name = "Gebäude é.png"
+    (folder / "images" / "003.png").rename(folder / "images" / normalize("NFC", name))
+    (folder / "labels" / "003.png").rename(folder / "labels" / normalize("NFD", name))
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").write_text(text.replace("003.png", normalize("NFC", name)))
+    _, report = checked(folder, capsys)
+    assert report["used"]["labels"] == 12
+    (finding,) = report["findings"]
+    assert finding["code"] == "name-normalised" and finding["file"] == str(folder / "labels")
 
 
 def test_an_unusable_capture_has_status_2_and_one_sentence(tmp_path, capsys):

@@ -176,6 +176,13 @@ def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path, monkeypatch):
     assert read_header(tmp_path / "b.png").orientation == 6
 
 
+def test_pictures_that_are_programs_are_refused(tmp_path):
+    head = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\nshowpage\n"
+    (tmp_path / "a.jpg").write_bytes(head)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_header(tmp_path / "a.jpg")
+
+
 def test_signals_are_found_in_profiles_and_nclx_boxes():
     image = Image.new("RGB", (2, 2))
     assert hdr_of(image) is None

@@ -62,6 +62,8 @@ class FileNames:
             return None
         for form, index in zip(_FORMS, self._indices, strict=True):
             found = index.get(form(relative), [])
+            if found == [relative]:  # a pipe, or a link to nothing
+                return None
             if len(found) == 1:
                 self.respelled[name] = self.folder / found[0]
                 return self.respelled[name]

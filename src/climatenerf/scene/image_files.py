@@ -31,6 +31,7 @@ _TRANSFERS: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
 _PRIMARIES = {1: "bt709", 9: "bt2020", 11: "p3", 12: "p3"}
 _MAX_CHUNKS = 200  # of a PNG before its pixels
 _AVIF_HEAD = 1 << 16  # bytes that hold the properties of an AVIF image
+_PROGRAMS = ("EPS", "WMF")  # Pillow has Ghostscript or Windows run them
 _SAME = 2  # 8-bit values by which a profile may differ from sRGB and still be left alone
 
 _pixel_limit = threading.Lock()
@@ -67,6 +68,8 @@ def open_image(path: Path, name: str | None = None) -> Iterator[Image.Image]:
         with _without_pixel_limit():
             image = Image.open(file)
         with image:
+            if image.format in _PROGRAMS:
+                raise ValueError(f"{name} is a program rather than a picture")
             if image.width * image.height > MAX_PIXELS:
                 raise UserError(
                     f"{name} has {image.width}x{image.height} pixels, above the limit of"

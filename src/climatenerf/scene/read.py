@@ -17,6 +17,7 @@ from climatenerf.scene.alignment.world_frame import align_scene
 from climatenerf.scene.checks.check import corrected
 from climatenerf.scene.checks.intrinsics import corrected_camera
 from climatenerf.scene.checks.sidecars import sidecar_findings, unused_findings
+from climatenerf.scene.file_names import FileNames
 from climatenerf.scene.findings import Finding, counted, without_repeats
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import Header, read_header
@@ -329,23 +330,28 @@ def _find_sidecars(capture: Capture) -> Capture:
     folders give a warning.
     """
     views = []
+    labels, masks, depths = (FileNames(capture.root / n) for n in ("labels", "masks", "depth"))
     for view in capture.views:
-        label = view.label_path or _sidecar(capture.root / "labels", view)
-        mask = view.mask_path or _sidecar(capture.root / "masks", view)
-        depth = view.depth_path or _sidecar(capture.root / "depth", view, (".npz", ".npy", ".png"))
+        label = view.label_path or _sidecar(labels, view)
+        mask = view.mask_path or _sidecar(masks, view)
+        depth = view.depth_path or _sidecar(depths, view, (".npz", ".npy", ".png"))
         if mask is not None and not is_file(mask):
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
         views.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
-    findings = (*capture.findings, *_sidecar_findings(capture.root, views))
+    odd = [each for files in (labels, masks, depths) for each in files.findings()]
+    findings = (*capture.findings, *odd, *_sidecar_findings(capture.root, views))
     return replace(capture, views=tuple(views), findings=findings)
 
 
-def _sidecar(folder: Path, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
-    if Path(view.name).is_absolute():  # joining it to `folder` would give the photo itself
+def _sidecar(files: FileNames, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
+    name = Path(view.name)
+    if name.is_absolute() or not files.folder.is_dir():
         return None
-    base = folder / view.name
-    candidates = [p for s in suffixes for p in (base.with_suffix(s), Path(f"{base}{s}"))]
-    return next((p for p in candidates if is_file(p)), None)
+    names = [
+        f"{n}{s}" for s in suffixes for n in (name.with_suffix("").as_posix(), name.as_posix())
+    ]
+    exact = next((p for n in names if is_file(p := files.folder / n)), None)
+    return exact or files.find_any(names)
 
 
 def _sidecar_findings(root: Path, views: Sequence[View]) -> list[Finding]:
