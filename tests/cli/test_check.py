@@ -130,6 +130,19 @@ def test_sidecars_are_matched_as_photos_are(capture, capsys):
     assert finding["code"] == "name-normalised" and finding["file"] == str(folder / "labels")
 
 
+def test_a_sidecar_stays_with_the_photo_of_its_exact_name(capture, capsys):
+    folder = capture()
+    (folder / "labels").mkdir()
+    for number, name in ((3, "a.png"), (4, "A.png")):
+        (folder / "images" / f"{number:03}.png").rename(folder / "images" / name)
+        path = folder / "transforms.json"
+        path.write_text(path.read_text().replace(f"{number:03}.png", name))
+    Image.new("L", (CAMERA.width, CAMERA.height)).save(folder / "labels" / "a.png")
+    _, report = checked(folder, capsys)
+    assert report["used"]["labels"] == 1
+    assert [each["code"] for each in report["findings"]] == ["sidecar-partial"]
+
+
 def test_an_unusable_capture_has_status_2_and_one_sentence(tmp_path, capsys):
     assert main(["check", str(tmp_path / "absent")]) == 2
     assert capsys.readouterr().err.count("\n") == 1

@@ -329,29 +329,46 @@ def _find_sidecars(capture: Capture) -> Capture:
     A sidecar is named `NAME.png` or `NAME.jpg.png`; depths may also be `.npz` or `.npy`. Incomplete
     folders give a warning.
     """
+    labels, odd_labels = _sidecars(capture.root / "labels", capture.views)
+    masks, odd_masks = _sidecars(capture.root / "masks", capture.views)
+    suffixes = (".npz", ".npy", ".png")
+    depths, odd_depths = _sidecars(capture.root / "depth", capture.views, suffixes)
     views = []
-    labels, masks, depths = (FileNames(capture.root / n) for n in ("labels", "masks", "depth"))
-    for view in capture.views:
-        label = view.label_path or _sidecar(labels, view)
-        mask = view.mask_path or _sidecar(masks, view)
-        depth = view.depth_path or _sidecar(depths, view, (".npz", ".npy", ".png"))
+    for view, label, mask, depth in zip(capture.views, labels, masks, depths, strict=True):
+        mask = view.mask_path or mask
         if mask is not None and not is_file(mask):
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
+        label, depth = view.label_path or label, view.depth_path or depth
         views.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
-    odd = [each for files in (labels, masks, depths) for each in files.findings()]
-    findings = (*capture.findings, *odd, *_sidecar_findings(capture.root, views))
-    return replace(capture, views=tuple(views), findings=findings)
+    odd = (*odd_labels, *odd_masks, *odd_depths, *_sidecar_findings(capture.root, views))
+    return replace(capture, views=tuple(views), findings=(*capture.findings, *odd))
 
 
-def _sidecar(files: FileNames, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
+def _sidecars(
+    folder: Path, views: Sequence[View], suffixes: tuple[str, ...] = (".png",)
+) -> tuple[list[Path | None], list[Finding]]:
+    """Return the file of each view in a folder, and what is odd about their names."""
+    if not folder.is_dir():
+        return [None] * len(views), []
+    names = [_sidecar_names(view, suffixes) for view in views]
+    found = [next((p for n in each if is_file(p := folder / n)), None) for each in names]
+    files, exact = FileNames(folder), set(found)
+    for i, each in enumerate(names):
+        # The file of another photo, whose name differs in case only, stays with that.
+        if found[i] is None and (other := files.find_any(each)) is not None:
+            if other in exact:
+                files.respelled = {n: p for n, p in files.respelled.items() if p != other}
+            else:
+                found[i] = other
+    return found, files.findings()
+
+
+def _sidecar_names(view: View, suffixes: tuple[str, ...]) -> list[str]:
     name = Path(view.name)
-    if name.is_absolute() or not files.folder.is_dir():
-        return None
-    names = [
-        f"{n}{s}" for s in suffixes for n in (name.with_suffix("").as_posix(), name.as_posix())
-    ]
-    exact = next((p for n in names if is_file(p := files.folder / n)), None)
-    return exact or files.find_any(names)
+    if name.is_absolute():
+        return []
+    stems = (name.with_suffix("").as_posix(), name.as_posix())
+    return [f"{stem}{suffix}" for suffix in suffixes for stem in stems]
 
 
 def _sidecar_findings(root: Path, views: Sequence[View]) -> list[Finding]:
