@@ -5,6 +5,8 @@ import sys
 import pytest
 from support.command_line import error_message
 
+from climatenerf.cli import VERBS, main
+
 RENDER = ("render", "run", "-o", "out")
 
 
@@ -26,6 +28,15 @@ def test_a_wrong_flag_is_one_sentence_with_status_2(args, expected, capsys):
     found = error_message(capsys, *args)
     assert expected in found and "None" not in found
     assert "\n" not in found
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_has_no_words_of_the_parser(verb, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([verb, "--help"])
+    found = capsys.readouterr().out
+    assert end.value.code in (0, None) and f"climatenerf {verb}" in found
+    assert "None" not in found and "--no-" not in found
 
 
 def test_boxes_of_utf_8_and_of_ascii_give_the_same_sentence():

@@ -239,6 +239,28 @@ def test_an_exception_that_follows_a_signal_is_the_interruption(verb, capsys):
     assert err.startswith("climatenerf: interrupted (SystemError") and err.count("\n") == 1
 
 
+def test_a_signal_within_a_finaliser_ends_the_verb(verb, capsys):
+    """Python drops exceptions that leave finalisers and callbacks, such as those of imports."""
+
+    class Dying:
+        def __del__(self):
+            os.kill(os.getpid(), signal.SIGTERM)
+            sum(range(1000))
+
+    def run(options):
+        del_me = Dying()
+        del del_me
+        time.sleep(5)
+        return 0
+
+    verb.run = run
+    hook, start = sys.unraisablehook, time.monotonic()
+    assert cli.main(["fit", "--scene", "a"]) == 143
+    assert time.monotonic() - start < 4
+    assert capsys.readouterr().err == "\nclimatenerf: interrupted\n"
+    assert sys.unraisablehook is hook
+
+
 def test_wrong_options_exit_with_2(verb, capsys):
     assert cli.main(["fit", "--scene", "a", "--minutse", "2"]) == 2
     assert "did you mean --minutes?" in capsys.readouterr().err
@@ -265,3 +287,16 @@ def test_help_of_a_verb_does_not_load_torch(verb):
     done = subprocess.run(args, capture_output=True, text=True, timeout=60)
     assert done.stdout.rstrip().endswith("HEAVY [] STATUS 0"), done.stdout + done.stderr
     assert f"climatenerf {verb}" in done.stdout
+
+
+def test_a_signal_within_executed_text_keeps_its_status(tmp_path):
+    """Imports execute text, that of dataclasses; `python -m` then ends with SIGINT by itself."""
+    text = "import os, signal; os.kill(os.getpid(), signal.SIGTERM)"
+    code = (
+        "import sys\nfrom climatenerf import cli\n"
+        f"cli._run = lambda words: exec({text!r})\nsys.exit(cli.main([]))\n"
+    )
+    (tmp_path / "stopped.py").write_text(code)
+    words = [sys.executable, "-m", "stopped"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (143, "\nclimatenerf: interrupted\n")

@@ -1,3 +1,4 @@
+import os
 import unicodedata
 
 import pytest
@@ -67,3 +68,11 @@ def test_cyclic_links_are_not_followed_forever(tmp_path):
     touch(tmp_path, "images/a.jpg")
     (tmp_path / "images" / "loop").symlink_to(tmp_path)
     assert FileNames(tmp_path).find("IMAGES/A.JPG") == tmp_path / "images" / "a.jpg"
+
+
+def test_what_is_no_file_is_not_found_under_another_spelling(tmp_path):
+    os.mkfifo(tmp_path / "pipe.jpg")
+    (tmp_path / "loop.jpg").symlink_to("loop.jpg")
+    files = FileNames(tmp_path)
+    assert files.find("pipe.jpg") is None and files.find("loop.jpg") is None
+    assert codes(files) == []

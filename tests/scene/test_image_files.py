@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFile, PngImagePlugin, features
 from support.hdr_signals import CHART, chart_image, hlg_signal, patches, pq_signal
 from support.icc_profiles import cicp_profile, display_p3
 from support.scene_builders import ring, write_colmap, write_transforms
@@ -135,6 +135,52 @@ def test_hdr_photos_named_by_their_profile_are_tone_mapped(tmp_path, code, encod
     found = patches(load_image(scene.views[0], scene))
     # 8 bits of PQ resolve 3 % of luminance only, which is 8 values of the red of cyan.
     assert np.abs(found - CHART)[BELOW_KNEE].max() <= (3 if code == 18 else 10)
+
+
+@pytest.mark.parametrize(("code", "encode"), [(18, hlg_signal), (16, pq_signal)])
+def test_hdr_png_named_by_a_chunk_is_tone_mapped(tmp_path, code, encode):
+    values = np.rint(encode(chart_image()) * 255).astype(np.uint8)
+    chunks = PngImagePlugin.PngInfo()
+    chunks.add_text("Comment", "x" * 5000)
+    chunks.add(b"cICP", bytes([9, code, 0, 1]))
+    scene = png_scene(tmp_path, lambda path: Image.fromarray(values).save(path, pnginfo=chunks))
+    assert [each.code for each in scene.findings if each.code == "photo-hdr"]
+    found = patches(load_image(scene.views[0], scene))
+    assert np.abs(found - CHART)[BELOW_KNEE].max() <= (3 if code == 18 else 10)
+
+
+@pytest.mark.skipif(not features.check("avif"), reason="Pillow lacks AVIF")
+@pytest.mark.parametrize(("code", "encode"), [(18, hlg_signal), (16, pq_signal)])
+def test_hdr_avif_is_tone_mapped(tmp_path, code, encode):
+    values = np.rint(encode(chart_image()) * 255).astype(np.uint8)
+
+    def save(path):
+        Image.fromarray(values).save(path, "AVIF", quality=100, subsampling="4:4:4")
+        data = path.read_bytes()
+        at = data.index(b"colrnclx") + 8
+        path.write_bytes(data[:at] + bytes([0, 9, 0, code]) + data[at + 4 :])
+
+    scene = png_scene(tmp_path, save)
+    found = patches(load_image(scene.views[0], scene))
+    assert np.abs(found - CHART)[BELOW_KNEE].max() <= (10 if code == 18 else 20)
+
+
+def test_the_header_of_a_png_is_read_without_its_pixels(tmp_path, monkeypatch):
+    Image.new("RGB", (40, 30)).save(tmp_path / "a.png")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (40, 30)).save(tmp_path / "b.png", exif=exif)
+    monkeypatch.setattr(Image.Image, "load", lambda self: pytest.fail("decoded"))
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda self: pytest.fail("decoded"))
+    assert read_header(tmp_path / "a.png").width == 40
+    assert read_header(tmp_path / "b.png").orientation == 6
+
+
+def test_pictures_that_are_programs_are_refused(tmp_path):
+    head = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\nshowpage\n"
+    (tmp_path / "a.jpg").write_bytes(head)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_header(tmp_path / "a.jpg")
 
 
 def test_signals_are_found_in_profiles_and_nclx_boxes():

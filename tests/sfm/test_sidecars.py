@@ -63,7 +63,7 @@ def test_labels_are_resampled_through_the_lens(scene, tmp_path, name, scale):
     plain = np.asarray(Image.fromarray(classes(LENS)[0]).resize((150, 112), 0))
     assert (plain != true)[~edges(true)].any()
     assert out.views[1].label_path is None
-    assert out.warnings == ("2 of 3 pictures have no labels.",)
+    assert out.warnings == ("2 of 3 pictures have no labels; name each file after its photo.",)
 
 
 @pytest.mark.parametrize("orientation", [1, 6, 8])

@@ -33,6 +33,8 @@ THREADING = {
     "KMP_BLOCKTIME": "0",
     "NUMBA_THREADING_LAYER_PRIORITY": "omp tbb workqueue",
 }
+SECONDS_TO_NEXT_SIGNAL = 0.05
+"""After which a signal is repeated whose exception Python has dropped."""
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 streams.complain("".join(traceback.format_exception(error)))
             status, sentence = outcome(error, received)
             streams.complain(sentence)
-            return status
         except KeyboardInterrupt as again:  # a second signal
-            return outcome(again)[0]
+            status = outcome(again)[0]
+        _forget_interruption()
+        return status
+
+
+def _forget_interruption() -> None:
+    """Let Python end with the status of `main` after an interruption within `exec`.
+
+    CPython notes that a KeyboardInterrupt left code that was executed from text, such as that of
+    every dataclass of an import, and at its end kills itself with SIGINT. Executing another text
+    clears the note.
+    """
+    exec("")
 
 
 def outcome(error: BaseException, received: Sequence[int] = ()) -> tuple[int, str]:
@@ -168,7 +181,17 @@ def _stopped_like_ctrl_c(received: list[int]) -> Iterator[None]:
         received.append(number)
         raise KeyboardInterrupt(number)
 
+    def stop_again(unraisable: "sys.UnraisableHookArgs") -> None:
+        # Python drops an exception that leaves a finaliser or a callback, of imports too.
+        if isinstance(unraisable.exc_value, KeyboardInterrupt) and received:
+            timer = threading.Timer(SECONDS_TO_NEXT_SIGNAL, _interrupt_main_thread, received[-1:])
+            timer.daemon = True
+            timer.start()
+        else:
+            hook(unraisable)
+
     replaced = {}
+    hook, sys.unraisablehook = sys.unraisablehook, stop_again
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows lacks the last
             number = getattr(signal, name, None)
@@ -180,8 +203,16 @@ def _stopped_like_ctrl_c(received: list[int]) -> Iterator[None]:
     try:
         yield
     finally:
+        sys.unraisablehook = hook
         for number, handler in replaced.items():
             signal.signal(number, handler)
+
+
+def _interrupt_main_thread(number: int) -> None:
+    if hasattr(signal, "pthread_kill"):  # it also ends a wait of the main thread
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _run(words: list[str]) -> int:

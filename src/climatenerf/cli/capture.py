@@ -9,6 +9,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.cli.fit import check_known_lengths, frame_line, parse_known_lengths
+from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError
 from climatenerf.scene.alignment.known_length import FILE_NAME as MARKS
 from climatenerf.scene.scene import FILE_NAME as SCENE
@@ -26,19 +27,19 @@ class Capture:
     """Scene folder to make."""
     features: int = 4096
     """Maximum number of features per picture."""
-    from_colmap: Path | None = None
+    from_colmap: Annotated[Path | None, optional("PATH")] = None
     """Folder of a COLMAP model of these photos, to take the poses from."""
-    labels: Path | None = None
+    labels: Annotated[Path | None, optional("PATH")] = None
     """Folder of class pictures (8-bit Cityscapes train ids), named like the photos."""
-    masks: Path | None = None
+    masks: Annotated[Path | None, optional("PATH")] = None
     """Folder of masks (black pixels are ignored), named like the photos."""
-    depth: Path | None = None
+    depth: Annotated[Path | None, optional("PATH")] = None
     """Folder of z-depths (16-bit PNG in mm; NPY or NPZ in m), named like the photos."""
     camera_height: OptionalLength = None
     """Height of the cameras above the ground, which sets the scale."""
     known_length: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
-    marks: Path | None = None
+    marks: Annotated[Path | None, optional("PATH")] = None
     """File of the marks at which known lengths end. Default: marks.toml in the scene folder."""
     seed: int = 0
     """Random seed."""

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError
 from climatenerf.scene import read_scene
 from climatenerf.scene.alignment.scale import scale_findings
@@ -26,13 +27,13 @@ class Check:
     """Folder or transforms.json of any capture that `fit` reads, or a run or scene folder."""
     json: bool = False
     """Print the findings as JSON."""
-    camera_height: Annotated[str | None, tyro.conf.arg(metavar="LENGTH")] = None
+    camera_height: Annotated[str | None, optional("LENGTH")] = None
     """Height of the cameras above the ground, such as "1.6 m", as for `fit`."""
     metric_input: bool = False
     """The poses are already in metres with z up."""
-    frames: str | None = None
+    frames: Annotated[str | None, optional("STR")] = None
     """First and last frame of a KITTI-360 drive, such as 1538:1601."""
-    label_space: str | None = None
+    label_space: Annotated[str | None, optional("STR")] = None
     """Meaning of the numbers in label files; see `fit`."""
 
 

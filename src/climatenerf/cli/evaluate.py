@@ -12,6 +12,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError
+from climatenerf.core.locks import only_writer
 
 
 @dataclass(frozen=True)
@@ -22,13 +23,13 @@ class Evaluate:
     """Run folder from `climatenerf fit reference/street`; with --ablation the reference set."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
-    reference: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    reference: bool = False
     """Compare with the reference set that the run was fitted to: geometry, weather, baselines."""
     views: tuple[str, ...] = ()
     """Test views to score, such as t01 t04. Default: all."""
     weathers: tuple[str, ...] = ()
     """Weathers to score, such as flood-low smog-near. Default: all."""
-    ablation: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    ablation: bool = False
     """Fit a reference set with one part of the method left out at a time, and score each fit: eight
     rows, an hour and a half with the defaults. Re-run the same command to resume."""
     minutes: float = 4.0
@@ -71,11 +72,6 @@ def run(options: Evaluate) -> int:
     measured = options.run / "metrics.json"  # absent after an interrupted fit
     metrics = checked_metrics(measured) if measured.exists() else {}
     names = ["clean", *(case.name for case in reference.weathers)]
-    old = check_folder(options.out, names)
-    with progress.Bar("evaluate", len(names) + 7) as bar:
-        scores = evaluate(
-            EvaluatedRun(field, scene, reference), lambda step: bar.advance(1, {"now": step})
-        )
     description = {
         "run": options.run.resolve().name,
         "capture": scene.root.name,
@@ -84,7 +80,14 @@ def run(options: Evaluate) -> int:
         "downscale": config.get("downscale"),
         "views": [Path(truth.name).stem for truth in reference.truths],
     }
-    write_report(scores, description, options.out, old)
+    check_folder(options.out, names)
+    with only_writer(options.out):
+        old = check_folder(options.out, names)
+        with progress.Bar("evaluate", len(names) + 7) as bar:
+            scores = evaluate(
+                EvaluatedRun(field, scene, reference), lambda step: bar.advance(1, {"now": step})
+            )
+        write_report(scores, description, options.out, old)
     progress.result(table_text(scores.table))
     progress.result(f"report: {options.out / 'report.md'}")
     return 0

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.core.locks import only_writer
 from climatenerf.scene import read_scene
 from climatenerf.scene.export import export_colmap, export_transforms
 
@@ -28,6 +29,7 @@ def run(options: Export) -> int:
     scene = read_scene(options.scene)
     progress.report_findings(scene.findings)
     writers = {"transforms": export_transforms, "colmap": export_colmap}
-    for name in dict.fromkeys(options.format):
-        progress.result(f"{name}: {writers[name](scene, options.out)}")
+    with only_writer(options.out):
+        for name in dict.fromkeys(options.format):
+            progress.result(f"{name}: {writers[name](scene, options.out)}")
     return 0

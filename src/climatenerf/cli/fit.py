@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError
 from climatenerf.core.input_limits import check_seed
 from climatenerf.scene import Scene, read_scene
@@ -37,19 +38,19 @@ class Fit:
     mip-NeRF 360, KITTI-360 or Mega-NeRF."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Run folder to make."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, optional("FLOAT")] = None
     """Time for fitting steps, minutes; reading, previews, saving and measuring are not counted.
     Default: 5, or no limit if --steps is given."""
-    steps: int | None = None
+    steps: Annotated[int | None, optional("INT")] = None
     """Stop after this many steps. With --minutes, the limit that is reached first counts."""
     downscale: int = 1
     """Factor by which the photos are reduced in width and height."""
-    holdout: str | None = None
+    holdout: Annotated[str | None, optional("STR")] = None
     """Photos held out for measuring: names separated by commas, or 0 for none. Default: the
     capture's own split, else every 8th photo by name."""
     resume: bool = False
     """Resume the run in the folder. --minutes counts from the beginning of the run."""
-    preset: Literal["cpu", "gpu", "paper"] | None = None
+    preset: Annotated[Literal["cpu", "gpu", "paper"] | None, optional("{cpu,gpu,paper}")] = None
     """Size of the field. gpu: larger tables. paper: the sizes and loss weights of the paper
     (docs/physics.md lists the differences); its sky is opaque according to the labels of each
     photo, and keeps snow away. Default: gpu with --device cuda, else cpu."""
@@ -64,19 +65,19 @@ class Fit:
     """Height of the cameras above the ground, which sets the scale."""
     known_length: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Lengths that set the scale, such as "DOOR=2.0 m", marked in pictures (see --marks)."""
-    marks: Path | None = None
+    marks: Annotated[Path | None, optional("PATH")] = None
     """File of the marks at which known lengths end. Default: marks.toml in the scene folder."""
     metric_input: bool = False
     """The poses are already in metres with z up."""
-    frames: str | None = None
+    frames: Annotated[str | None, optional("STR")] = None
     """First and last frame of a KITTI-360 drive, such as 1538:1601."""
-    label_space: str | None = None
+    label_space: Annotated[str | None, optional("STR")] = None
     """Meaning of the numbers in label files: cityscapes-train-ids, cityscapes-ids or seven.
     Default: what the capture states."""
-    labels: str | None = None
+    labels: Annotated[str | None, optional("STR")] = None
     """Class labels: none, heuristic (sky and ground without a network), or a network's name or
     folder. Default: the capture's label files, else heuristic if the photos clearly show sky."""
-    mono_depth: str | None = None
+    mono_depth: Annotated[str | None, optional("STR")] = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the
     capture's depth_relative files, else its depth files; none ignores both."""
     device: Literal["cpu", "cuda"] = "cpu"

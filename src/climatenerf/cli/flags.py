@@ -16,6 +16,17 @@ _NO_TYPE = re.compile(
 )
 
 
+def optional(metavar: str) -> Any:
+    """Return the help of a flag whose default, None, means nothing to a reader.
+
+    Args:
+        metavar: what stands for the value: STR, INT, FLOAT or PATH, which messages know.
+    """
+    import tyro
+
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
 def parse_flags(kind: type, prog: str, words: Sequence[str]) -> Any:
     """Return the options of a verb; tyro prints help itself and exits with status 0.
 
@@ -32,7 +43,10 @@ def parse_flags(kind: type, prog: str, words: Sequence[str]) -> Any:
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, prog=prog, args=list(words))
+            # Without --no-FLAG for flags that are off by default.
+            return tyro.cli(
+                kind, prog=prog, args=list(words), config=(tyro.conf.FlagCreatePairsOff,)
+            )
     except BrokenPipeError:  # the reader of the help, such as `| head`, has read enough
         streams.flush_output()
         raise SystemExit(0) from None

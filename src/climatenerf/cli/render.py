@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
@@ -26,7 +27,7 @@ class Render:
     """Run folder made by `climatenerf fit`."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the frames, the movie and the layers."""
-    weather: Path | None = None
+    weather: Annotated[Path | None, optional("PATH")] = None
     """Weather file (TOML); flags override it."""
     path: str = "training"
     """Camera path: training, orbit, still, still:NAME, or a nerfstudio camera_path.json."""
@@ -34,7 +35,7 @@ class Render:
     """Number of frames."""
     fps: float = 24.0
     """Frames per second of the movie."""
-    size: str | None = None
+    size: Annotated[str | None, optional("STR")] = None
     """Size of the frames, such as 480x270. Default: the photos' own."""
     supersample: int = 1
     """Rays per pixel along each side."""
@@ -47,10 +48,10 @@ class Render:
     them."""
     layer_format: tuple[Literal["npz", "png", "exr"], ...] = ("npz",)
     """File formats of the layers."""
-    part: str | None = None
+    part: Annotated[str | None, optional("STR")] = None
     """Render a part of the frames, such as 3/16: frames 0002, 0018, 0034, ... Several processes can
     each render a part of one folder; --join then assembles them."""
-    join: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    join: bool = False
     """Render nothing; assemble movie.mp4 and movie.json from finished frames."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the present

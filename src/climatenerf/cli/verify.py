@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.cli.flags import optional
 from climatenerf.verification.check import Check
 
 if TYPE_CHECKING:
@@ -24,9 +25,9 @@ class Verify:
     """Check the physics of the installed program against closed forms: a table of figures and
     thresholds. The exit status is 1 if a check fails."""
 
-    run: tyro.conf.Positional[Path | None] = None
+    run: Annotated[Path | None, tyro.conf.Positional, optional("[PATH]")] = None
     """Run folder made by `climatenerf fit`, to be checked as well."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    json: bool = False
     """Print JSON instead of a table."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute."""

@@ -10,7 +10,7 @@ import contextlib
 import os
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 
@@ -62,12 +62,26 @@ class FileNames:
             return None
         for form, index in zip(_FORMS, self._indices, strict=True):
             found = index.get(form(relative), [])
+            if found == [relative]:  # a pipe, or a link to nothing
+                return None
             if len(found) == 1:
                 self.respelled[name] = self.folder / found[0]
                 return self.respelled[name]
             if found:
                 self.ambiguous[name] = found
                 return None
+        return None
+
+    def find_any(self, names: Iterable[str]) -> Path | None:
+        """Return the file of the first name that has one; None if none has.
+
+        Names that are ambiguous count as such only if no other name has a file.
+        """
+        known = dict(self.ambiguous)
+        for name in names:
+            if (found := self.find(name)) is not None:
+                self.ambiguous = known
+                return found
         return None
 
     def _below(self, name: str, absolute: str) -> Path | None:
@@ -89,6 +103,13 @@ class FileNames:
             for file in files:
                 index[form(file)].append(file)
         return indices
+
+    def ambiguous_paths(self) -> dict[Path, list[Path]]:
+        """Return the paths that ambiguous names would have, with the files that they match."""
+        return {
+            self.folder / normalised(name): [self.folder / file for file in files]
+            for name, files in self.ambiguous.items()
+        }
 
     def findings(self) -> list[Finding]:
         """Return what was found under another spelling, and what is ambiguous."""

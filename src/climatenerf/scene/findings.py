@@ -18,6 +18,7 @@ CODES: dict[str, str] = {
     "photo-alpha": "Photos have an alpha channel, which is ignored.",
     "photo-hdr": "Photos are HDR (HLG or PQ); they are tone-mapped to sRGB.",
     "photo-resized": "Photos differ in size from their cameras; the intrinsics are scaled.",
+    "photo-exchanged": "Photos do not show what their points show in other photos.",
     "name-normalised": "Names in the pose files and on disk differ in their spelling; matched.",
     "name-ambiguous": "A name in the pose files matches several files on disk.",
     "file-missing": "A file that the capture names is not on disk.",
@@ -80,9 +81,10 @@ class Finding:
     Attributes:
         code: Key of `CODES`.
         message: What is odd, without a full stop.
-        remedy: What the user can do, without a full stop; empty if nothing needs doing.
+        remedy: What the user can do, without a full stop; empty if nothing needs doing, as for
+            some notes.
         severity: "note", "warning" or "error".
-        file: The file or folder it is about, empty if none.
+        file: The file or folder it is about; `read_scene` puts the capture where it is empty.
     """
 
     code: str

@@ -29,6 +29,9 @@ _GAIN_MAPS = (b"hdrgm:Version", b"HDRGainMap")  # XMP of Ultra HDR and of Apple
 # Code points of ITU-T H.273.
 _TRANSFERS: dict[int, Transfer] = {16: "PQ", 18: "HLG"}
 _PRIMARIES = {1: "bt709", 9: "bt2020", 11: "p3", 12: "p3"}
+_MAX_CHUNKS = 200  # of a PNG before its pixels
+_AVIF_HEAD = 1 << 16  # bytes that hold the properties of an AVIF image
+_PROGRAMS = ("EPS", "WMF")  # Pillow has Ghostscript or Windows run them
 _SAME = 2  # 8-bit values by which a profile may differ from sRGB and still be left alone
 
 _pixel_limit = threading.Lock()
@@ -65,6 +68,8 @@ def open_image(path: Path, name: str | None = None) -> Iterator[Image.Image]:
         with _without_pixel_limit():
             image = Image.open(file)
         with image:
+            if image.format in _PROGRAMS:
+                raise ValueError(f"{name} is a program rather than a picture")
             if image.width * image.height > MAX_PIXELS:
                 raise UserError(
                     f"{name} has {image.width}x{image.height} pixels, above the limit of"
@@ -102,14 +107,49 @@ def _register_heif(file: IO[bytes], name: str) -> None:
 
 
 def hdr_of(image: Image.Image) -> Hdr | None:
-    """Return the HDR signal of an opened image from its `nclx` box or ICC profile; None for SDR."""
+    """Return the HDR signal of an opened image; None for SDR.
+
+    It is stated by the `nclx` box of HEIC and AVIF, the `cICP` chunk of PNG or an ICC profile.
+    """
     nclx = image.info.get("nclx_profile") or {}
     primaries = int(nclx.get("color_primaries", 0))
     code = int(nclx.get("transfer_characteristics", 0))
+    if code not in _TRANSFERS and (file := getattr(image, "fp", None)) is not None:
+        position = file.tell()
+        if image.format == "PNG":
+            primaries, code = _png_code_points(file)
+        elif image.format == "AVIF":
+            primaries, code = _avif_code_points(file)
+        file.seek(position)
     if code not in _TRANSFERS:
         primaries, code = _cicp(image.info.get("icc_profile") or b"")
     transfer = _TRANSFERS.get(code)
     return None if transfer is None else Hdr(transfer, _PRIMARIES.get(primaries, "bt2020"))
+
+
+def _png_code_points(file: IO[bytes]) -> tuple[int, int]:
+    """Return primaries and transfer of a PNG's `cICP` chunk (PNG 3, 11.3.2.6); 0, 0 if none."""
+    position = 8
+    for _ in range(_MAX_CHUNKS):
+        file.seek(position)
+        head = file.read(12)
+        if len(head) < 12 or head[4:8] == b"IDAT":
+            break
+        if head[4:8] == b"cICP":
+            return head[8], head[9]
+        position += 12 + int.from_bytes(head[:4], "big")
+    return 0, 0
+
+
+def _avif_code_points(file: IO[bytes]) -> tuple[int, int]:
+    """Return primaries and transfer of an AVIF's `nclx` box (ISO/IEC 14496-12); 0, 0 if none."""
+    file.seek(0)
+    head = file.read(_AVIF_HEAD)
+    at = head.find(b"colrnclx")
+    if not 0 <= at <= len(head) - 12:
+        return 0, 0
+    primaries, transfer = struct.unpack_from(">HH", head, at + 8)
+    return primaries, transfer
 
 
 def _cicp(profile: bytes) -> tuple[int, int]:

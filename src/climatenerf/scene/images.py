@@ -108,15 +108,21 @@ def focal_35mm(path: Path) -> float | None:
     """Return EXIF's FocalLengthIn35mmFilm, mm; None if absent or the image is unreadable."""
     try:
         with open_image(path) as image:
-            value = image.getexif().get_ifd(_EXIF_TAG).get(_FOCAL_35MM_TAG)
+            value = _exif(image).get_ifd(_EXIF_TAG).get(_FOCAL_35MM_TAG)
             number = float(value) if value else 0.0
     except (*_IMAGE_ERRORS, TypeError, ZeroDivisionError, UserError):
         return None
     return number if 0 < number < 1e4 else None
 
 
+def _exif(image: Image.Image) -> Image.Exif:
+    """Return the EXIF of an opened image, without decoding its pixels."""
+    # Of a PNG without EXIF, Pillow decodes all pixels to look for EXIF behind them.
+    return Image.Image.getexif(image) if image.format == "PNG" else image.getexif()
+
+
 def _header(image: Image.Image) -> Header:
-    orientation = image.getexif().get(_ORIENTATION_TAG, 1)
+    orientation = _exif(image).get(_ORIENTATION_TAG, 1)
     return Header(
         *image.size,
         alpha=image.mode in ALPHA_MODES or "transparency" in image.info,

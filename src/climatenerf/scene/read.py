@@ -17,7 +17,8 @@ from climatenerf.scene.alignment.world_frame import align_scene
 from climatenerf.scene.checks.check import corrected
 from climatenerf.scene.checks.intrinsics import corrected_camera
 from climatenerf.scene.checks.sidecars import sidecar_findings, unused_findings
-from climatenerf.scene.findings import Finding, without_repeats
+from climatenerf.scene.file_names import FileNames
+from climatenerf.scene.findings import Finding, counted, without_repeats
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import Header, read_header
 from climatenerf.scene.label_spaces import checked_label_space
@@ -106,7 +107,11 @@ def read_scene(
     )
     aligned = _aligned(scene, saved, camera_height, metric_input, capture.metric, gravity)
     aligned = checked_world(aligned, str(path))
-    odd = (*aligned.findings, *sidecar_findings(aligned), *unused_findings(aligned, capture.views))
+    matching = [file for files in capture.ambiguous.values() for file in files]
+    unused = unused_findings(aligned, capture.views, matching)
+    odd = (*aligned.findings, *sidecar_findings(aligned), *unused)
+    # What concerns no single file concerns the capture.
+    odd = (each if each.file else replace(each, file=str(path)) for each in odd)
     return replace(aligned, findings=without_repeats(odd))
 
 
@@ -219,46 +224,53 @@ def _check_images(capture: Capture) -> Capture:
     """Leave out missing images, fit the cameras to the image sizes, and sort views by name."""
     findings = list(capture.findings)
     present = [v for v in capture.views if is_file(v.path)]
-    missing = len(capture.views) - len(present)
+    absent = [v for v in capture.views if not is_file(v.path) and v.path not in capture.ambiguous]
     if len(present) < MIN_IMAGES:
         folder = capture.views[0].path.parent if capture.views else capture.root
+        count = len(capture.ambiguous)
+        several = f" ({counted(count, 'name')} with several matching files)" if count else ""
         raise UserError(
             f"Only {len(present)} of the {len(capture.views)} images with poses exist in {folder}; "
-            f"at least {MIN_IMAGES} are needed, so restore them or correct the names."
+            f"at least {MIN_IMAGES} are needed, so restore them or correct the names{several}."
         )
-    if missing:
-        first = next(v.name for v in capture.views if not is_file(v.path))
+    if absent:
         message = (
-            f"{missing} of the {len(capture.views)} images with poses are not on disk "
-            f"(first: {first}); they are left out"
+            f"{len(absent)} of the {len(capture.views)} images with poses are not on disk "
+            f"(first: {absent[0].name}); they are left out"
         )
-        findings.append(Finding("photo-missing", message, file=str(capture.root)))
+        remedy = "restore them, or remove their poses"
+        file = str(absent[0].path.parent)
+        findings.append(Finding("photo-missing", message, remedy, file=file))
     present = sorted(_with_inner_names(present), key=lambda v: v.name)
     for a, b in zip(present, present[1:], strict=False):
         if a.name == b.name:
             raise UserError(f"The image {a.name} has two poses; remove one of them.")
     cameras: dict[Camera, int] = {}
-    views, scaled, transparent, hdr = [], 0, 0, 0
+    views: list[View] = []
+    scaled: list[Path] = []
+    transparent: list[Path] = []
+    hdr: list[Path] = []
     for view in present:
         camera = capture.cameras[view.camera]
         header = read_header(view.path)
         fitted = _fit_camera(view, camera, header)
-        scaled += fitted != camera
-        transparent += header.alpha
-        hdr += header.hdr
+        scaled += [view.path] * (fitted != camera)
+        transparent += [view.path] * header.alpha
+        hdr += [view.path] * header.hdr
         views.append(replace(view, camera=cameras.setdefault(fitted, len(cameras))))
     if scaled:
         message = (
-            f"{scaled} images differ in size from their cameras but have the same shape; their "
-            "intrinsics are scaled"
+            f"{len(scaled)} images differ in size from their cameras but have the same shape;"
+            " their intrinsics are scaled"
         )
-        findings.append(Finding("photo-resized", message))
+        findings.append(Finding("photo-resized", message, "", "note", str(scaled[0])))
     if hdr:
-        message = f"{hdr} images are HDR (HLG or PQ) and are tone-mapped to sRGB"
-        findings.append(Finding("photo-hdr", message, severity="note"))
+        message = f"{len(hdr)} images are HDR (HLG or PQ) and are tone-mapped to sRGB"
+        findings.append(Finding("photo-hdr", message, "", "note", str(hdr[0])))
     if transparent:
-        message = f"{transparent} images have an alpha channel, which is ignored"
-        findings.append(Finding("photo-alpha", message, "use masks to exclude pixels"))
+        message = f"{len(transparent)} images have an alpha channel, which is ignored"
+        remedy = "use masks to exclude pixels"
+        findings.append(Finding("photo-alpha", message, remedy, file=str(transparent[0])))
     for camera in cameras:
         error = _round_trip_error(corrected_camera(camera)[0])
         if error > MAX_ROUND_TRIP:
@@ -317,24 +329,46 @@ def _find_sidecars(capture: Capture) -> Capture:
     A sidecar is named `NAME.png` or `NAME.jpg.png`; depths may also be `.npz` or `.npy`. Incomplete
     folders give a warning.
     """
+    labels, odd_labels = _sidecars(capture.root / "labels", capture.views)
+    masks, odd_masks = _sidecars(capture.root / "masks", capture.views)
+    suffixes = (".npz", ".npy", ".png")
+    depths, odd_depths = _sidecars(capture.root / "depth", capture.views, suffixes)
     views = []
-    for view in capture.views:
-        label = view.label_path or _sidecar(capture.root / "labels", view)
-        mask = view.mask_path or _sidecar(capture.root / "masks", view)
-        depth = view.depth_path or _sidecar(capture.root / "depth", view, (".npz", ".npy", ".png"))
+    for view, label, mask, depth in zip(capture.views, labels, masks, depths, strict=True):
+        mask = view.mask_path or mask
         if mask is not None and not is_file(mask):
             raise UserError(f"The mask {mask} of {view.name} is missing; restore it.")
+        label, depth = view.label_path or label, view.depth_path or depth
         views.append(replace(view, label_path=label, mask_path=mask, depth_path=depth))
-    findings = (*capture.findings, *_sidecar_findings(capture.root, views))
-    return replace(capture, views=tuple(views), findings=findings)
+    odd = (*odd_labels, *odd_masks, *odd_depths, *_sidecar_findings(capture.root, views))
+    return replace(capture, views=tuple(views), findings=(*capture.findings, *odd))
 
 
-def _sidecar(folder: Path, view: View, suffixes: tuple[str, ...] = (".png",)) -> Path | None:
-    if Path(view.name).is_absolute():  # joining it to `folder` would give the photo itself
-        return None
-    base = folder / view.name
-    candidates = [p for s in suffixes for p in (base.with_suffix(s), Path(f"{base}{s}"))]
-    return next((p for p in candidates if is_file(p)), None)
+def _sidecars(
+    folder: Path, views: Sequence[View], suffixes: tuple[str, ...] = (".png",)
+) -> tuple[list[Path | None], list[Finding]]:
+    """Return the file of each view in a folder, and what is odd about their names."""
+    if not folder.is_dir():
+        return [None] * len(views), []
+    names = [_sidecar_names(view, suffixes) for view in views]
+    found = [next((p for n in each if is_file(p := folder / n)), None) for each in names]
+    files, exact = FileNames(folder), set(found)
+    for i, each in enumerate(names):
+        # The file of another photo, whose name differs in case only, stays with that.
+        if found[i] is None and (other := files.find_any(each)) is not None:
+            if other in exact:
+                files.respelled = {n: p for n, p in files.respelled.items() if p != other}
+            else:
+                found[i] = other
+    return found, files.findings()
+
+
+def _sidecar_names(view: View, suffixes: tuple[str, ...]) -> list[str]:
+    name = Path(view.name)
+    if name.is_absolute():
+        return []
+    stems = (name.with_suffix("").as_posix(), name.as_posix())
+    return [f"{stem}{suffix}" for suffix in suffixes for stem in stems]
 
 
 def _sidecar_findings(root: Path, views: Sequence[View]) -> list[Finding]:

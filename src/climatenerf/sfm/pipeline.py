@@ -286,6 +286,7 @@ def in_metres(settings: CaptureSettings, new: Path, imported: PhotoImport) -> Sc
     found = find_georeference(scene, positions)
     finding = gps_finding(found, {picture.name: picture.source for picture in imported.pictures})
     if finding is not None:
+        finding = replace(finding, file=str(scene.root))
         scene = replace(scene, findings=(*scene.findings, finding))
     if not isinstance(found, Georeference):
         return scene

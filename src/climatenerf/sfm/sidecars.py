@@ -75,7 +75,8 @@ def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, 
     missing = sum(path is None for path in found.values())
     if missing:
         message = f"{missing} of {len(views)} pictures have no {kind}"
-        findings.append(Finding("sidecar-partial", message))
+        remedy = "name each file after its photo"
+        findings.append(Finding("sidecar-partial", message, remedy, file=str(folder)))
     if not certain:
         findings.append(
             Finding(
@@ -83,6 +84,7 @@ def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, 
                 f"EXIF rotates some photos by 180 degrees or mirrors them. Their {kind} are assumed"
                 " to match the photos as shown, not as stored",
                 "check them",
+                file=str(folder),
             )
         )
     return replace(scene, views=tuple(views), findings=tuple(findings))

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.locks import only_writer
 from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
 from climatenerf.evaluation import geometry
 from climatenerf.evaluation.baselines import CleanView
@@ -132,12 +133,28 @@ def ablate(
         selected: settings of the rows, see `select_rows`.
 
     Raises:
-        UserError: the capture has no reference set, or the folder holds fits of other settings.
+        UserError: the capture has no reference set, the folder holds fits of other settings, or
+            another process writes into it.
     """
     # All checks come before the fits, which take hours.
     reference = read_reference(scene.root)
     check_views(scene, reference)
     check_folder(out, reference.folder, tuple(selected))
+    with only_writer(out):
+        return _ablate(scene, out, minutes, downscale, seeds, after_step, progress, selected)
+
+
+def _ablate(
+    scene: Scene,
+    out: Path,
+    minutes: float,
+    downscale: int,
+    seeds: int,
+    after_step: Callable[[str, Report], None],
+    progress: Progress,
+    selected: dict[str, FitSettings],
+) -> dict[str, Any]:
+    """Fit, score and write as `ablate` does, in a folder that is checked and locked."""
     make_folder(out / "runs")
     table: dict[str, list[dict[str, float]]] = {}
     sheet = []

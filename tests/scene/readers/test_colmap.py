@@ -89,7 +89,7 @@ def test_intrinsics_are_scaled_to_the_images(tmp_path):
     scene = read_scene(tmp_path)
     camera = scene.cameras[0]
     assert (camera.width, camera.fx, camera.cy) == (16, 15.0, 6.0)
-    assert any("intrinsics are scaled" in w for w in scene.warnings)
+    assert any("intrinsics are scaled" in str(each) for each in scene.findings)
 
 
 @pytest.mark.parametrize(

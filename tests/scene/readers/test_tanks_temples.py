@@ -97,7 +97,8 @@ def test_unposed_images_and_missing_images_give_warnings(tmp_path):
     scene = read_scene(tmp_path)
     assert len(scene.views) == 7
     assert any("1 of the 8" in w and "0_00001.png" in w for w in scene.warnings)
-    assert any("1 images have no pose (first: 0_00002.png)" in w for w in scene.warnings)
+    notes = [str(each) for each in scene.findings]
+    assert any("1 images have no pose (first: 0_00002.png)" in note for note in notes)
 
 
 def damage_pose(root, content):

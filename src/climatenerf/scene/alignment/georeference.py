@@ -156,7 +156,8 @@ def gps_finding(found: Georeference | UnusableGps, sources: Mapping[str, str]) -
     if isinstance(found, UnusableGps):
         if not found.photos:
             return None
-        return Finding("gps", f"GPS of {found.photos} photos is of no use here: {found.reason}")
+        message = f"GPS of {found.photos} photos is of no use here: {found.reason}"
+        return Finding("gps", message, "give --camera-height or --known-length for the scale")
     if not found.left_out:
         return None
     listed = ", ".join(sources.get(name, name) for name in found.left_out[:MAX_LISTED])
@@ -165,6 +166,7 @@ def gps_finding(found: Georeference | UnusableGps, sources: Mapping[str, str]) -
         "gps",
         f"GPS of {len(found.left_out)} of {found.photos + len(found.left_out)} photos is far from"
         f" their camera positions and is left out: {listed}{more}",
+        severity="note",
     )
 
 

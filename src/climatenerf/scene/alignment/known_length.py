@@ -186,6 +186,6 @@ def apply_known_lengths(scene: Scene, lengths: list[LengthMeasurement]) -> Scene
     if spread > DISAGREEMENT:
         listed = ", ".join(f"{m.name} x{r:.2f}" for m, r in zip(lengths, ratio, strict=True))
         message = f"The known lengths disagree ({listed})"
-        finding = Finding("scale-disagrees", message, "check their marks")
+        finding = Finding("scale-disagrees", message, "check their marks", file=str(scene.root))
         out = replace(out, findings=(*out.findings, finding))
     return out

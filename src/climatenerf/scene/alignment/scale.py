@@ -123,6 +123,7 @@ def scale_findings(scene: Scene) -> list[Finding]:
             f"The scale from {name} is {entry['times']:.2f} times the one from"
             f" {scene.scale_source}",
             "check both",
+            file=str(scene.root),
         )
         for name, entry in scene.scale_report.items()
         if abs(np.log(entry["times"])) > SIGMAS * (entry["error"] + scene.scale_error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
+from climatenerf.scene.checks.appearance import appearance_findings
 from climatenerf.scene.checks.intrinsics import camera_findings, corrected_camera, exif_findings
 from climatenerf.scene.checks.matching import matching_findings
 from climatenerf.scene.checks.points import agreeing_convention, view_findings
@@ -42,12 +44,11 @@ def corrected(scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]]
     if scene.points is not None and len(scene.points):
         scene, shares, odd = agreeing_convention(scene, point_transforms)
         findings += odd
-    if shares is None or not shares.recorded and not any(f.code == "pose-axes" for f in findings):
-        try:
+    recorded = shares is not None and shares.recorded
+    if not recorded and not any(f.code == "pose-axes" for f in findings):
+        with contextlib.suppress(UserError):  # a photo that cannot be read: loading it reports that
             scene, odd = matching_findings(scene)
-        except UserError:
-            odd = []  # a photo that cannot be read: loading it reports the error
-        findings += odd
+            findings += odd
     total = len(scene.views)
     before = scene.views
     scene, odd = without_outliers(scene, shares)
@@ -57,10 +58,26 @@ def corrected(scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]]
     findings += odd
     if shares is not None:
         findings += view_findings(scene, shares)
+    if recorded and not any(f.code in ("pose-axes", "points-outside") for f in findings):
+        with contextlib.suppress(UserError):
+            findings += _photo_findings(scene)
     for camera in dict.fromkeys(scene.cameras[view.camera] for view in scene.views):
         findings += camera_findings(camera)
     findings += [*duplicate_findings(scene), *baseline_findings(scene), *_exif(scene)]
     return replace(scene, findings=without_repeats((*scene.findings, *findings)))
+
+
+def _photo_findings(scene: Scene) -> list[Finding]:
+    """Compare photos around the points that they share, or else around matched corners.
+
+    Raises:
+        UserError: A photo cannot be read.
+    """
+    if (odd := appearance_findings(scene)) is not None:
+        return odd
+    # Points that agree with the poses outweigh matches that would convert these.
+    _, odd = matching_findings(scene)
+    return [each for each in odd if each.code in ("focal-disagrees", "matches-disagree")]
 
 
 def _with_corrected_cameras(scene: Scene) -> tuple[Scene, list[Finding]]:

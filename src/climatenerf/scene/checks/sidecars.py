@@ -244,14 +244,17 @@ def _unreadable(error: UserError, path: Path | None, code: str = "unreadable") -
     return Finding(code, cause or remedy, remedy if cause else "", "error", str(path))
 
 
-def unused_findings(scene: Scene, posed: Sequence[View]) -> list[Finding]:
+def unused_findings(
+    scene: Scene, posed: Sequence[View], told: Collection[Path] = ()
+) -> list[Finding]:
     """Return photos without pose, and sidecars of no photo, in the folders that views use.
 
     Args:
         scene: The scene.
         posed: All photos with poses, also those that are left out for another reason.
+        told: Files that another finding names.
     """
-    used = {str(view.path) for view in posed}
+    used = {str(view.path) for view in posed} | {str(path) for path in told}
     for view in posed:
         used |= {str(p) for p in (view.label_path, view.mask_path, view.depth_path) if p}
     findings = []

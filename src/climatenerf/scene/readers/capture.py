@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ class Capture:
         findings: What is odd about the files.
         depth_scale: Metres per unit of integer depth files.
         point_transforms: Transforms that the points may lack although the poses include them, 4x4.
+        ambiguous: Paths of views whose names match several files, with these; `findings` has them.
     """
 
     root: Path
@@ -50,6 +52,7 @@ class Capture:
     findings: tuple[Finding, ...] = ()
     depth_scale: float = MILLIMETRES
     point_transforms: tuple[Float[np.ndarray, "4 4"], ...] = ()
+    ambiguous: Mapping[Path, Sequence[Path]] = field(default_factory=dict)
 
 
 def checked_camera(camera: Camera, where: str) -> Camera:

@@ -113,6 +113,7 @@ def read_colmap(root: Path) -> Capture:
         views=views,
         points=points if len(points) else None,
         findings=(*findings, *_feature_lines(model, chosen), *files.findings()),
+        ambiguous=files.ambiguous_paths(),
     )
 
 
@@ -158,7 +159,8 @@ def _largest(root: Path) -> tuple[Path, list[_Image], tuple[Finding, ...]]:
         f"COLMAP produced {len(models)} separate models (images in each: {sizes}); "
         f"{model.name} is used, the others are left out"
     )
-    return model, chosen, (Finding("model-parts", message, file=str(model)),)
+    remedy = "take more photos between the parts"
+    return model, chosen, (Finding("model-parts", message, remedy, file=str(model)),)
 
 
 def _suffix(folder: Path) -> str | None:

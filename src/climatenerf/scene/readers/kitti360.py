@@ -122,6 +122,7 @@ def read_kitti360(path: Path, frames: tuple[int, int] | None = None) -> Capture:
         "photo-without-pose",
         f"{unposed} images of {drive} have no pose; they are left out",
         severity="note",
+        file=str(root),
     )
     return Capture(
         root=root,

@@ -70,13 +70,13 @@ def read_tanks_temples(root: Path) -> Capture:
         cameras=(_camera(root / "intrinsics.txt", header.width, header.height),),
         views=views,
         predefined_split=any(v.split == "heldout" for v in views),
-        findings=_unposed(unposed) if unposed else (),
+        findings=_unposed(root, unposed) if unposed else (),
     )
 
 
-def _unposed(names: list[str]) -> tuple[Finding]:
+def _unposed(root: Path, names: list[str]) -> tuple[Finding]:
     message = f"{len(names)} images have no pose (first: {names[0]}); they are left out"
-    return (Finding("photo-without-pose", message),)
+    return (Finding("photo-without-pose", message, severity="note", file=str(root)),)
 
 
 def _pose(path: Path, name: str) -> np.ndarray:

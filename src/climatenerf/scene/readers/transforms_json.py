@@ -24,6 +24,7 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.scene.file_names import FileNames, normalised
 from climatenerf.scene.findings import Finding, counted, examples
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import read_header
 from climatenerf.scene.readers.capture import Capture, checked_camera, checked_pose
 from climatenerf.scene.readers.ply import read_points
@@ -35,6 +36,10 @@ _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".heic", ".
 _DEPTH_KEYS = ("depth_file_path", "depth_path")
 _DEPTH_SCALES = ("depth_unit_scale_factor", "integer_depth_scale")
 _READ_PATHS = {"file_path", "mask_path", "ply_file_path", *_DEPTH_KEYS}
+# What tells the name of a file from another text: the end of its key, or its own end.
+_FILE_KEYS = ("_path", "_file", "_filename")
+_FILE_SUFFIXES = {*PHOTO_SUFFIXES, ".npy", ".npz", ".exr", ".pfm", ".hdr", ".ply", ".pcd", ".pt"}
+_MAX_NAME = 1024
 # Coefficients of lens models that this program lacks; zero values change nothing.
 _UNREAD_NUMBERS = ("k5", "k6", "s1", "s2", "s3", "s4", "rolling_shutter_time")
 
@@ -77,23 +82,21 @@ def read_transforms(root: Path) -> Capture:
         predefined_split |= bool(train or heldout) or name in SPLIT_FILES
         for frame in data["frames"]:
             view = _view(frame, data, files_below, path, cameras)
-            for key in _unread_keys(frame, base):
-                unread[key] = unread.get(key, 0) + 1
-            absent += _absent(frame, view)
+            absent += _absent_depth(frame, view, files_below)
+            absent += _count_unread(frame, files_below, unread)
             key = normalised(frame["file_path"])
             held_out = key in heldout or name in SPLIT_FILES[1:]
             if not train or key in train or held_out:
                 views.append(replace(view, split="heldout" if held_out else "train"))
             else:
                 unlisted += 1
-        for key in _unread_keys(data, base):
-            unread[key] = unread.get(key, 0) + 1
+        absent += _count_unread(data, files_below, unread)
         depth_scale = _depth_scale(data, str(path)) or depth_scale
         transforms += _point_transforms(data)
         if isinstance(cloud := data.get("ply_file_path"), str):
             if (file := files_below.find(cloud)) is not None:
                 points = read_points(file)
-            else:
+            elif cloud not in files_below.ambiguous:
                 absent.append(cloud)
     if unlisted and not views:
         raise UserError(
@@ -113,6 +116,7 @@ def read_transforms(root: Path) -> Capture:
         ),
         depth_scale=depth_scale or MILLIMETRES,
         point_transforms=tuple(transforms),
+        ambiguous=files_below.ambiguous_paths(),
     )
 
 
@@ -123,7 +127,8 @@ def _named_data_findings(
     out = []
     if unlisted:
         message = f"{unlisted} images are in none of the lists of {file.name}; they are left out"
-        out.append(Finding("photo-unlisted", message, file=str(file)))
+        remedy = "add them to train_filenames, or remove the lists"
+        out.append(Finding("photo-unlisted", message, remedy, file=str(file)))
     if absent:
         message = (
             f"{counted(len(absent), 'file')} named in {file.name} but not on disk"
@@ -139,28 +144,55 @@ def _named_data_findings(
     return out
 
 
-def _unread_keys(table: dict[str, Any], base: Path) -> list[str]:
-    """Return the keys of a table that name a file on disk or a lens coefficient and are not read.
+def _count_unread(table: dict[str, Any], files: FileNames, unread: dict[str, int]) -> list[str]:
+    """Count the keys of a table that name a file or a lens coefficient and are not read.
 
     Other keys (`sharpness`, `colmap_im_id`, `aabb_scale`, time stamps) carry nothing that a fit
     could use.
+
+    Args:
+        table: A frame, or the whole file.
+        files: The files of the capture.
+        unread: Gets the counts.
+
+    Returns:
+        The named files that are not on disk.
     """
-    out = []
+    absent = []
     for key, value in table.items():
         if key in _UNREAD_NUMBERS:
-            if isinstance(value, int | float) and value:
-                out.append(key)
-        elif key not in _READ_PATHS and isinstance(value, str) and 0 < len(value) < 1024:
-            is_path = "/" in value or "\\" in value or "." in value
-            if is_path and "\0" not in value and (base / normalised(value)).is_file():
-                out.append(key)
-    return out
+            found = isinstance(value, int | float) and bool(value)
+        elif key in _READ_PATHS or not _names_a_file(key, value):
+            continue
+        elif not (found := files.find(value) is not None) and value not in files.ambiguous:
+            absent += [] if _is_folder(files.folder / normalised(value)) else [value]
+        if found:
+            unread[key] = unread.get(key, 0) + 1
+    return absent
 
 
-def _absent(frame: dict[str, Any], view: View) -> list[str]:
-    """Return the files, other than the photo, that a frame names and that are not on disk."""
+def _names_a_file(key: str, value: Any) -> bool:
+    """Return whether a value is a path rather than another text or an address."""
+    if not isinstance(value, str) or not 0 < len(value) < _MAX_NAME:
+        return False
+    if "\0" in value or "\n" in value or "://" in value:
+        return False
+    return key.endswith(_FILE_KEYS) or Path(normalised(value)).suffix.lower() in _FILE_SUFFIXES
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:  # a name that is too long
+        return False
+
+
+def _absent_depth(frame: dict[str, Any], view: View, files: FileNames) -> list[str]:
+    """Return the depth file that a frame names and that is not on disk."""
     named = next((frame[key] for key in _DEPTH_KEYS if isinstance(frame.get(key), str)), None)
-    return [named] if named is not None and view.depth_path is None else []
+    if named is None or view.depth_path is not None or named in files.ambiguous:
+        return []
+    return [named]
 
 
 def _depth_scale(data: dict[str, Any], where: str) -> float | None:
@@ -227,8 +259,10 @@ def _view(
     relative = normalised(frame["file_path"])
     path = files.find(relative) or files.folder / relative
     if not is_file(path) and path.suffix.lower() not in (s.lower() for s in _IMAGE_SUFFIXES):
-        found = (files.find(f"{relative}{suffix}") for suffix in _IMAGE_SUFFIXES)
-        path = next((file for file in found if file is not None), Path(f"{path}.png"))
+        names = [f"{relative}{suffix}" for suffix in _IMAGE_SUFFIXES]
+        found = files.find_any(names)
+        name = next((name for name in names if name in files.ambiguous), names[0])
+        path = found or files.folder / name
     name = relative.removeprefix("images/")
     name = name if Path(name).suffix == path.suffix else name + path.suffix
     pose = checked_pose(frame.get("transform_matrix"), name, str(file))
