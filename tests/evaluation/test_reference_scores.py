@@ -87,6 +87,29 @@ def test_depth_scores_of_a_known_relative_error():
     assert geometry.depth_scores([nothing], (truth,))["depth_abs_rel"] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("rise", [0.0, 0.06])
+def test_ground_scores_of_a_known_vertical_error(rise):
+    truth = truth_of(rise=rise)
+    for offset, within in ((0.04, (1, 1)), (-0.07, (1, 0)), (0.12, (0, 0))):
+        found = geometry.ground_scores([sloped_ground(truth.c2w, rise, offset)], (truth,))
+        assert (found["ground_within_10cm"], found["ground_within_5cm"]) == within, offset
+    depth = truth.depth.copy()
+    near = np.argwhere(truth.depth < geometry.MAX_DISTANCE)
+    for row, column in near[: len(near) // 4]:
+        depth[row, column] = np.inf
+    found = geometry.ground_scores([depth], (truth,))
+    assert found["ground_within_5cm"] == pytest.approx(0.75, abs=0.01)
+
+
+def test_ground_scores_leave_out_steep_faces_and_other_classes():
+    truth, kerb = truth_of(), truth_of(rise=1.5)
+    nothing = np.full_like(truth.depth, np.inf)
+    found = geometry.ground_scores([truth.depth, nothing], (truth, kerb))
+    assert found["ground_within_5cm"] == 1
+    found = geometry.ground_scores([truth.depth], (truth_of(label=VEGETATION),))
+    assert np.isnan(found["ground_within_10cm"])
+
+
 def test_ground_holes_of_a_known_number_of_pixels():
     truth, vegetation = truth_of(), truth_of(label=VEGETATION)
     ground = np.argwhere(truth.depth < geometry.MAX_DISTANCE)
