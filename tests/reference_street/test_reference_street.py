@@ -186,34 +186,43 @@ def test_people_move_between_the_pictures_that_show_them():
 
 
 REFERENCE = ROOT / "reference" / "street"
+PHOTOS = {"": 64, "busy": 64, "turned": 64, "sparse": 20, "tracks": 64}
 
 
-def test_the_set_on_disk_matches_its_checksums():
-    for folder in (
-        REFERENCE,
-        publish.variant_folder(REFERENCE, "busy"),
-        publish.variant_folder(REFERENCE, "turned"),
-    ):
-        lines = (folder / "SHA256SUMS").read_text().splitlines()
-        assert len(lines) >= 3
-        for line in lines:
-            digest, name = line.split("  ")
-            assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest, name
-        files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-        assert files == {line.split("  ")[1] for line in lines} | {"SHA256SUMS"}
-    total = sum(p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file())
-    assert total < 30e6
+def variant(name):
+    return publish.variant_folder(REFERENCE, name) if name else REFERENCE
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+def test_the_set_on_disk_matches_its_checksums(name):
+    folder = variant(name)
+    lines = (folder / "SHA256SUMS").read_text().splitlines()
+    assert len(lines) >= 3
+    for line in lines:
+        digest, file = line.split("  ")
+        assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest, file
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert files == {line.split("  ")[1] for line in lines} | {"SHA256SUMS"}
+
+
+def test_the_set_on_disk_is_small():
+    sizes = {p: p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file()}
+    folders = {p.relative_to(REFERENCE.parent).parts[0] for p in sizes}
+    assert folders == {variant(name).name for name in PHOTOS}
+    assert sum(sizes.values()) < 36e6
+    for name in ("sparse", "tracks"):  # lists and points, no pictures
+        assert sum(size for p, size in sizes.items() if variant(name) in p.parents) < 300e3
 
 
 def test_the_set_is_readable_as_capture_and_as_ground_truth():
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.scene import read_scene
 
-    for variant in ("", "-busy", "-turned"):
-        folder = REFERENCE.with_name(REFERENCE.name + variant)
-        scene = read_scene(folder)
-        assert len(scene.of_split("train")) == 64 and len(scene.of_split("heldout")) == 6
-        reference = read_reference(folder)
+    for name, photos in PHOTOS.items():
+        scene = read_scene(variant(name))
+        assert len(scene.of_split("train")) == photos and len(scene.of_split("heldout")) == 6
+        assert all(view.path.is_file() for view in scene.views)
+        reference = read_reference(variant(name))
         assert len(reference.truths) == 6 and len(reference.weathers) == 9
     cases = {case.name: case for case in reference.weathers}
     truth = reference.truths[0]
@@ -231,11 +240,66 @@ def test_the_set_is_readable_as_capture_and_as_ground_truth():
     assert np.abs(dense - clean).mean() > 2 * np.abs(thin - clean).mean()
 
 
+@pytest.mark.parametrize("name", ["sparse", "tracks"])
+def test_hard_variants_have_the_geometry_of_the_street(name):
+    from climatenerf.evaluation.reference import read_reference
+    from climatenerf.scene import load_scene
+
+    street, scene = load_scene(REFERENCE), load_scene(variant(name))
+    assert (scene.ground_z, scene.lowest_ground_z) == (street.ground_z, street.lowest_ground_z)
+    views = {view.name: view for view in street.views}
+    for view in scene.views:
+        np.testing.assert_array_equal(scene.c2w_world(view), street.c2w_world(views[view.name]))
+        assert view.label_path.resolve() == views[view.name].label_path.resolve()
+    true, found = read_reference(REFERENCE), read_reference(variant(name))
+    assert found.folder == REFERENCE
+    for a, b in zip(true.truths, found.truths, strict=True):
+        for key in ("depth", "normal", "label"):
+            np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+
+
+def test_the_sparse_variant_has_wide_baselines_and_the_points_of_its_photos():
+    from climatenerf.scene import load_scene
+
+    street, sparse = load_scene(REFERENCE), load_scene(variant("sparse"))
+    centres = np.stack([view.c2w[:3, 3] for view in sparse.of_split("train")])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)[~np.eye(20, dtype=bool)]
+    assert apart.reshape(20, 19).min(1).min() > 1.4 and apart.reshape(20, 19).min(1).mean() > 2.5
+    views = {view.name: view for view in street.views}
+    seen = 0
+    for view in sparse.views:
+        true = street.points[views[view.name].seen]
+        np.testing.assert_array_equal(sparse.points[view.seen], true)
+        seen += len(view.seen)
+    assert seen == len(sparse.points) > 800
+
+
+def test_tracks_lie_near_the_ground_with_the_errors_of_matches():
+    """On the road the heights of exact points are exact, and those of tracks are not."""
+    from climatenerf.scene import load_scene
+
+    exact, tracks = (load_scene(variant(name)).points for name in ("", "tracks"))
+    spread = []
+    for points in (exact, tracks):
+        road = points[(np.abs(points[:, 0]) < 2.6) & (np.abs(points[:, 1]) < 15)]
+        above = road[:, 2] - ground_height(road[:, 0], road[:, 1])
+        spread.append(np.median(np.abs(above[np.abs(above) < 0.5])))
+    assert spread[0] < 0.002 and 0.01 < spread[1] < 0.06
+    under = ground_height(tracks[:, 0], tracks[:, 1]) - tracks[:, 2]
+    assert 0.02 < (under > 0.1).mean() < 0.08, "some matches are wrong"
+    scene = load_scene(variant("tracks"))
+    observed = np.bincount(
+        np.concatenate([v.seen for v in scene.of_split("train")]), minlength=len(tracks)
+    )
+    assert observed.min() >= 2 and observed.mean() > 4
+    assert all(len(view.seen) == 0 for view in scene.of_split("heldout"))
+
+
 def test_gravity_alignment_and_scale_of_the_rotated_variant():
     from climatenerf.scene import read_scene
     from climatenerf.scene.alignment.known_length import apply_known_lengths, measure
 
-    scene = read_scene(publish.variant_folder(REFERENCE, "turned"))
+    scene = read_scene(variant("turned"))
     turn = np.eye(4)
     turn[:3, :3] = publish.SHRUNK * publish._rotation(*publish.TURN)
     turn[:3, 3] = publish.SHIFT

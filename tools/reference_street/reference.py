@@ -30,6 +30,7 @@ from tools.reference_street.render import load, render_view
 from tools.reference_street.smog import air_box, scattering_air
 from tools.reference_street.snowfall import snow_meshes
 from tools.reference_street.store import add, stored
+from tools.reference_street.variants import write_variants
 from tools.reference_street.water import still, wavy
 from tools.reference_street.write import write_demo
 
@@ -137,6 +138,7 @@ def main() -> None:
         write_demo(args.store, args.demo, WIDTH, HEIGHT)
     if args.out:
         write_reference(args.store, args.out, WIDTH, HEIGHT)
+        write_variants(args.store, args.out)
 
 
 if __name__ == "__main__":
