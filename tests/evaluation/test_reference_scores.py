@@ -16,6 +16,7 @@ from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.evaluated_run import depth_spread
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
+from climatenerf.output.score_report import table_text
 from climatenerf.scene import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -393,3 +394,15 @@ def test_open_ground_has_no_surface_above_it():
     # The same ground 3 m higher covers all of the lower ground, and is open itself.
     both = geometry.open_ground((ground, raised))
     assert len(both) and both[:, 2].min() > middle[2] + 1.5
+
+
+def test_a_report_without_weather_has_no_table_of_baselines():
+    table = {
+        "clean": {"psnr": 25.0, "ssim": 0.8},
+        "frame": {"scale": 1.0}, "geometry": {"ground_within_5cm": 0.5}, "labels": {"miou": 0.9},
+        "completeness": {"mirror_psnr": math.nan}, "weather": {}, "baselines": {},
+        "consistency": {"clean": {"next": 0.02, "far": 0.1}, "baselines": {}},
+    }  # fmt: skip
+    text = table_text(table)
+    assert "ground within 5cm 0.5" in text and "0.020 / 0.100" in text
+    assert "PSNR dB / SSIM" not in text

@@ -187,9 +187,11 @@ def mirror_scores(run: EvaluatedRun) -> dict[str, float]:
     Pixels count where the mirror is visible in the true picture.
 
     Returns:
-        `mirror_psnr`, dB.
+        `mirror_psnr`, dB; NaN without pictures of the mirror.
     """
     reference = run.reference
+    if reference.mirror_level is None:
+        return {"mirror_psnr": float("nan")}
     calm = Flood(level=reference.mirror_level, wind_speed=0.0)
     weather = KeyframedWeather(Weather(flood=calm), {})
     prepared = prepare_weather(run, weather, 0.0, [run.camera(t)[1] for t in reference.truths])
