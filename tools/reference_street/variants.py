@@ -3,7 +3,7 @@
     python -m tools.reference_street.variants --out reference/street
 
 Each is a folder beside the street and shares its files where it can. `--only sparse` writes some
-alone. See docs/reference-scene.md.
+alone; `plain` needs the traced group of that name. See docs/reference-scene.md.
 """
 
 import argparse
@@ -13,16 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from tools.reference_street.layout import heldout_poses
-from tools.reference_street.publish import variant_folder, write_list, write_sums
+from tools.reference_street.phone import photo
+from tools.reference_street.publish import save_arrays, variant_folder, write_list, write_sums
 from tools.reference_street.tracks import motion_points
-from tools.reference_street.write import save_portable
+from tools.reference_street.write import mean_of, save_portable
 
 if TYPE_CHECKING:
     from climatenerf.scene import Scene
 
 SPARSE_PHOTOS = 20
+PLAIN_EXPOSURE = 1.6  # gain of the plain variant's linear pictures: dark photos
+PLAIN_QUALITY = 88  # of its JPEGs, with colour at half the resolution
+PLAIN_SEED = 3
 
 
 def write_variants(store: Path, out: Path, only: list[str] | None = None) -> None:
@@ -30,6 +35,8 @@ def write_variants(store: Path, out: Path, only: list[str] | None = None) -> Non
     write: dict[str, Callable[[], None]] = {
         "sparse": lambda: write_sparse(out),
         "tracks": lambda: write_tracks(store, out),
+        "plain": lambda: write_plain(store, out),
+        "hard": lambda: write_hard(store, out),
     }
     for name in write if only is None else only:
         write[name]()
@@ -62,6 +69,36 @@ def write_tracks(store: Path, out: Path) -> None:
     scene = _variant_scene(out, "tracks", out.name)
     save_portable(_with_motion_points(scene, store / "tracks"))
     write_list(scene.root, f"../{out.name}", _tests())
+
+
+def write_plain(store: Path, out: Path) -> None:
+    """Write the variant with plain ground, photographed at dusk by a phone."""
+    plain = variant_folder(out, "plain")
+    scene = _variant_scene(out, "plain", plain.name)
+    for index, view in enumerate(scene.views):
+        linear = PLAIN_EXPOSURE * mean_of(store / "plain", view.name)
+        path = plain / "images" / view.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = Image.fromarray(photo(linear, np.random.default_rng([PLAIN_SEED, index])))
+        picture.save(path, "JPEG", quality=PLAIN_QUALITY, subsampling="4:2:0")
+        if view.split == "heldout":
+            truth = plain / "truth" / f"{Path(view.name).stem}.npz"
+            save_arrays(truth, clean=linear.astype(np.float16))
+    shared = {key: f"../{out.name}/{key}" for key in ("points.ply", "points_seen.npz")}
+    save_portable(
+        replace(scene, points=None),
+        points=shared["points.ply"],
+        points_seen=shared["points_seen.npz"],
+    )
+    write_list(plain, f"../{out.name}", _tests(), clean=".")
+
+
+def write_hard(store: Path, out: Path) -> None:
+    """Write the variant with few photos of plain ground and points found on those photos."""
+    plain = variant_folder(out, "plain").name
+    scene = _fewer_photos(_variant_scene(out, "hard", plain))
+    save_portable(_with_motion_points(scene, store / "tracks-hard"))
+    write_list(scene.root, f"../{out.name}", _tests(), clean=f"../{plain}")
 
 
 def _variant_scene(out: Path, variant: str, photos: str) -> "Scene":
@@ -107,7 +144,9 @@ def main() -> None:
     )
     parser.add_argument("--store", type=Path, default=Path("build/street-reference"))
     parser.add_argument("--out", type=Path, required=True, help="the published street")
-    parser.add_argument("--only", nargs="*", choices=("sparse", "tracks"), help="default: all")
+    parser.add_argument(
+        "--only", nargs="*", choices=("sparse", "tracks", "plain", "hard"), help="default: all"
+    )
     args = parser.parse_args()
     write_variants(args.store, args.out, args.only)
 
