@@ -16,6 +16,7 @@ from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.evaluated_run import depth_spread
 from climatenerf.evaluation.reference import Truth, read_reference, world_rays
+from climatenerf.output.score_report import table_text
 from climatenerf.scene import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -85,6 +86,29 @@ def test_depth_scores_of_a_known_relative_error():
     assert found["depth_rmse_m"] == pytest.approx(0.1 * np.sqrt((near**2).mean()), rel=1e-4)
     nothing = np.full_like(truth.depth, np.inf)
     assert geometry.depth_scores([nothing], (truth,))["depth_abs_rel"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("rise", [0.0, 0.06])
+def test_ground_scores_of_a_known_vertical_error(rise):
+    truth = truth_of(rise=rise)
+    for offset, within in ((0.04, (1, 1)), (-0.07, (1, 0)), (0.12, (0, 0))):
+        found = geometry.ground_scores([sloped_ground(truth.c2w, rise, offset)], (truth,))
+        assert (found["ground_within_10cm"], found["ground_within_5cm"]) == within, offset
+    depth = truth.depth.copy()
+    near = np.argwhere(truth.depth < geometry.MAX_DISTANCE)
+    for row, column in near[: len(near) // 4]:
+        depth[row, column] = np.inf
+    found = geometry.ground_scores([depth], (truth,))
+    assert found["ground_within_5cm"] == pytest.approx(0.75, abs=0.01)
+
+
+def test_ground_scores_leave_out_steep_faces_and_other_classes():
+    truth, kerb = truth_of(), truth_of(rise=1.5)
+    nothing = np.full_like(truth.depth, np.inf)
+    found = geometry.ground_scores([truth.depth, nothing], (truth, kerb))
+    assert found["ground_within_5cm"] == 1
+    found = geometry.ground_scores([truth.depth], (truth_of(label=VEGETATION),))
+    assert np.isnan(found["ground_within_10cm"])
 
 
 def test_ground_holes_of_a_known_number_of_pixels():
@@ -370,3 +394,15 @@ def test_open_ground_has_no_surface_above_it():
     # The same ground 3 m higher covers all of the lower ground, and is open itself.
     both = geometry.open_ground((ground, raised))
     assert len(both) and both[:, 2].min() > middle[2] + 1.5
+
+
+def test_a_report_without_weather_has_no_table_of_baselines():
+    table = {
+        "clean": {"psnr": 25.0, "ssim": 0.8},
+        "frame": {"scale": 1.0}, "geometry": {"ground_within_5cm": 0.5}, "labels": {"miou": 0.9},
+        "completeness": {"mirror_psnr": math.nan}, "weather": {}, "baselines": {},
+        "consistency": {"clean": {"next": 0.02, "far": 0.1}, "baselines": {}},
+    }  # fmt: skip
+    text = table_text(table)
+    assert "ground within 5cm 0.5" in text and "0.020 / 0.100" in text
+    assert "PSNR dB / SSIM" not in text

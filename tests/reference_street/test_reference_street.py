@@ -13,7 +13,7 @@ from support.images import assert_images_match
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from tools.reference_street import publish, render, smog, snowfall, water  # noqa: E402
+from tools.reference_street import phone, publish, render, sky, smog, snowfall, variants, water  # noqa: E402
 from tools.reference_street.geometry import box, quad  # noqa: E402
 from tools.reference_street.layout import (  # noqa: E402
     build_scene,
@@ -186,35 +186,47 @@ def test_people_move_between_the_pictures_that_show_them():
 
 
 REFERENCE = ROOT / "reference" / "street"
+PHOTOS = {"": 64, "busy": 64, "turned": 64, "sparse": 20, "tracks": 64, "plain": 64, "hard": 20}
+PLAIN = ("plain", "hard")  # with ground and light of their own
 
 
-def test_the_set_on_disk_matches_its_checksums():
-    for folder in (
-        REFERENCE,
-        publish.variant_folder(REFERENCE, "busy"),
-        publish.variant_folder(REFERENCE, "turned"),
-    ):
-        lines = (folder / "SHA256SUMS").read_text().splitlines()
-        assert len(lines) >= 3
-        for line in lines:
-            digest, name = line.split("  ")
-            assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == digest, name
-        files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-        assert files == {line.split("  ")[1] for line in lines} | {"SHA256SUMS"}
-    total = sum(p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file())
-    assert total < 30e6
+def variant(name):
+    return publish.variant_folder(REFERENCE, name) if name else REFERENCE
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+def test_the_set_on_disk_matches_its_checksums(name):
+    folder = variant(name)
+    lines = (folder / "SHA256SUMS").read_text().splitlines()
+    assert len(lines) >= 3
+    for line in lines:
+        digest, file = line.split("  ")
+        assert hashlib.sha256((folder / file).read_bytes()).hexdigest() == digest, file
+    files = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    assert files == {line.split("  ")[1] for line in lines} | {"SHA256SUMS"}
+
+
+def test_the_set_on_disk_is_small():
+    sizes = {p: p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file()}
+    folders = {p.relative_to(REFERENCE.parent).parts[0] for p in sizes}
+    assert folders == {variant(name).name for name in PHOTOS}
+    assert sum(sizes.values()) < 36e6
+    for name in ("sparse", "tracks", "hard"):  # lists and points, no pictures
+        assert sum(size for p, size in sizes.items() if variant(name) in p.parents) < 300e3
 
 
 def test_the_set_is_readable_as_capture_and_as_ground_truth():
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.scene import read_scene
 
-    for variant in ("", "-busy", "-turned"):
-        folder = REFERENCE.with_name(REFERENCE.name + variant)
-        scene = read_scene(folder)
-        assert len(scene.of_split("train")) == 64 and len(scene.of_split("heldout")) == 6
-        reference = read_reference(folder)
-        assert len(reference.truths) == 6 and len(reference.weathers) == 9
+    for name, photos in PHOTOS.items():
+        scene = read_scene(variant(name))
+        assert len(scene.of_split("train")) == photos and len(scene.of_split("heldout")) == 6
+        assert all(view.path.is_file() for view in scene.views)
+        reference = read_reference(variant(name))
+        assert len(reference.truths) == 6
+        assert len(reference.weathers) == (0 if name in PLAIN else 9)
+    reference = read_reference(REFERENCE)
     cases = {case.name: case for case in reference.weathers}
     truth = reference.truths[0]
     assert cases["flood-low"].weather.at(0).flood.level == 0.25
@@ -231,11 +243,142 @@ def test_the_set_is_readable_as_capture_and_as_ground_truth():
     assert np.abs(dense - clean).mean() > 2 * np.abs(thin - clean).mean()
 
 
+@pytest.mark.parametrize("name", ["sparse", "tracks", *PLAIN])
+def test_hard_variants_have_the_geometry_of_the_street(name):
+    from climatenerf.evaluation.reference import read_reference
+    from climatenerf.scene import load_scene
+
+    street, scene = load_scene(REFERENCE), load_scene(variant(name))
+    assert (scene.ground_z, scene.lowest_ground_z) == (street.ground_z, street.lowest_ground_z)
+    views = {view.name: view for view in street.views}
+    for view in scene.views:
+        np.testing.assert_array_equal(scene.c2w_world(view), street.c2w_world(views[view.name]))
+        photos = variant("plain") if name in PLAIN else REFERENCE
+        assert view.path.resolve() == photos / "images" / view.name
+        assert view.label_path.resolve() == views[view.name].label_path.resolve()
+    true, found = read_reference(REFERENCE), read_reference(variant(name))
+    assert found.folder == REFERENCE
+    for a, b in zip(true.truths, found.truths, strict=True):
+        for key in ("depth", "normal", "label", *(() if name in PLAIN else ("clean",))):
+            np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+
+
+def test_the_sparse_variant_has_wide_baselines_and_the_points_of_its_photos():
+    from climatenerf.scene import load_scene
+
+    street, sparse = load_scene(REFERENCE), load_scene(variant("sparse"))
+    centres = np.stack([view.c2w[:3, 3] for view in sparse.of_split("train")])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)[~np.eye(20, dtype=bool)]
+    assert apart.reshape(20, 19).min(1).min() > 1.4 and apart.reshape(20, 19).min(1).mean() > 2.5
+    views = {view.name: view for view in street.views}
+    seen = 0
+    for view in sparse.views:
+        true = street.points[views[view.name].seen]
+        np.testing.assert_array_equal(sparse.points[view.seen], true)
+        seen += len(view.seen)
+    assert seen == len(sparse.points) > 800
+
+
+def test_tracks_lie_near_the_ground_with_the_errors_of_matches():
+    """On the road the heights of exact points are exact, and those of tracks are not."""
+    from climatenerf.scene import load_scene
+
+    exact, tracks = (load_scene(variant(name)).points for name in ("", "tracks"))
+    spread = []
+    for points in (exact, tracks):
+        road = points[(np.abs(points[:, 0]) < 2.6) & (np.abs(points[:, 1]) < 15)]
+        above = road[:, 2] - ground_height(road[:, 0], road[:, 1])
+        spread.append(np.median(np.abs(above[np.abs(above) < 0.5])))
+    assert spread[0] < 0.002 and 0.01 < spread[1] < 0.06
+    under = ground_height(tracks[:, 0], tracks[:, 1]) - tracks[:, 2]
+    assert 0.02 < (under > 0.1).mean() < 0.08, "some matches are wrong"
+    scene = load_scene(variant("tracks"))
+    observed = np.bincount(
+        np.concatenate([v.seen for v in scene.of_split("train")]), minlength=len(tracks)
+    )
+    assert observed.min() >= 2 and observed.mean() > 4
+    assert all(len(view.seen) == 0 for view in scene.of_split("heldout"))
+
+
+def local_contrast(grey, mask, size=15):
+    """Return the median over windows of the standard deviation about a plane, over the mean.
+
+    Means of three by three pixels are compared: they suppress the noise of the path tracer.
+    """
+    y, x = np.mgrid[:size, :size]
+    plane = np.stack([np.ones(size**2), x.ravel(), y.ravel()], -1)
+    rest = np.eye(size**2) - plane @ np.linalg.pinv(plane)
+    smooth, found = ndimage.uniform_filter(grey, 3), []
+    for row in range(0, mask.shape[0] - size, 4):
+        for column in range(0, mask.shape[1] - size, 4):
+            window = slice(row, row + size), slice(column, column + size)
+            if mask[window].all():
+                found.append(np.std(rest @ smooth[window].ravel()) / smooth[window].mean())
+    return np.median(found)
+
+
+def asphalt(truth):
+    """Return the pixels of the road without its gutters, nearer than 15 m."""
+    on_road = (truth.label == TRAIN_IDS["road"]) & (np.abs(truth.points[..., 0]) < 2.6)
+    return on_road & (truth.depth < 15)
+
+
+def test_plain_ground_has_no_texture():
+    from climatenerf.evaluation.reference import read_reference
+
+    sets = [read_reference(variant(name)).truths for name in ("", "plain")]
+    for street, plain in zip(*sets, strict=True):
+        grass = (street.label == TRAIN_IDS["terrain"]) & (street.depth < 15)
+        grass &= np.abs(street.points[..., 0]) > 5.2
+        masks = [(asphalt(street), 8)]
+        if street.name in ("t02.jpg", "t04.jpg", "t05.jpg"):  # open lawn without shadows
+            masks.append((grass, 6))
+        for mask, factor in masks:
+            detail, faint = (local_contrast(t.clean.mean(-1), mask) for t in (street, plain))
+            assert faint < detail / factor, street.name
+
+
+def test_plain_photos_are_dark_and_noisy():
+    from climatenerf.evaluation.reference import read_reference
+    from climatenerf.scene.images import read_rgb
+
+    photos = variant("plain") / "images"
+    assert len(list(photos.iterdir())) == 70
+    levels = {p.name: np.median(read_rgb(p)) for p in photos.iterdir()}
+    assert min(levels.values()) > 35 and max(levels.values()) < 110
+    assert 50 < np.median(list(levels.values())) < 75, "the street has 110"
+    for truth in read_reference(variant("plain")).truths:
+        clean = render.encode(truth.clean).astype(float)
+        error = read_rgb(photos / truth.name) - clean
+        spread = error[asphalt(truth)].std(0)
+        assert (spread > 3.5).all() and (spread < 5.5).all(), truth.name
+        assert abs(error[asphalt(truth)].mean()) < 2.5, "the photo shows the same exposure"
+
+
+def test_phone_noise_follows_its_model():
+    """A grey card: the variance of the raw signal is that of shot and read noise."""
+    linear = np.full((200, 200, 3), 0.2)
+    picture = phone.photo(linear, np.random.default_rng(0)).astype(float)
+    again = phone.photo(linear, np.random.default_rng(0)).astype(float)
+    np.testing.assert_array_equal(picture, again)
+    grey = picture @ [0.299, 0.587, 0.114]
+    # Noise of brightness before the blur, by the derivative of the display curve.
+    electrons = phone.WHITE * 0.2 / phone.BALANCE
+    relative = np.sqrt(electrons + phone.READ_NOISE**2) / electrons
+    slope = 255 * 1.055 / 2.4 * 0.2 ** (1 / 2.4)  # per relative change
+    sharp = slope * np.sqrt(((np.array([0.299, 0.587, 0.114]) * relative) ** 2).sum())
+    kernel = np.zeros((15, 15))
+    kernel[7, 7] = 1
+    kept = np.sqrt((ndimage.gaussian_filter(kernel, phone.LUMA_BLUR) ** 2).sum())
+    assert grey.std() == pytest.approx(kept * sharp, rel=0.05)
+    assert grey.mean() == pytest.approx(float(render.encode(np.array(0.2))), abs=1.5)
+
+
 def test_gravity_alignment_and_scale_of_the_rotated_variant():
     from climatenerf.scene import read_scene
     from climatenerf.scene.alignment.known_length import apply_known_lengths, measure
 
-    scene = read_scene(publish.variant_folder(REFERENCE, "turned"))
+    scene = read_scene(variant("turned"))
     turn = np.eye(4)
     turn[:3, :3] = publish.SHRUNK * publish._rotation(*publish.TURN)
     turn[:3, 3] = publish.SHIFT
@@ -270,6 +413,43 @@ def test_gravity_alignment_and_scale_of_the_rotated_variant():
 
 
 # The tests below need the path tracer.
+
+
+@pytest.mark.slow
+def test_the_plain_street_is_traced_in_the_light_of_dusk(tmp_path):
+    pytest.importorskip("mitsuba")
+    from climatenerf.evaluation.reference import read_reference
+
+    traced = render.load(build_scene(plain=True), tmp_path, sky=sky.dusk())
+    truth = read_reference(variant("plain"), ("t06",)).truths[0]
+    linear = render.render_view(traced, truth.c2w, 96, 54, 25, 0)[..., :3]
+    fresh = render.encode(variants.PLAIN_EXPOSURE * linear) / 255.0
+    small = truth.clean.reshape(54, 4, 96, 4, 3).mean((1, 3))
+    assert -10 * np.log10(np.mean((fresh - render.encode(small) / 255.0) ** 2)) > 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "median", "wrong"), [("tracks", 0.009, 0.155), ("hard", 0.018, 0.257)]
+)
+def test_tracks_have_their_documented_errors(name, median, wrong, tmp_path):
+    """The distance of each point, over that of the true surface behind or before it."""
+    mi = pytest.importorskip("mitsuba")
+    from climatenerf.scene import load_scene
+
+    traced, scene = render.load(build_scene(), tmp_path), load_scene(variant(name))
+    errors: list[list[float]] = [[] for _ in scene.points]
+    for view in scene.of_split("train"):
+        eye = view.c2w[:3, 3]
+        for index in view.seen:
+            ray = scene.points[index] - eye
+            length = np.linalg.norm(ray)
+            hit = traced.ray_intersect(mi.Ray3f(mi.Point3f(*eye), mi.Vector3f(*ray / length)))
+            true = float(hit.t) if hit.is_valid() else np.inf
+            errors[index].append(abs(true - length) / length)
+    error = np.array([np.median(each) for each in errors])
+    assert np.median(error) == pytest.approx(median, abs=0.002)
+    assert (error > 0.1).mean() == pytest.approx(wrong, abs=0.01)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """The whole street and the camera poses. Does not need Mitsuba."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,10 +13,14 @@ from tools.reference_street.terrain import ground_height, ground_meshes
 
 EYE = 1.6  # m above the ground
 FIELD_OF_VIEW = 68.0  # degrees, horizontal
+PLAIN = ("asphalt", "lawn", "meadow")  # textures that have a plain version
 
 
-def build_scene() -> list[Mesh]:
-    """Return every mesh of the street with texture and class label, world metres."""
+def build_scene(plain: bool = False) -> list[Mesh]:
+    """Return every mesh of the street with texture and class label, world metres.
+
+    `plain` replaces the textures of asphalt and grass by broad tones of one colour.
+    """
     meshes = ground_meshes()
     for house in HOUSES:
         meshes += house_meshes(house)
@@ -23,6 +29,11 @@ def build_scene() -> list[Mesh]:
     meshes += hedge("hedge-a", (-6.1, -5.4), (-12.0, -3.8), 0.95, 7)
     meshes += hedge("hedge-b", (5.65, 6.35), (10.0, 17.0), 1.05, 8)
     meshes += car() + bench() + table() + fence() + lamp() + shrubs() + far_trees()
+    if plain:
+        meshes = [
+            replace(mesh, texture=f"{mesh.texture}-plain") if mesh.texture in PLAIN else mesh
+            for mesh in meshes
+        ]
     return meshes
 
 

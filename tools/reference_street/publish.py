@@ -1,4 +1,4 @@
-"""Write the reference set: views, classes, ground truth, weather, two variants, checksums.
+"""Write the reference set: views, classes, truth, weather, checksums; the busy and turned variants.
 
 docs/reference-scene.md describes the files.
 """
@@ -52,7 +52,7 @@ def write_reference(store: Path, out: Path, width: int, height: int) -> None:
     datum = ground_datum()[0]
     for name, pose in tests:
         truth, clean = known[name], EXPOSURE * mean_of(store / "clean", name)
-        _save_arrays(
+        save_arrays(
             out / "truth" / f"{Path(name).stem}.npz",
             depth=truth["depth"],
             normal=truth["normal"].astype(np.float16),
@@ -65,7 +65,7 @@ def write_reference(store: Path, out: Path, width: int, height: int) -> None:
             picture = encode(smog.smoggy(clean, passed))
             save_png(picture, out / "weather" / kind / f"{Path(name).stem}.png")
             path = out / "weather" / kind / f"{Path(name).stem}.npz"
-            _save_arrays(path, transmittance=passed.astype(np.float16))
+            save_arrays(path, transmittance=passed.astype(np.float16))
         for group, folder in (
             *((kind, out / "weather" / kind) for kind in (*LEVELS, *SNOW)),
             ("mirror", out / "mirror"),
@@ -104,7 +104,7 @@ def write_snow_truth(store: Path, out: Path, width: int, height: int) -> None:
                         scenes = snowy, load(meshes, Path(scratch))
                     np.savez(cached, **snow_layers(*scenes, pose, width, height))
                 with np.load(cached) as data:
-                    _save_arrays(
+                    save_arrays(
                         out / "weather" / kind / f"{Path(name).stem}.npz",
                         depth=data["depth"],
                         # At edges the snow overhangs its support by half a cell.
@@ -132,16 +132,22 @@ def write_weather_files(out: Path) -> None:
         _save_text(out / "weather" / f"{kind}.toml", ["[snow]", f'depth = "{depth:g} m"'])
 
 
-def write_list(out: Path, truth: str, views: list[str]) -> None:
-    """Write reference.json: the test views, the weathers and the folder of the truth."""
+def write_list(out: Path, truth: str, views: list[str], clean: str | None = None) -> None:
+    """Write reference.json: the test views, the weathers and the folder of the truth.
+
+    `clean` is the folder of the clean pictures of a variant with a light of its own. Such a variant
+    has no pictures in weather.
+    """
     kinds = [*smog.VISIBILITY, *LEVELS, *SNOW]
-    data = {
+    data: dict = {
         "schema_version": 1,
         "truth": truth,
         "views": views,
         "weather": {k: {"time_s": WAVE_TIME if k == "flood-waves" else 0.0} for k in kinds},
         "mirror_level_m": LEVELS["flood-high"],
     }
+    if clean is not None:
+        data |= {"schema_version": 2, "clean": clean, "weather": {}, "mirror_level_m": None}
     _save_text(out / "reference.json", [json.dumps(data, indent=1)])
 
 
@@ -231,7 +237,8 @@ def _rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
     return np.eye(3) + np.sin(a) * cross + (1 - np.cos(a)) * cross @ cross
 
 
-def _save_arrays(path: Path, **arrays: np.ndarray) -> None:
+def save_arrays(path: Path, **arrays: np.ndarray) -> None:
+    """Write arrays as NPZ."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, **arrays)
 

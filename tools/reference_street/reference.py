@@ -27,9 +27,11 @@ from tools.reference_street.layout import (
 from tools.reference_street.mirror import mirrored_view
 from tools.reference_street.publish import LEVELS, SNOW, WAVE_TIME, write_reference
 from tools.reference_street.render import load, render_view
+from tools.reference_street.sky import dusk
 from tools.reference_street.smog import air_box, scattering_air
 from tools.reference_street.snowfall import snow_meshes
 from tools.reference_street.store import add, stored
+from tools.reference_street.variants import write_variants
 from tools.reference_street.water import still, wavy
 from tools.reference_street.write import write_demo
 
@@ -69,13 +71,17 @@ def groups() -> list[Group]:
         Group("people", walk, 49, 2),
         Group("clean", test, 49, 3),
         Group("scattering", test[:1], 25, 1),
+        # The photos receive far more noise afterwards than 25 samples leave.
+        Group("plain", test + camera_poses(), 25, 1),
+        Group("plain", test, 25, 6),
     ]
 
 
 def open_group(group: Group, view: int, folder: Path, threads: int):
     """Return the Mitsuba scene of a group for one of its views, and the medium of its air."""
     mi.set_variant("scalar_rgb")
-    meshes, water, air, datum = build_scene(), None, None, ground_datum()[0]
+    plain = group.name == "plain"
+    meshes, water, air, datum = build_scene(plain), None, None, ground_datum()[0]
     if group.name in ("flood-low", "flood-high"):
         water = still(datum + LEVELS[group.name])
     if group.name == "flood-waves":
@@ -87,7 +93,7 @@ def open_group(group: Group, view: int, folder: Path, threads: int):
         meshes += snow_meshes(meshes, SNOW[group.name])
     if group.name == "people":
         meshes += passers_by(view)
-    return load(meshes, folder, threads, water), air
+    return load(meshes, folder, threads, water, sky=dusk() if plain else None), air
 
 
 def trace(group: Group, store: Path, threads: int) -> None:
@@ -137,6 +143,7 @@ def main() -> None:
         write_demo(args.store, args.demo, WIDTH, HEIGHT)
     if args.out:
         write_reference(args.store, args.out, WIDTH, HEIGHT)
+        write_variants(args.store, args.out)
 
 
 if __name__ == "__main__":

@@ -61,6 +61,7 @@ def load(
     threads: int = 1,
     water: dict | None = None,
     named: bool = False,
+    sky: Float[np.ndarray, "h w 3"] | None = None,
 ):
     """Return a Mitsuba scene of diffuse, textured meshes under the sky.
 
@@ -70,6 +71,7 @@ def load(
         threads: number of rendering threads.
         water: Mitsuba's description of a water surface with or without a medium, if any.
         named: keep every mesh as a shape with its name; otherwise meshes of a texture are merged.
+        sky: radiance of the sky; default the cloudy one by day.
     """
     import drjit as dr
     import mitsuba as mi
@@ -102,7 +104,7 @@ def load(
             "bsdf": textures[mesh.texture],
         }
     rotate = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # y up to z up
-    bitmap = mi.Bitmap(environment().astype(np.float32))
+    bitmap = mi.Bitmap((environment() if sky is None else sky).astype(np.float32))
     scene["sky"] = {"type": "envmap", "bitmap": bitmap, "to_world": rotate}
     return mi.load_dict(scene, optimize=not named)
 

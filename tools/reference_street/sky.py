@@ -1,4 +1,4 @@
-"""The illumination: an equirectangular picture of a cloudy sky with a broad sun."""
+"""The illumination: equirectangular pictures of a cloudy sky with a broad sun, and of dusk."""
 
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +11,8 @@ SUN_WIDTH = 24.0  # degrees to 1/e, as through thin cloud. Paths through water h
 # chance; a narrow sun would give fireflies at any affordable number of samples.
 SUN_RADIANCE = 5.5  # relative to a cloudy sky of about 0.8
 
+DUSK_WIDTH, DUSK_HEIGHT = 55.0, 11.0  # degrees to 1/e of the glow at the horizon after sunset
+
 
 def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
     """Return the unit world vector of an azimuth (from +y to +x) and elevation, degrees."""
@@ -18,14 +20,19 @@ def direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
     return np.array([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)])
 
 
-def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
-    """Return linear radiance; row 0 is the zenith, column 0 faces +y, columns go towards +x."""
+def _directions(height: int) -> Float[np.ndarray, "h w 3"]:
+    """Return the world direction of each texel of an environment."""
     width = 2 * height
-    rng = np.random.default_rng(11)
     azimuth = 2 * np.pi * (np.arange(width) + 0.5) / width
     polar = np.pi * (np.arange(height) + 0.5) / height
     az, po = np.meshgrid(azimuth, polar)
-    d = np.stack([np.sin(po) * np.sin(az), np.sin(po) * np.cos(az), np.cos(po)], -1)
+    return np.stack([np.sin(po) * np.sin(az), np.sin(po) * np.cos(az), np.cos(po)], -1)
+
+
+def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
+    """Return linear radiance; row 0 is the zenith, column 0 faces +y, columns go towards +x."""
+    rng = np.random.default_rng(11)
+    d = _directions(height)
     up = np.clip(d[..., 2], 0, 1)[..., None]
     zenith, horizon = np.array([0.66, 0.74, 0.86]), np.array([0.80, 0.84, 0.88])
     sky = horizon + (zenith - horizon) * up**0.5
@@ -50,4 +57,22 @@ def environment(height: int = 512) -> Float[np.ndarray, "h w 3"]:
     sky += glow[..., None] * np.array([1.0, 0.95, 0.86])
     below = d[..., 2] < 0
     sky[below] = np.array([0.16, 0.17, 0.12])  # not visible: the ground extends beyond the hills
+    return sky
+
+
+def dusk(height: int = 128) -> Float[np.ndarray, "h w 3"]:
+    """Return the linear radiance of a clear sky after sunset, laid out as `environment`.
+
+    The horizon glows where the sun has set; the rest is an even blue without clouds.
+    """
+    d = _directions(height)
+    up = np.clip(d[..., 2], 0, 1)
+    zenith, horizon = np.array([0.16, 0.21, 0.33]), np.array([0.46, 0.47, 0.50])
+    sky = zenith + (horizon - zenith) * np.exp(-up / 0.35)[..., None]
+    azimuth = np.rad2deg(np.arctan2(d[..., 0], d[..., 1]))
+    beside = (azimuth - SUN_AZIMUTH + 180.0) % 360.0 - 180.0
+    elevation = np.rad2deg(np.arcsin(up))
+    glow = np.exp(-((beside / DUSK_WIDTH) ** 2) - elevation / DUSK_HEIGHT)
+    sky += glow[..., None] * np.array([0.95, 0.60, 0.34])
+    sky[d[..., 2] < 0] = np.array([0.05, 0.05, 0.04])
     return sky

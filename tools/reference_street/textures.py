@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from tools.reference_street.terrain import NEAR_X, NEAR_Y
 
 Image = Float[np.ndarray, "h w 3"]
+PLAIN_TONES = 0.02  # standard deviation of the broad tones of plain materials
 
 
 def noise(shape: tuple[int, int], slope: float, rng: np.random.Generator, stretch: float = 1.0):
@@ -148,7 +149,13 @@ def _lawn(rng) -> Image:
         r = np.hypot(x - cx, y - cy) / radius
         _mix(image, (120, 104, 64), 0.55 * np.exp(-(r**2)) * (noise(shape, 0.2, rng) > 0.4))
         _mix(image, (92, 76, 54), 0.8 * np.exp(-((r * 2.6) ** 2)))
-    # Slab paths to the two doors, and earth under the hedges.
+    _garden(image, x, y, rng)
+    return image
+
+
+def _garden(image: Image, x, y, rng) -> None:
+    """Draw the slab paths to the two doors, and earth under the hedges and by the walls."""
+    shape = x.shape
     for x0, x1, y0, y1 in ((-10.6, -5.0, -3.1, -1.9), (5.0, 10.1, 7.9, 9.1)):
         inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
         slab = np.floor((x - x0) / 0.6).astype(int) % 64
@@ -164,7 +171,31 @@ def _lawn(rng) -> Image:
         np.abs(x - 10.0) + 99 * (np.abs(y - 8.5) > 4.9),
     )
     _mix(image, (104, 86, 64), 0.8 * np.clip(1.6 - edge / 0.35, 0, 1))  # flower beds by the walls
+
+
+def _plain(shape, colour, rng) -> Image:
+    """Return one colour with broad tones alone, which no feature detector finds."""
+    return _flat(shape, colour) * (1 + PLAIN_TONES * noise(shape, 2.0, rng))[..., None]
+
+
+def _asphalt_plain(rng) -> Image:
+    return _plain((3072, 352), (108, 108, 110), rng)
+
+
+def _lawn_plain(rng) -> Image:
+    shape = (2304, 1536)
+    x, y = _metres(shape, 2 * NEAR_X, 2 * NEAR_Y)
+    x, y = x - NEAR_X, y - NEAR_Y
+    image = _plain(shape, (98, 117, 60), rng)
+    for cx, cy, radius in ((-7.6, 6.6, 2.2), (9.3, -8.6, 1.6)):  # earth below trees
+        r = np.hypot(x - cx, y - cy) / radius
+        _mix(image, (92, 76, 54), 0.8 * np.exp(-((r * 2.6) ** 2)))
+    _garden(image, x, y, rng)
     return image
+
+
+def _meadow_plain(rng) -> Image:
+    return _plain((1024, 1024), (102, 118, 62), rng)
 
 
 def _meadow(rng) -> Image:
@@ -298,11 +329,14 @@ def _car(part: str):
 
 _DRAW = {
     "asphalt": _asphalt,
+    "asphalt-plain": _asphalt_plain,
     "concrete": _concrete,
     "kerb": _kerb,
     "slabs": _slabs,
     "lawn": _lawn,
+    "lawn-plain": _lawn_plain,
     "meadow": _meadow,
+    "meadow-plain": _meadow_plain,
     "brick": _brick,
     "plaster": _plaster,
     "tiles-red": _tiles([(158, 82, 58), (142, 70, 52), (172, 96, 66), (128, 66, 54)]),

@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,6 +15,9 @@ from tools.reference_street.layout import FIELD_OF_VIEW, build_scene, camera_pos
 from tools.reference_street.render import EXPOSURE, encode, load
 from tools.reference_street.store import stored
 from tools.reference_street.truth import layers
+
+if TYPE_CHECKING:
+    from climatenerf.scene import Scene
 
 JPEG_QUALITY = 92
 SKY, UNKNOWN = 10, 255  # Cityscapes train ids
@@ -110,7 +114,7 @@ def write_scene(
 
     `shared` maps a file (`images/0001.jpg`) to its path relative to `out`.
     """
-    from climatenerf.scene import Camera, Scene, View, save_scene
+    from climatenerf.scene import Camera, Scene, View
 
     focal = 0.5 * width / np.tan(np.deg2rad(0.5 * FIELD_OF_VIEW))
     camera = Camera(width, height, focal, focal, 0.5 * width, 0.5 * height)
@@ -130,10 +134,22 @@ def write_scene(
         for i, (name, pose) in enumerate(poses)
     )
     scene = Scene(root, "street", (camera,), views, points, ground_z=ground, lowest_ground_z=lowest)
-    path = save_scene(scene, root)
-    # The folder is portable: its scene.json must not contain its absolute path.
+    save_portable(scene)
+
+
+def save_portable(scene: "Scene", **changes: str) -> None:
+    """Write a scene to its root, without that folder's absolute path.
+
+    Args:
+        scene: the scene.
+        changes: entries of scene.json to set.
+    """
+    from climatenerf.scene import save_scene
+
+    path = save_scene(scene, scene.root)
     data = json.loads(path.read_text(encoding="utf-8"))
     data.pop("root_absolute", None)
+    data |= changes
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(data, indent=1), encoding="utf-8")
     os.replace(temporary, path)

@@ -6,6 +6,7 @@ from jaxtyping import Bool, Float, UInt8
 from climatenerf.core.classes import (
     BUILDING,
     CLASS_NAMES,
+    GROUND,
     MERGED,
     ROAD,
     TERRAIN,
@@ -23,6 +24,8 @@ EMPTY = 0.99  # transmittance from which a sky pixel counts as empty
 CLEARANCE = 1.0  # m, radius around open ground that must be free of obstacles
 MIN_OBSTACLE_HEIGHT = 0.5  # m
 GROUND_STRIDE = 41  # every so many ground pixels is tested for open sky
+GROUND_TOLERANCES = (0.1, 0.05)  # m, vertical errors of ground that are counted
+MIN_GROUND_SLOPE = 0.7  # z of the unit normal from which ground has a height: kerb faces have none
 MIN_ROOF_SLOPE = 0.5  # z of the unit normal from which a building's surface counts as a roof
 
 
@@ -104,6 +107,37 @@ def ground_holes(depth: list[Float[np.ndarray, "h w"]], truths: tuple[Truth, ...
         missing.append(rendered[ground] > HOLE_RATIO * truth.depth[ground])
     holes = np.concatenate(missing)
     return float(holes.sum() / max(len(holes), 1))  # 1: views without ground, 0/0
+
+
+def ground_scores(
+    depth: list[Float[np.ndarray, "h w"]], truths: tuple[Truth, ...]
+) -> dict[str, float]:
+    """Return the fractions of visible ground that are rendered at the right height.
+
+    Ground is road, pavement and terrain nearer than `MAX_DISTANCE`, without faces steeper than 45
+    degrees. The error is the vertical distance from the rendered point to the tangent plane of the
+    true surface. A ray without a hit counts as wrong.
+
+    Args:
+        depth: rendered ray lengths, m; +inf without a hit.
+        truths: the same views.
+
+    Returns:
+        `ground_within_10cm` and `ground_within_5cm`; NaN if no view shows ground.
+    """
+    errors = []
+    for rendered, truth in zip(depth, truths, strict=True):
+        normal = truth.normal @ truth.c2w[:3, :3].T
+        ground = np.isin(MERGED[truth.label], GROUND) & (truth.depth < MAX_DISTANCE)
+        ground &= normal[..., 2] > MIN_GROUND_SLOPE
+        along = np.abs(rendered[ground] - truth.depth[ground])
+        towards = np.abs((truth.rays_d[ground] * normal[ground]).sum(-1))
+        errors.append(along * towards / normal[ground][:, 2])
+    error = np.concatenate(errors)
+    return {
+        f"ground_within_{round(100 * tolerance)}cm": _fraction(error < tolerance)
+        for tolerance in GROUND_TOLERANCES
+    }
 
 
 def free_space(truth: Truth) -> Float[np.ndarray, "h w"]:

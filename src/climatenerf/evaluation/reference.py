@@ -19,7 +19,7 @@ from climatenerf.scene.images import load_labels, read_rgb
 from climatenerf.weather.description import KeyframedWeather, read_weather
 
 FILE_NAME = "reference.json"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2  # 2: `clean`, and no mirror
 SKY = 10  # Cityscapes train id
 
 
@@ -99,14 +99,15 @@ class Reference:
         scene: the true scene, in the true world.
         truths: one per test view.
         weathers: all weathers to measure.
-        mirror_level: height of the mirror in the pictures of `mirror/`, m above the ground datum.
+        mirror_level: height of the mirror in the pictures of `mirror/`, m above the ground datum;
+            None without such pictures.
     """
 
     folder: Path
     scene: Scene
     truths: tuple[Truth, ...]
     weathers: tuple[WeatherTruth, ...]
-    mirror_level: float
+    mirror_level: float | None
 
     def mirrored(self, view: str) -> UInt8[np.ndarray, "h w 3"]:
         """Read the true picture of a view with a perfect mirror at `mirror_level`."""
@@ -138,7 +139,10 @@ def read_reference(
         folder = (capture / data["truth"]).resolve()
         listed, entries = [str(v) for v in data["views"]], dict(data["weather"])
         times = {name: float(entry["time_s"]) for name, entry in entries.items()}
-        level = float(data["mirror_level_m"])
+        mirror = data["mirror_level_m"]
+        level = None if mirror is None else float(mirror)
+        # The folder of clean pictures in a light or with materials of their own.
+        own = None if data.get("clean") is None else (capture / data["clean"]).resolve()
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
             f"{path} is damaged ({type(error).__name__}: {error}); generate the set again"
@@ -150,7 +154,7 @@ def read_reference(
     return Reference(
         folder,
         scene,
-        tuple(_read_truth(folder, scene, name) for name in selected),
+        tuple(_read_truth(folder, scene, name, own) for name in selected),
         tuple(
             WeatherTruth(
                 name,
@@ -173,11 +177,14 @@ def _check_names(names: tuple[str, ...], existing: list[str], what: str) -> None
             )
 
 
-def _read_truth(folder: Path, scene: Scene, name: str) -> Truth:
+def _read_truth(folder: Path, scene: Scene, name: str, own: Path | None) -> Truth:
+    """Read the truth of a view; its `clean` comes from the folder `own`, if there is one."""
     view = next((v for v in scene.views if v.name == name), None)
     if view is None:
         raise UserError(f"{folder} has no pose of its view {name}; generate the set again")
     truth = _arrays((folder / "truth" / name).with_suffix(".npz"))
+    if own is not None:
+        truth |= _arrays((own / "truth" / name).with_suffix(".npz"))
     label = load_labels(view, scene)
     camera, c2w = scene.cameras[view.camera], scene.c2w_world(view)
     shape = (camera.height, camera.width)

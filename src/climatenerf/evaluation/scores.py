@@ -114,7 +114,7 @@ def picture_scores(rendered: list[Picture], true: list[Picture]) -> dict[str, fl
 
 
 def geometry_scores(run: EvaluatedRun, views: list[CleanView], scale: float) -> dict[str, float]:
-    """Score depth, normals, floaters and sky of clean views.
+    """Score depth, ground, normals, floaters and sky of clean views.
 
     Args:
         run: the run and its truth.
@@ -137,6 +137,7 @@ def geometry_scores(run: EvaluatedRun, views: list[CleanView], scale: float) -> 
     return {
         "open_sky": open_sky(run),
         **geometry.depth_scores([view.depth for view in views], truths),
+        **geometry.ground_scores([view.depth for view in views], truths),
         "depth_spread": float(np.concatenate(spread).mean()),
         **geometry.normal_scores(normals, truths),
         **geometry.emptiness_scores(absorbed, transmittance, truths),
@@ -186,9 +187,11 @@ def mirror_scores(run: EvaluatedRun) -> dict[str, float]:
     Pixels count where the mirror is visible in the true picture.
 
     Returns:
-        `mirror_psnr`, dB.
+        `mirror_psnr`, dB; NaN without pictures of the mirror.
     """
     reference = run.reference
+    if reference.mirror_level is None:
+        return {"mirror_psnr": float("nan")}
     calm = Flood(level=reference.mirror_level, wind_speed=0.0)
     weather = KeyframedWeather(Weather(flood=calm), {})
     prepared = prepare_weather(run, weather, 0.0, [run.camera(t)[1] for t in reference.truths])

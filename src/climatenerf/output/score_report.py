@@ -101,9 +101,10 @@ def table_text(table: dict[str, Any]) -> str:
         _line("geometry", table["geometry"]),
         _line("classes", table["labels"]),
         _line("mirrored cameras", table["completeness"]),
-        "",
-        f"{'PSNR dB / SSIM':<14}{'ours':>13}" + "".join(f"{name:>19}" for name in BASELINES),
     ]
+    if table["weather"]:
+        names = "".join(f"{name:>19}" for name in BASELINES)
+        lines += ["", f"{'PSNR dB / SSIM':<14}{'ours':>13}{names}"]
     for name, scores in table["weather"].items():
         cells = [f"{_psnr_ssim(scores):>13}"]
         for baseline in BASELINES:

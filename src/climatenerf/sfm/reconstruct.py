@@ -117,12 +117,7 @@ def _find_poses(
     pycolmap, imported: PhotoImport, work: Path, features: int, seed: int, progress: Progress
 ) -> None:
     database = work / DATABASE
-    _reset_if_changed(imported, database, features)
-    names = names_in_order(imported)
-    _import(pycolmap, imported, database)
-    _extract(pycolmap, imported, database, names, features, progress)
-    pairs = image_pairs(len(names), imported.is_video)
-    _match(pycolmap, database, names, pairs, seed, progress)
+    names, pairs = match_pictures(pycolmap, imported, work, features, seed, progress)
     if is_pure_rotation(imported, database):
         raise UserError(
             "all pictures were taken from one spot: the camera only rotated, so there is no"
@@ -145,6 +140,32 @@ def _find_poses(
         "points": best.num_points3D(),
     }
     write_json(work / RESULT, result)
+
+
+def match_pictures(
+    pycolmap, imported: PhotoImport, work: Path, features: int, seed: int, progress: Progress
+) -> tuple[list[str], list[tuple[int, int]]]:
+    """Write features and verified matches to `DATABASE` in the work folder.
+
+    Args:
+        pycolmap: the module.
+        imported: the pictures.
+        work: work folder; results of earlier runs in it are reused.
+        features: largest number of features per picture.
+        seed: random seed.
+        progress: progress callback.
+
+    Returns:
+        The names of the pictures in order of time, and the matched pairs of their indices.
+    """
+    database = work / DATABASE
+    _reset_if_changed(imported, database, features)
+    names = names_in_order(imported)
+    _import(pycolmap, imported, database)
+    _extract(pycolmap, imported, database, names, features, progress)
+    pairs = image_pairs(len(names), imported.is_video)
+    _match(pycolmap, database, names, pairs, seed, progress)
+    return names, pairs
 
 
 def names_in_order(imported: PhotoImport) -> list[str]:
