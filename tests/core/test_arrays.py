@@ -79,3 +79,19 @@ def test_files_of_the_other_kind_are_refused(tmp_path):
     np.savez(tmp_path / "b.npz", DEPTH)
     with pytest.raises(ValueError, match="no NPY"):
         arrays.read_npy(tmp_path / "b.npz")
+
+
+def test_any_damaged_byte_of_an_archive_is_a_known_error(tmp_path):
+    """Among them unknown compressions and versions, for which `zipfile` has its own error."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, depth=DEPTH)
+    data = path.read_bytes()
+    kinds = set()
+    for at in range(len(data)):
+        for byte in (0, 20, 99, 255):
+            path.write_bytes(data[:at] + bytes([byte]) + data[at + 1 :])
+            try:
+                arrays.read_npz(path)
+            except arrays.ERRORS as error:
+                kinds.add(type(error))
+    assert {zipfile.BadZipFile, NotImplementedError} <= kinds

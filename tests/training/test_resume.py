@@ -334,7 +334,8 @@ def test_a_missing_or_incomplete_optimiser_state_is_a_user_error(scene, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("grid.0.first", np.nan), ("grid.0.second", -1e38), ("floats", np.inf)]
+    ("name", "value"),
+    [("grid.0.first", np.nan), ("grid.0.second", -1e38), ("net.0.step", -1.0), ("floats", np.inf)],
 )
 def test_an_optimiser_state_that_would_make_nan_is_refused(scene, tmp_path, name, value):
     fitted(scene, tmp_path / "run", steps=2)

@@ -90,7 +90,9 @@ class Runner:
         """Wait for the verb that `start` began."""
         assert self.process is not None and self.process.stdout is not None
         answer = json.loads(self.process.stdout.readline())
-        texts = ((self.work / name).read_text(errors="replace") for name in ("stdout", "stderr"))
+        paths = (self.work / "stdout", self.work / "stderr")
+        # A verb that is stopped at once has not opened them.
+        texts = (p.read_text(errors="replace") if p.exists() else "" for p in paths)
         return Outcome(**answer, **dict(zip(("out", "err"), texts, strict=True)))
 
     def run(self, *args: object, **options: Any) -> Outcome:

@@ -18,8 +18,20 @@ MAX_MEMBERS = 1000
 MAX_HEADER = 10_000
 """Bytes of an array's header, as in NumPy."""
 
-ERRORS = (OSError, ValueError, EOFError, IndexError, KeyError, zipfile.BadZipFile, zlib.error)
-"""What the functions below raise for a file that is absent or damaged."""
+ERRORS = (
+    OSError,
+    ValueError,
+    EOFError,
+    IndexError,
+    KeyError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What the functions below raise for a file that is absent or damaged.
+
+`zipfile` raises NotImplementedError where a damaged header claims an unknown compression.
+"""
 
 
 def read_npy(path: Path, max_bytes: int = MAX_BYTES) -> np.ndarray:

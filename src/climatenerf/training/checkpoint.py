@@ -157,7 +157,7 @@ def _check_state(arrays: dict[str, np.ndarray], about: object) -> None:
         raise ValueError("its checksum is another")
     check_finite(arrays, MAX_VALUE)
     for name, array in arrays.items():
-        negative = name.endswith((".second", ".exp_avg_sq", "steps", "counters"))
+        negative = name.endswith((".second", ".exp_avg_sq", ".step", "steps", "counters"))
         if negative and array.size and array.min() < 0:
             raise ValueError(f"{name} holds a negative number")
 
