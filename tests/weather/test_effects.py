@@ -17,9 +17,10 @@ from support.random_field import random_field
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.layer_table import Layer
+from climatenerf.core.layer_table import RESERVED_NAMES, Layer
 from climatenerf.core.storage import write_json
 from climatenerf.field.checkpoint import save_field
+from climatenerf.output import render_folder
 from climatenerf.render.session import RenderSession
 from climatenerf.scene import save_scene
 from climatenerf.scene.scene import Scene, View
@@ -137,6 +138,10 @@ def effect(**changes) -> Effect:
 RAIN = Layer("mask_rain", "1", "fraction of the pixel that shows rain", 1 / 255, 8)
 
 
+def writes(name: str) -> Effect:
+    return effect(layers=(dataclasses.replace(RAIN, name=name),))
+
+
 @pytest.mark.parametrize(
     ("added", "message"),
     [
@@ -144,11 +149,17 @@ RAIN = Layer("mask_rain", "1", "fraction of the pixel that shows rain", 1 / 255,
         ([effect(name="seed")], "cannot be named 'seed'"),
         ([effect(name="path")], "cannot be named 'path'"),
         ([effect(name="acid rain")], "cannot be named 'acid rain'"),
-        ([effect(layers=(dataclasses.replace(RAIN, name="depth"),))], "layer 'depth' is written"),
+        ([writes("depth")], "layer 'depth' is written"),
         (
             [effect(layers=(RAIN,)), effect(name="sleet", layers=(RAIN,))],
             "layer 'mask_rain' is written by the effect 'rain' and by the effect 'sleet'",
         ),
+        ([writes("frames")], "cannot be named 'frames'"),
+        ([writes("Movie")], "cannot be named 'Movie'"),
+        ([writes("../evil")], "cannot be named '../evil'"),
+        ([writes("a/b")], "cannot be named 'a/b'"),
+        ([writes("")], "cannot be named ''"),
+        ([writes("Depth")], "layer 'Depth' is written"),
         ([effect(after=("hail",))], "placed after hail, which is absent"),
         ([effect(after=("sleet",)), effect(name="sleet", after=("rain",))], "waits for it"),
     ],
@@ -157,6 +168,12 @@ def test_incompatible_effects_are_refused_in_one_sentence(added, message):
     with pytest.raises(UserError) as error:
         check_effects((*EFFECTS, *added), reserved=["path"])
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_layers_cannot_have_the_names_of_the_other_files_of_a_render():
+    own = {"frames", render_folder.MOVIE, render_folder.SIDECAR, render_folder.PREVIEW}
+    assert {Path(name).stem for name in own} == RESERVED_NAMES
+    assert Path(render_folder.frame_files(0, (), ())[0]).parts[0] in RESERVED_NAMES
 
 
 def test_incompatible_installed_effects_exit_with_status_2(installed, tmp_path):

@@ -10,7 +10,7 @@ import importlib.metadata
 from collections.abc import Sequence
 
 from climatenerf.core.errors import UserError
-from climatenerf.core.layer_table import FRAME_LAYERS, Layer
+from climatenerf.core.layer_table import FRAME_LAYERS, RESERVED_NAMES, Layer
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.flood.parameters import FLOOD
 from climatenerf.weather.light.parameters import SUN
@@ -70,14 +70,30 @@ def check_effects(effects: Sequence[Effect], reserved: Sequence[str] = ()) -> tu
             )
         names.add(effect.name)
         for layer in effect.layers:
-            if layer.name in layers:
+            _check_layer_name(effect, layer)
+            key = layer.name.lower()  # of a folder; some file systems ignore case
+            if key in layers:
                 raise UserError(
-                    f"the layer {layer.name!r} is written by {layers[layer.name]} and by the effect"
+                    f"the layer {layer.name!r} is written by {layers[key]} and by the effect"
                     f" {effect.name!r}; rename one"
                 )
-            layers[layer.name] = f"the effect {effect.name!r}"
+            layers[key] = f"the effect {effect.name!r}"
     in_order(effects)
     return tuple(effects)
+
+
+def _check_layer_name(effect: Effect, layer: Layer) -> None:
+    """Refuse a layer whose folder would lie elsewhere or hold other files of a render.
+
+    Raises:
+        UserError: the name is reserved or is no identifier.
+    """
+    if not layer.name.isidentifier() or layer.name.lower() in RESERVED_NAMES:
+        raise UserError(
+            f"a layer of the weather effect {effect.name!r} cannot be named {layer.name!r}, because"
+            " its files go into a folder of that name; give it another name of letters, digits and"
+            " underscores"
+        )
 
 
 def in_order(effects: Sequence[Effect]) -> tuple[Effect, ...]:
