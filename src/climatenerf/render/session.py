@@ -110,10 +110,12 @@ class RenderSession:
                 continue
             require(self.field, effect.needs, f"the weather effect {effect.name!r}")
             key = _key(effect, own)
-            if self._keys.get(effect.name) != key:
-                prepared[effect.name] = key, function(self._preparation(own))
+            if self._keys.get(effect.name) == key:
+                entity = self._entities[effect.name]
             else:
-                self._entities[effect.name].check(own)
+                entity = function(self._preparation(own))
+                prepared[effect.name] = key, entity
+            entity.check(own)
         for name, (key, entity) in prepared.items():
             self._keys[name], self._entities[name] = key, entity
         self.weather = weather
