@@ -10,6 +10,7 @@ import pytest
 import torch
 from support.analytic_fields import AnalyticField, HalfSpace
 
+from climatenerf import api
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.field import compositing
@@ -19,7 +20,11 @@ from climatenerf.render import session as module
 from climatenerf.render.frame import render_frame
 from climatenerf.render.session import RenderSession
 from climatenerf.scene.scene import Scene, View
-from climatenerf.weather.description import weather_from_table, weather_to_table
+from climatenerf.weather.description import (
+    KeyframedWeather,
+    weather_from_table,
+    weather_to_table,
+)
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.flood import surface as flood_module
 from climatenerf.weather.registry import EFFECTS
@@ -207,6 +212,35 @@ def test_an_entity_checks_the_weather_of_each_preparation(session_of, prepared_f
     with pytest.raises(UserError, match="too large for the scene"):
         small.change(small.weather.base.with_value("hail.size", 0.2))
     assert small.world(0.0) and small.weather.base.hail.size == 0.05
+
+
+def test_a_section_without_its_effect_is_refused(session_of):
+    """It would be dropped silently; with default values it changes nothing."""
+    hail = Effect("hail", Hail, ("size",), lambda _: HailEntity())
+    made = session_of({"flood": {"level": "0 m"}}, [0.0])
+    known = Weather(hail=Hail(0.05), effects=(*EFFECTS, hail))
+    default = known.with_value("hail.size", None)
+    film = KeyframedWeather(default, {"hail.speed": ((0.0, 1.0), (4.0, 2.0))})
+    for weather in (known, film):
+        with pytest.raises(UserError, match="section 'hail' that no effect renders") as error:
+            RenderSession(made.field, made.scene, weather)
+        assert "pass effects=" in str(error.value) and "\n" not in str(error.value)
+        with pytest.raises(UserError, match="section 'hail' that no effect renders"):
+            api._keyframed(weather, EFFECTS)
+        with pytest.raises(UserError, match="section 'hail'"):
+            made.change(weather)
+    assert not RenderSession(made.field, made.scene, default).world(0.0).matters
+
+
+def test_a_session_uses_the_installed_effects(session_of, monkeypatch):
+    """As `render_movie` does; weather made for the built-in effects gets the missing section."""
+    hail = Effect("hail", Hail, ("size",), lambda _: HailEntity())
+    made = session_of({"flood": {"level": "0 m"}}, [0.0])
+    monkeypatch.setattr(module, "installed_effects", lambda: (*EFFECTS, hail))
+    session = RenderSession(made.field, made.scene, Weather())
+    assert session.weather.base.hail == Hail()
+    with pytest.raises(UserError, match="too large for the scene"):
+        session.change(session.weather.base.with_value("hail.size", 0.2))
 
 
 def test_the_middle_of_the_shutter_interval_is_rendered(session_of):

@@ -13,7 +13,7 @@ Sections, names, units and ranges come from the effects. Loads no torch.
 import difflib
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,27 @@ class KeyframedWeather:
         for name, frames in self.keyframes.items():
             weather = weather.with_value(name, _interpolate(frames, time))
         return weather
+
+
+def for_effects(weather: Weather | KeyframedWeather, effects: Sequence[Effect]) -> KeyframedWeather:
+    """Weather over time with a section for each effect.
+
+    Sections of other effects stay if they have their defaults.
+
+    Raises:
+        UserError: a section has values that no effect would render.
+    """
+    film = weather if isinstance(weather, KeyframedWeather) else KeyframedWeather(weather, {})
+    known = {effect.name for effect in effects}
+    keyframed = {name.partition(".")[0] for name in film.keyframes}
+    for name, section in film.base.sections.items():
+        if name not in known and (name in keyframed or section != type(section)()):
+            raise UserError(
+                f"the weather has a section {name!r} that no effect renders (there are"
+                f" {', '.join(sorted(known)) or 'none'}); pass effects= with its Effect, or install"
+                " its package"
+            )
+    return replace(film, base=film.base.with_sections(effects))
 
 
 def read_weather(path: Path, effects: Sequence[Effect] = EFFECTS) -> KeyframedWeather:
