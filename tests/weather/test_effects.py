@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -25,9 +26,10 @@ from climatenerf.render.session import RenderSession
 from climatenerf.scene import save_scene
 from climatenerf.scene.scene import Scene, View
 from climatenerf.weather.description import weather_from_table
-from climatenerf.weather.effect import Effect
+from climatenerf.weather.effect import Effect, Measure
 from climatenerf.weather.registry import EFFECTS, check_effects, in_order, layer_table
 from climatenerf.weather.smog.parameters import SMOG, Smog
+from climatenerf.weather.units import number
 from climatenerf.weather.weather import Weather
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "03_new_effect.py"
@@ -168,6 +170,49 @@ def test_incompatible_effects_are_refused_in_one_sentence(added, message):
     with pytest.raises(UserError) as error:
         check_effects((*EFFECTS, *added), reserved=["path"])
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Unitless:
+    depth: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Required:
+    depth: Annotated[float, number(0.0, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"enabled_by": ("visibilty",)}, "no parameter 'visibilty', which its enabled_by names"),
+        ({"alternatives": (("visibility", "sgima"),)}, "'sgima', which its alternatives names"),
+        ({"prepared_from": ("rain.sgima",)}, "is prepared from 'rain.sgima'"),
+        ({"prepared_from": ("wet.depth",)}, "is prepared from 'wet.depth'"),
+        ({"prepare": "my_package.entity"}, "prepare function 'my_package.entity'"),
+        ({"prepare": ":prepare"}, "prepare function ':prepare'"),
+        ({"prepare": 5}, "prepare function 5"),
+        ({"measures": (Measure("wet", "mask_rian"),)}, "reads the layer 'mask_rian'"),
+        ({"measures": (Measure("wet", "depth", "mask_rian"),)}, "reads the layer 'mask_rian'"),
+        ({"measures": (Measure("up", "normal"),)}, "reads the layer 'normal'"),
+        ({"measures": (Measure("snow_share", "depth"),)}, "measure 'snow_share' is a number of"),
+        ({"measures": (Measure("mean_transmittance", "depth"),)}, "is a number of every frame"),
+        ({"parameters": Unitless}, "Unitless.depth states no unit and range"),
+        ({"parameters": Required, "enabled_by": ()}, "its parameter 'depth' no default"),
+        ({"parameters": dict}, "are no dataclass"),
+    ],
+)
+def test_slips_of_an_author_are_refused_in_one_sentence(changes, message):
+    with pytest.raises(UserError) as error:
+        check_effects((*EFFECTS, effect(**changes)))
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert "'rain'" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["absent_package:prepare", "math:prepare"])
+def test_a_missing_prepare_function_is_named_with_its_effect(name):
+    with pytest.raises(UserError, match=f"{name}' of the weather effect 'rain' does not load"):
+        effect(prepare=name).load()
 
 
 def test_layers_cannot_have_the_names_of_the_other_files_of_a_render():

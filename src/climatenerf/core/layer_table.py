@@ -46,5 +46,7 @@ FRAME_LAYERS = (
     ),
 )
 """Layers of every frame, whatever the weather."""
+ON_DEMAND = frozenset({"normal", "label"})
+"""Layers that are computed only for frames that write them."""
 RESERVED_NAMES = frozenset({"frames", "movie", "preview"})
 """Names that a folder of a render uses itself, so that no layer can have them."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import CPU, to_device, to_numpy
-from climatenerf.core.layer_table import Layer
+from climatenerf.core.layer_table import ON_DEMAND, Layer
 from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.render.depth_normals import plane_normals
@@ -116,7 +116,7 @@ def see_frame(
     table = layer_table() if options.table is None else options.table
     given = {"depth": seen.depth, "transmittance": seen.transmittance, **seen.layers}
     layers = {name: _middle(values, shape) for name, values in given.items()}
-    for name in table.keys() - layers.keys() - {"normal", "label"}:
+    for name in table.keys() - layers.keys() - ON_DEMAND:
         layers[name] = np.full((height, width), table[name].no_data, np.float32)
     if options.normals or options.labels:
         directions, angle = _middle(rays[1], shape), 1.0 / camera.fx
