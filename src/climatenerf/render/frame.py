@@ -18,8 +18,7 @@ from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
-from climatenerf.render.volume import camera_rays
-from climatenerf.weather.flood.optics import pixel_rotation
+from climatenerf.render.volume import camera_rays, pixel_rotation
 from climatenerf.weather.registry import layer_table
 from climatenerf.weather.world import World
 
@@ -127,7 +126,7 @@ def see_frame(
             if normal is None:
                 normal = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
             weather = _middle(seen.normal, shape)
-            known = (weather != 0).any(-1, keepdims=True)  # of water and snow
+            known = (weather != 0).any(-1, keepdims=True)  # normals of surfaces and matter
             layers["normal"] = np.where(known, weather, normal)
     return averaged(seen.rgb), layers
 
