@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from climatenerf.core.errors import UserError, one_line, shown
+from climatenerf.core.errors import UserError, excerpt, one_line
 from climatenerf.core.parsing import read_toml
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import EFFECTS, parameters
@@ -95,7 +95,7 @@ def weather_from_table(
             weather = weather.with_value("seed", _integer(entries))
             continue
         if not isinstance(entries, Mapping):
-            raise UserError(f"[{section}] must be a table of values; got {shown(entries)}")
+            raise UserError(f"[{section}] must be a table of values; got {excerpt(entries)}")
         for key, raw in entries.items():
             item = _nearest(key, list(known[section]), f"key in [{section}]")
             name, parameter = f"{section}.{item}", known[section][item]
@@ -220,7 +220,7 @@ def _read_keyframes(name: str, parameter: Parameter, raw: Mapping[str, Any]) -> 
 
 def _integer(raw: Any) -> int:
     if isinstance(raw, bool) or not isinstance(raw, int):
-        raise UserError(f"seed must be a whole number; got {shown(raw)}")
+        raise UserError(f"seed must be a whole number; got {excerpt(raw)}")
     return raw
 
 
