@@ -1,4 +1,4 @@
-"""What a measured layer of a frame is: name, unit, meaning, storage. Loads no torch.
+"""What a measured layer of a frame is: name, unit, meaning, storage. Does not import torch.
 
 The layers of every frame are here; each weather effect adds its own (`weather.registry`).
 """

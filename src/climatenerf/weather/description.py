@@ -7,7 +7,7 @@
     [smog]
     visibility = "200 m"
 
-Sections, names, units and ranges come from the effects. Loads no torch.
+Sections, names, units and ranges come from the effects. Does not import torch.
 """
 
 import difflib

@@ -1,4 +1,4 @@
-"""What a weather effect is: one package, described by one `Effect`. Loads no torch.
+"""What a weather effect is: one package, described by one `Effect`. Does not import torch.
 
 An effect states its parameters, the layers it writes, what it needs of a field and what its
 preparation depends on. Its entity, which does the physics, is loaded when the effect is present:
@@ -70,7 +70,7 @@ class Effect:
     Attributes:
         name: Section of the weather file and prefix of the flags: letters, digits, underscores.
         parameters: Frozen dataclass with a default for each field, and a `units.Parameter` in each
-            annotation. It loads no torch.
+            annotation. Its module does not import torch.
         enabled_by: Fields that put the effect into the scene when one of them is not None.
         prepare: "package.module:function", or the function: takes a `world.Preparation` and returns
             an `Entity`. None: the section only informs other effects.

@@ -1,4 +1,4 @@
-"""The list of weather effects, and what follows from it. Loads no torch.
+"""The list of weather effects, and what follows from it. Does not import torch.
 
 The functions take the tuple of effects as an argument. To add an effect, write its package and add
 one line to `EFFECTS`, or install a package with an entry point in the group `climatenerf.effects`

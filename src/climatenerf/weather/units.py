@@ -2,7 +2,7 @@
 
 Inside the program every quantity is a plain float in SI units (angles: radians). A `Parameter` in a
 dataclass field's annotation states unit and range once: flags, help, weather files, keyframes and
-checks all read it. Importing this module loads neither torch nor pint.
+checks all read it. Importing this module does not import torch or pint.
 """
 
 import functools
