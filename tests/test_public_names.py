@@ -13,6 +13,13 @@ import climatenerf
 FUNCTIONS = ["evaluate", "fit", "load_run", "open_scene", "render_movie"]
 CLASSES = ["Flood", "RenderSession", "Smog", "Snow", "Sun", "Weather"]
 
+CAPABILITIES = {"APPEARANCE", "CLASSES", "DENSITY", "FUSED", "NORMALS", "OBSERVED"}
+UNITS = {"ANGLE", "DURATION", "LENGTH", "PER_LENGTH", "SPEED", "number", "quantity", "triple"}
+WORLD = {"Matter", "Medium", "Preparation", "RaySamples", "Samples", "Surface", "SurfaceHits"}
+NEED_TORCH = {*WORLD, "BakedSnow", "World", "bake_snow", "device_of", "observed"}
+DESCRIPTION = {"EFFECTS", "Effect", "Layer", "Measure", "UserError", "check_effects"}
+EXTEND = CAPABILITIES | UNITS | NEED_TORCH | DESCRIPTION
+
 
 def public(names):
     return [name for name in names if not name.startswith("__")]
@@ -29,6 +36,23 @@ def test_dir_lists_the_public_names_and_does_not_import_torch():
     assert public(names.split()) == sorted([*FUNCTIONS, *CLASSES, "extend"])
     assert "__version__" in names.split()
     assert not {"torch", "numba", "scipy"} & set(modules.split())
+
+
+def test_names_for_effects_are_listed_and_do_not_import_torch():
+    code = (
+        "import sys; from climatenerf import extend; print(*dir(extend));"
+        "print(*(name for name in dir(extend) if name in vars(extend))); print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    names, eager, modules = (set(line.split()) for line in done.stdout.splitlines())
+    assert names == EXTEND
+    assert names - eager == {name for name in EXTEND if name in NEED_TORCH}
+    assert not {"torch", "numba", "scipy"} & modules
+
+
+@pytest.mark.parametrize("name", sorted(EXTEND))
+def test_each_name_for_effects_exists(name):
+    assert getattr(climatenerf.extend, name) is not None
 
 
 @pytest.mark.parametrize("name", FUNCTIONS + CLASSES)

@@ -139,3 +139,17 @@ def test_nothing_depends_on_the_default_device():
     assert not wrong, wrong
     given = "with torch.device('cuda'): pass\nwith x.device: pass\ntorch.get_default_device()"
     assert default_devices(ast.parse(given)) == {1, 2, 3}
+
+
+def test_rendering_knows_no_single_effect():
+    """Effects come from the registry; only `weather` imports the package of one."""
+    packages = {path.parent.name for path in ROOT.glob("weather/*/parameters.py")}
+    wrong = []
+    for part in ("render", "field", "ops", "output"):
+        for path in sorted((ROOT / part).rglob("*.py")):
+            for imported in imports(path):
+                if imported.startswith("climatenerf.weather.") and (
+                    imported.split(".")[2] in packages
+                ):
+                    wrong.append(f"{path.relative_to(ROOT)} imports {imported}")
+    assert packages >= {"flood", "smog", "snow"} and not wrong, wrong

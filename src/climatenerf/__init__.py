@@ -1,7 +1,7 @@
 """climatenerf: render a real place from photos in physically based smog, flood and snow.
 
 The public names are listed by `dir(climatenerf)` and described in `climatenerf.api`. Importing this
-package loads neither torch nor numba; each name is imported when it is first used.
+package does not import torch or numba; each name is imported when it is first used.
 """
 
 import importlib

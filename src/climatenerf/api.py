@@ -26,7 +26,7 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.input_limits import check_seed
 from climatenerf.scene import Scene
-from climatenerf.weather.description import KeyframedWeather, read_weather
+from climatenerf.weather.description import KeyframedWeather, for_effects, read_weather
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects, layer_table
 from climatenerf.weather.weather import Weather
@@ -253,7 +253,8 @@ def render_movie(
         preview: show the frame at work in `preview.png`.
         progress: called with the effect that is prepared, then with "frames" and "movie".
         note: called with sentences about what was assumed or left out.
-        effects: the effects that the weather has sections for; None takes the installed ones.
+        effects: the effects to render with; None takes the installed ones. A section of the weather
+            that has values of its own needs its effect among them.
 
     Returns:
         The movie; with `part` the folder of the frames.
@@ -355,8 +356,6 @@ def _keyframed(
     """Return any description of weather as weather over time, with a section for each effect."""
     if weather is None:
         weather = Weather(effects=effects)
-    if isinstance(weather, Weather):
-        weather = KeyframedWeather(weather, {})
-    if not isinstance(weather, KeyframedWeather):
-        return read_weather(Path(weather), effects)
-    return replace(weather, base=weather.base.with_sections(effects))
+    if isinstance(weather, Weather | KeyframedWeather):
+        return for_effects(weather, effects)
+    return read_weather(Path(weather), effects)

@@ -9,13 +9,22 @@ The package names its effect in its own pyproject.toml, and `climatenerf render`
     [project.entry-points."climatenerf.effects"]
     ash = "my_package:ASH"
 
-Importing this module loads no torch; `BakedSnow`, `Samples`, `World` and the functions that need it
-are imported when they are first used.
+Importing this module does not import torch; the types of the renderer, such as `World` and
+`Samples`, and the functions that need torch are imported when they are first used.
 """
 
 import importlib
 
+from climatenerf.core.errors import UserError
 from climatenerf.core.layer_table import Layer
+from climatenerf.field.capabilities import (
+    APPEARANCE,
+    CLASSES,
+    DENSITY,
+    FUSED,
+    NORMALS,
+    OBSERVED,
+)
 from climatenerf.weather.effect import Effect, Measure
 from climatenerf.weather.registry import EFFECTS, check_effects
 from climatenerf.weather.units import (
@@ -31,14 +40,21 @@ from climatenerf.weather.units import (
 
 __all__ = [
     "ANGLE",
+    "APPEARANCE",
+    "CLASSES",
+    "DENSITY",
     "DURATION",
     "EFFECTS",
+    "FUSED",
     "LENGTH",
+    "NORMALS",
+    "OBSERVED",
     "PER_LENGTH",
     "SPEED",
     "Effect",
     "Layer",
     "Measure",
+    "UserError",
     "check_effects",
     "number",
     "quantity",
@@ -48,9 +64,15 @@ __all__ = [
 _LAZY = {
     "BakedSnow": "climatenerf.weather.snow.layer",
     "bake_snow": "climatenerf.weather.snow.layer",
+    "device_of": "climatenerf.field.protocol",
     "observed": "climatenerf.field.protocol",
+    "Matter": "climatenerf.weather.world",
+    "Medium": "climatenerf.weather.world",
     "Preparation": "climatenerf.weather.world",
+    "RaySamples": "climatenerf.weather.world",
     "Samples": "climatenerf.core.samples",
+    "Surface": "climatenerf.weather.world",
+    "SurfaceHits": "climatenerf.weather.world",
     "World": "climatenerf.weather.world",
 }
 

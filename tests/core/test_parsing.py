@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from climatenerf.core import parsing
-from climatenerf.core.errors import MAX_LINE, UserError, one_line, shown
+from climatenerf.core.errors import MAX_LINE, UserError, excerpt, one_line
 
 SOURCE = "scene.json"
 
@@ -141,11 +141,11 @@ def test_messages_are_one_line_of_bounded_length():
     assert one_line("two\n  lines\t and \x1b[2J a bell\a") == r"two lines\t and \x1b[2J a bell\x07"
     assert one_line("two  blanks") == "two  blanks"
     assert len(one_line("x" * 10**6)) < MAX_LINE + 10
-    assert shown(10**6000).endswith("digits") and shown([0] * 100) == "a list of 100 entries"
+    assert excerpt(10**6000).endswith("digits") and excerpt([0] * 100) == "a list of 100 entries"
     deep: list = []
     for _ in range(10_000):
         deep = [deep]
-    assert shown(deep) == "a list" and len(shown("x" * 10**6)) < 80
+    assert excerpt(deep) == "a list" and len(excerpt("x" * 10**6)) < 80
 
 
 def test_json_and_toml_are_parsed_in_this_module_only():

@@ -3,12 +3,14 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
 import torch
 from support.analytic_fields import AnalyticField, HalfSpace
 
+from climatenerf import api
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.field import compositing
@@ -18,9 +20,17 @@ from climatenerf.render import session as module
 from climatenerf.render.frame import render_frame
 from climatenerf.render.session import RenderSession
 from climatenerf.scene.scene import Scene, View
-from climatenerf.weather.description import weather_from_table, weather_to_table
+from climatenerf.weather.description import (
+    KeyframedWeather,
+    weather_from_table,
+    weather_to_table,
+)
+from climatenerf.weather.effect import Effect
 from climatenerf.weather.flood import surface as flood_module
+from climatenerf.weather.registry import EFFECTS
 from climatenerf.weather.snow import layer as snow_module
+from climatenerf.weather.units import LENGTH, number, quantity
+from climatenerf.weather.weather import Weather
 
 CAMERA = Camera(64, 36, 40.0, 40.0, 32.0, 18.0)
 C2W = np.eye(4)
@@ -162,6 +172,75 @@ def test_a_refused_change_keeps_the_weather(session_of):
     with pytest.raises(UserError):
         session.change(before.base.with_value("flood.wind_speed", -1.0))
     assert session.weather is before and session.world(0.0).surfaces[0].level == 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Hail:
+    """Parameters of an effect that the test defines."""
+
+    size: Annotated[float | None, quantity(LENGTH, 0.0, 1.0, optional=True)] = None
+    speed: Annotated[float, number(0.0, 50.0)] = 20.0
+
+
+class HailEntity:
+    """Place nothing, and refuse hail above 10 cm, which fits no scene."""
+
+    def place(self, world, weather, time):
+        return world
+
+    def check(self, moments):
+        if any(moment.hail.size > 0.1 for moment in moments):
+            raise UserError("--hail.size is too large for the scene; give at most 10 cm")
+
+    def facts(self):
+        return {}
+
+
+@pytest.mark.parametrize("prepared_from", [(), ("hail.size",)])
+def test_an_entity_checks_the_weather_of_each_preparation(session_of, prepared_from):
+    hail = Effect("hail", Hail, ("size",), lambda _: HailEntity(), prepared_from=prepared_from)
+    made = session_of({"flood": {"level": "0 m"}}, [0.0])
+    effects = (*EFFECTS, hail)
+
+    def session(size):
+        weather = Weather(hail=Hail(size), effects=effects)
+        return RenderSession(made.field, made.scene, weather, C2W[None, :3, 3], effects=effects)
+
+    with pytest.raises(UserError, match="too large for the scene"):
+        session(0.2)
+    small = session(0.05)
+    with pytest.raises(UserError, match="too large for the scene"):
+        small.change(small.weather.base.with_value("hail.size", 0.2))
+    assert small.world(0.0) and small.weather.base.hail.size == 0.05
+
+
+def test_a_section_without_its_effect_is_refused(session_of):
+    """It would be dropped silently; with default values it changes nothing."""
+    hail = Effect("hail", Hail, ("size",), lambda _: HailEntity())
+    made = session_of({"flood": {"level": "0 m"}}, [0.0])
+    known = Weather(hail=Hail(0.05), effects=(*EFFECTS, hail))
+    default = known.with_value("hail.size", None)
+    film = KeyframedWeather(default, {"hail.speed": ((0.0, 1.0), (4.0, 2.0))})
+    for weather in (known, film):
+        with pytest.raises(UserError, match="section 'hail' that no effect renders") as error:
+            RenderSession(made.field, made.scene, weather)
+        assert "pass effects=" in str(error.value) and "\n" not in str(error.value)
+        with pytest.raises(UserError, match="section 'hail' that no effect renders"):
+            api._keyframed(weather, EFFECTS)
+        with pytest.raises(UserError, match="section 'hail'"):
+            made.change(weather)
+    assert not RenderSession(made.field, made.scene, default).world(0.0).matters
+
+
+def test_a_session_uses_the_installed_effects(session_of, monkeypatch):
+    """As `render_movie` does; weather made for the built-in effects gets the missing section."""
+    hail = Effect("hail", Hail, ("size",), lambda _: HailEntity())
+    made = session_of({"flood": {"level": "0 m"}}, [0.0])
+    monkeypatch.setattr(module, "installed_effects", lambda: (*EFFECTS, hail))
+    session = RenderSession(made.field, made.scene, Weather())
+    assert session.weather.base.hail == Hail()
+    with pytest.raises(UserError, match="too large for the scene"):
+        session.change(session.weather.base.with_value("hail.size", 0.2))
 
 
 def test_the_middle_of_the_shutter_interval_is_rendered(session_of):

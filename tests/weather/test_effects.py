@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
@@ -17,16 +18,18 @@ from support.random_field import random_field
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.layer_table import Layer
+from climatenerf.core.layer_table import RESERVED_NAMES, Layer
 from climatenerf.core.storage import write_json
 from climatenerf.field.checkpoint import save_field
+from climatenerf.output import render_folder
 from climatenerf.render.session import RenderSession
 from climatenerf.scene import save_scene
 from climatenerf.scene.scene import Scene, View
 from climatenerf.weather.description import weather_from_table
-from climatenerf.weather.effect import Effect
+from climatenerf.weather.effect import Effect, Measure
 from climatenerf.weather.registry import EFFECTS, check_effects, in_order, layer_table
 from climatenerf.weather.smog.parameters import SMOG, Smog
+from climatenerf.weather.units import number
 from climatenerf.weather.weather import Weather
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "03_new_effect.py"
@@ -137,6 +140,10 @@ def effect(**changes) -> Effect:
 RAIN = Layer("mask_rain", "1", "fraction of the pixel that shows rain", 1 / 255, 8)
 
 
+def writes(name: str) -> Effect:
+    return effect(layers=(dataclasses.replace(RAIN, name=name),))
+
+
 @pytest.mark.parametrize(
     ("added", "message"),
     [
@@ -144,11 +151,17 @@ RAIN = Layer("mask_rain", "1", "fraction of the pixel that shows rain", 1 / 255,
         ([effect(name="seed")], "cannot be named 'seed'"),
         ([effect(name="path")], "cannot be named 'path'"),
         ([effect(name="acid rain")], "cannot be named 'acid rain'"),
-        ([effect(layers=(dataclasses.replace(RAIN, name="depth"),))], "layer 'depth' is written"),
+        ([writes("depth")], "layer 'depth' is written"),
         (
             [effect(layers=(RAIN,)), effect(name="sleet", layers=(RAIN,))],
             "layer 'mask_rain' is written by the effect 'rain' and by the effect 'sleet'",
         ),
+        ([writes("frames")], "cannot be named 'frames'"),
+        ([writes("Movie")], "cannot be named 'Movie'"),
+        ([writes("../evil")], "cannot be named '../evil'"),
+        ([writes("a/b")], "cannot be named 'a/b'"),
+        ([writes("")], "cannot be named ''"),
+        ([writes("Depth")], "layer 'Depth' is written"),
         ([effect(after=("hail",))], "placed after hail, which is absent"),
         ([effect(after=("sleet",)), effect(name="sleet", after=("rain",))], "waits for it"),
     ],
@@ -157,6 +170,55 @@ def test_incompatible_effects_are_refused_in_one_sentence(added, message):
     with pytest.raises(UserError) as error:
         check_effects((*EFFECTS, *added), reserved=["path"])
     assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Unitless:
+    depth: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Required:
+    depth: Annotated[float, number(0.0, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"enabled_by": ("visibilty",)}, "no parameter 'visibilty', which its enabled_by names"),
+        ({"alternatives": (("visibility", "sgima"),)}, "'sgima', which its alternatives names"),
+        ({"prepared_from": ("rain.sgima",)}, "is prepared from 'rain.sgima'"),
+        ({"prepared_from": ("wet.depth",)}, "is prepared from 'wet.depth'"),
+        ({"prepare": "my_package.entity"}, "prepare function 'my_package.entity'"),
+        ({"prepare": ":prepare"}, "prepare function ':prepare'"),
+        ({"prepare": 5}, "prepare function 5"),
+        ({"measures": (Measure("wet", "mask_rian"),)}, "reads the layer 'mask_rian'"),
+        ({"measures": (Measure("wet", "depth", "mask_rian"),)}, "reads the layer 'mask_rian'"),
+        ({"measures": (Measure("up", "normal"),)}, "reads the layer 'normal'"),
+        ({"measures": (Measure("snow_share", "depth"),)}, "measure 'snow_share' is a number of"),
+        ({"measures": (Measure("mean_transmittance", "depth"),)}, "is a number of every frame"),
+        ({"parameters": Unitless}, "Unitless.depth states no unit and range"),
+        ({"parameters": Required, "enabled_by": ()}, "its parameter 'depth' no default"),
+        ({"parameters": dict}, "are no dataclass"),
+    ],
+)
+def test_slips_of_an_author_are_refused_in_one_sentence(changes, message):
+    with pytest.raises(UserError) as error:
+        check_effects((*EFFECTS, effect(**changes)))
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert "'rain'" in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["absent_package:prepare", "math:prepare"])
+def test_a_missing_prepare_function_is_named_with_its_effect(name):
+    with pytest.raises(UserError, match=f"{name}' of the weather effect 'rain' does not load"):
+        effect(prepare=name).load()
+
+
+def test_layers_cannot_have_the_names_of_the_other_files_of_a_render():
+    own = {"frames", render_folder.MOVIE, render_folder.SIDECAR, render_folder.PREVIEW}
+    assert {Path(name).stem for name in own} == RESERVED_NAMES
+    assert Path(render_folder.frame_files(0, (), ())[0]).parts[0] in RESERVED_NAMES
 
 
 def test_incompatible_installed_effects_exit_with_status_2(installed, tmp_path):

@@ -66,8 +66,8 @@ def run(options: Capture) -> int:
     with progress.StageBars() as bars:
         made = capture(settings, Listener(progress.say, progress.warn, bars))
     for kind in SIDECAR_KINDS:
-        if kept := [path for path in made.kept if path.startswith(f"{kind}/")]:
-            progress.say(f"Files of yours stay in {options.out / kind}: {listed(kept)}.")
+        if files := [path for path in made.user_files if path.startswith(f"{kind}/")]:
+            progress.say(f"Files of yours stay in {options.out / kind}: {listed(files)}.")
     progress.report_findings(made.scene.findings)
     progress.say(frame_line(made.scene))
     for picture in made.unposed:

@@ -50,7 +50,7 @@ def one_line(text: str, limit: int = MAX_LINE) -> str:
     return f"{plain[: limit // 2]} ... {plain[-limit // 2 :]}"
 
 
-def shown(value: object, limit: int = 60) -> str:
+def excerpt(value: object, limit: int = 60) -> str:
     """Return a value from a file for a message, cut off and on one line."""
     if isinstance(value, int) and value.bit_length() > 256:  # Python refuses to write it out
         long = value.bit_length() > 14_000

@@ -1,6 +1,6 @@
 """Largest accepted values of numbers that users give."""
 
-from climatenerf.core.errors import UserError, shown
+from climatenerf.core.errors import UserError, excerpt
 
 MAX_FRAMES = 100_000
 """Frames of a movie: over an hour at 24 per second."""
@@ -15,5 +15,5 @@ def check_seed(seed: int) -> int:
         UserError: it is outside 0 to `MAX_SEED`.
     """
     if not 0 <= seed <= MAX_SEED:
-        raise UserError(f"--seed must lie between 0 and {MAX_SEED}; got {shown(seed)}")
+        raise UserError(f"--seed must lie between 0 and {MAX_SEED}; got {excerpt(seed)}")
     return seed

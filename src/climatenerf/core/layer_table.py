@@ -1,4 +1,4 @@
-"""What a measured layer of a frame is: name, unit, meaning, storage. Loads no torch.
+"""What a measured layer of a frame is: name, unit, meaning, storage. Does not import torch.
 
 The layers of every frame are here; each weather effect adds its own (`weather.registry`).
 """
@@ -14,7 +14,8 @@ class Layer:
     """How one layer is named, read and stored.
 
     Attributes:
-        name: Name of its folder, its array and its entry in the sidecar.
+        name: Name of its folder, its array and its entry in the sidecar: an identifier that is not
+            in `RESERVED_NAMES`.
         unit: Unit of the float32 values, as the sidecar names it.
         meaning: One line for the sidecar.
         png_step: Value of one grey level of the PNG; None for unit vectors, stored as (n + 1) / 2.
@@ -45,3 +46,7 @@ FRAME_LAYERS = (
     ),
 )
 """Layers of every frame, whatever the weather."""
+ON_DEMAND = frozenset({"normal", "label"})
+"""Layers that are computed only for frames that write them."""
+RESERVED_NAMES = frozenset({"frames", "movie", "preview"})
+"""Names that a folder of a render uses itself, so that no layer can have them."""

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError, explain, one_line, shown
+from climatenerf.core.errors import UserError, excerpt, explain, one_line
 from climatenerf.core.text import decode
 
 MAX_NESTING = 100
@@ -60,7 +60,7 @@ def read_bytes(path: Path | str, what: str = "file", max_bytes: int = MAX_JSON_B
     except OSError as error:
         raise explain(error, Path(path)) from error
     except ValueError as error:  # a zero byte in the name
-        raise UserError(f"{what}: {shown(str(path))} is no name of a file; check it") from error
+        raise UserError(f"{what}: {excerpt(str(path))} is no name of a file; check it") from error
     if len(data) > max_bytes:
         raise UserError(
             f"{what}: {path} has more than {max_bytes / 1e6:.0f} MB, which no such file needs;"
@@ -173,8 +173,8 @@ def checked_number(value: Any, where: str, low: float = -math.inf, high: float =
     if not is_number(value) or not math.isfinite(value) or not low <= value <= high:
         bounds = "" if math.isinf(low) and math.isinf(high) else f" from {low:g} to {high:g}"
         raise UserError(
-            f"{where} should be a finite number{bounds}, not {shown(value)}; correct it or restore"
-            " the file"
+            f"{where} should be a finite number{bounds}, not {excerpt(value)}; correct it or"
+            " restore the file"
         )
     return float(value)
 
@@ -255,7 +255,7 @@ def is_number(value: Any) -> bool:
 def _entry(table: Mapping[str, Any], key: str, where: str, default: Any) -> Any:
     if not isinstance(table, Mapping):
         raise UserError(
-            f"{where} should be a table of named values, not {shown(table)}; restore the file"
+            f"{where} should be a table of named values, not {excerpt(table)}; restore the file"
         )
     value = table.get(key, default)
     if value is _REQUIRED:
@@ -274,7 +274,8 @@ def _typed(
 
 def _wrong(key: str, where: str, meaning: str, value: Any) -> UserError:
     return UserError(
-        f"{key} in {where} should be {meaning}, not {shown(value)}; correct it or restore the file"
+        f"{key} in {where} should be {meaning}, not {excerpt(value)}; correct it or restore the"
+        " file"
     )
 
 
@@ -323,7 +324,7 @@ def _check_values(table: dict[str, Any], where: str) -> None:
             inner += value.values() if isinstance(value, dict) else value
         for value in inner:
             if isinstance(value, int) and value.bit_length() > 3.33 * MAX_DIGITS:
-                raise UserError(f"{where} holds {shown(value)}; correct it")
+                raise UserError(f"{where} holds {excerpt(value)}; correct it")
         level = [value for value in inner if isinstance(value, dict | list)]
         if not level:
             return

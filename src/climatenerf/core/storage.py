@@ -23,7 +23,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from climatenerf.core.errors import UserError, explain, one_line, shown
+from climatenerf.core.errors import UserError, excerpt, explain, one_line
 from climatenerf.core.parsing import read_json
 
 __all__ = [
@@ -302,7 +302,7 @@ def check_schema(found: object, supported: int, what: str) -> None:
     """
     if not isinstance(found, int) or isinstance(found, bool) or found < 1:
         raise UserError(
-            f"{what} has no schema version ({shown(found)}); it is damaged, recreate it"
+            f"{what} has no schema version ({excerpt(found)}); it is damaged, recreate it"
         )
     if found > supported:
         raise UserError(

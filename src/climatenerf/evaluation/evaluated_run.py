@@ -19,6 +19,7 @@ from climatenerf.render.session import RenderSession
 from climatenerf.render.volume import camera_rays
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.registry import EFFECTS
 from climatenerf.weather.world import World
 
 Picture = UInt8[np.ndarray, "h w 3"]
@@ -95,7 +96,7 @@ def prepare_weather(
     """Prepare a weather at one time (s) for cameras at some poses (world m)."""
     positions = np.stack([pose[:3, 3] for pose in poses])
     moment = np.array([time])
-    return RenderSession(run.field, run.scene, weather, positions, moment)
+    return RenderSession(run.field, run.scene, weather, positions, moment, effects=EFFECTS)
 
 
 def render_weather(

@@ -294,10 +294,10 @@ def score_weather(
             render_baseline(case, ground_z, view, constants, name, seed)
             for seed, view in enumerate(views)
         ]
-        shown = [picture for picture in pictures if picture is not None]
-        if len(shown) == len(pictures):
+        complete = [picture for picture in pictures if picture is not None]
+        if len(complete) == len(pictures):
             scores.table["baselines"].setdefault(name, {})[case.name] = picture_scores(
-                [(255 * picture + 0.5).astype(np.uint8) for picture in shown], true
+                [(255 * picture + 0.5).astype(np.uint8) for picture in complete], true
             )
     return constants
 

@@ -175,8 +175,8 @@ class AnalyticField:
         self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None
     ) -> Float[Tensor, "n 3"]:
         """From the horizon's colour to the zenith's, linear in the sine of the elevation."""
-        share = d[:, 2:].clamp(0, 1)
-        return (1 - share) * d.new_tensor(self.horizon) + share * d.new_tensor(self.zenith)
+        weight = d[:, 2:].clamp(0, 1)
+        return (1 - weight) * d.new_tensor(self.horizon) + weight * d.new_tensor(self.zenith)
 
     def _distances(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n solids"]:
         if not self.solids:

@@ -1,4 +1,7 @@
-"""What a field can answer beside colours, for `RadianceField.capabilities`. Loads no torch."""
+"""What a field can answer beside colours, for `RadianceField.capabilities`.
+
+Does not import torch.
+"""
 
 DENSITY = "density"
 """`density` answers at any position."""

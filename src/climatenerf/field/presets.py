@@ -1,4 +1,4 @@
-"""Sizes of the field, as plain values. Imports no torch."""
+"""Sizes of the field, as plain values. Does not import torch."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Samples of rays in the occupied space of a field, and what training rays tell the occupancy."""
+"""Samples of rays in the occupied space of a field; updates of the occupancy by training rays."""
 
 from dataclasses import dataclass
 

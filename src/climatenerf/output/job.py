@@ -41,7 +41,7 @@ from climatenerf.scene import Scene
 from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
 from climatenerf.weather.effect import Effect
-from climatenerf.weather.registry import EFFECTS, layer_table
+from climatenerf.weather.registry import EFFECTS, MEAN_TRANSMITTANCE, layer_table
 
 if TYPE_CHECKING:
     from climatenerf.field.protocol import RadianceField
@@ -484,7 +484,7 @@ def measured(
     layers: dict[str, Float[np.ndarray, "h w *c"]], effects: Sequence[Effect] = EFFECTS
 ) -> dict[str, float]:
     """Return the means over a frame that its effects name; see `Effect.measures`."""
-    found = {"mean_transmittance": float(layers["transmittance"].mean())}
+    found = {MEAN_TRANSMITTANCE: float(layers["transmittance"].mean())}
     for measure in (measure for effect in effects for measure in effect.measures):
         values = layers[measure.layer]
         where = np.ones(values.shape, bool) if measure.mask is None else layers[measure.mask] > 0.5

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError, shown
+from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.paths.framing import (
     check_size,
@@ -83,7 +83,7 @@ def camera_path(
     if spec.endswith(".json"):
         return from_camera_path_json(Path(spec), scene, size)
     raise UserError(
-        f"there is no camera path {shown(spec)}; use training, orbit, still, still:VIEW or a"
+        f"there is no camera path {excerpt(spec)}; use training, orbit, still, still:VIEW or a"
         " nerfstudio camera_path.json"
     )
 
@@ -275,7 +275,7 @@ def _named_view(scene: Scene, view: str | int) -> View:
         return scene.views[int(text)]
     near = difflib.get_close_matches(text, names, n=1, cutoff=0.0) or names[:1]
     raise UserError(
-        f"there is no view {shown(text)} among the {len(names)} photographs; give a name such as"
+        f"there is no view {excerpt(text)} among the {len(names)} photographs; give a name such as"
         f" {near[0]!r} or a number from 0 to {len(names) - 1}"
     )
 
@@ -283,6 +283,6 @@ def _named_view(scene: Scene, view: str | int) -> View:
 def _check_frames(frames: int) -> None:
     if not 1 <= frames <= MAX_FRAMES:
         raise UserError(
-            f"a movie of {shown(frames)} frames cannot be rendered; give --frames 1 or more"
+            f"a movie of {excerpt(frames)} frames cannot be rendered; give --frames 1 or more"
             f" (up to {MAX_FRAMES})"
         )

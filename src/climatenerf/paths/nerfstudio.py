@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core import parsing
-from climatenerf.core.errors import UserError, shown
+from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.scene import Scene
 from climatenerf.scene.readers.ply import MAX_POSITION
@@ -50,7 +50,7 @@ def read_drawn_path(path: Path, scene: Scene) -> DrawnPath:
     data = parsing.read_json(path, "camera path")
     if str(data.get("camera_type", "perspective")).lower() != "perspective":
         raise UserError(
-            f"camera path: {path} is for a {shown(data['camera_type'])} camera; only perspective"
+            f"camera path: {path} is for a {excerpt(data['camera_type'])} camera; only perspective"
             " paths can be rendered; change the camera in the viewer and export again"
         )
     entries = data.get("camera_path")

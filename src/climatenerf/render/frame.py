@@ -11,15 +11,14 @@ from torch import Tensor
 from climatenerf.core.cameras import Camera
 from climatenerf.core.colour import encode_srgb
 from climatenerf.core.device import CPU, to_device, to_numpy
-from climatenerf.core.layer_table import Layer
+from climatenerf.core.layer_table import ON_DEMAND, Layer
 from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
-from climatenerf.render.volume import camera_rays
-from climatenerf.weather.flood.optics import pixel_rotation
+from climatenerf.render.volume import camera_rays, pixel_rotation
 from climatenerf.weather.registry import layer_table
 from climatenerf.weather.world import World
 
@@ -116,7 +115,7 @@ def see_frame(
     table = layer_table() if options.table is None else options.table
     given = {"depth": seen.depth, "transmittance": seen.transmittance, **seen.layers}
     layers = {name: _middle(values, shape) for name, values in given.items()}
-    for name in table.keys() - layers.keys() - {"normal", "label"}:
+    for name in table.keys() - layers.keys() - ON_DEMAND:
         layers[name] = np.full((height, width), table[name].no_data, np.float32)
     if options.normals or options.labels:
         directions, angle = _middle(rays[1], shape), 1.0 / camera.fx
@@ -127,7 +126,7 @@ def see_frame(
             if normal is None:
                 normal = plane_normals(c2w[:3, 3], directions, layers["depth"], angle)
             weather = _middle(seen.normal, shape)
-            known = (weather != 0).any(-1, keepdims=True)  # of water and snow
+            known = (weather != 0).any(-1, keepdims=True)  # normals of surfaces and matter
             layers["normal"] = np.where(known, weather, normal)
     return averaged(seen.rgb), layers
 

@@ -56,7 +56,7 @@ def trace(
         rays_d: unit directions.
         pixel_angle: angle that a pixel spans, rad.
         sample_rotation: angle that rotates each ray's glossy sample set, rad; see
-            `flood.optics.pixel_rotation`.
+            `volume.pixel_rotation`.
         cancelled: asked every 10 to 20 ms of computing; see `field.compositing.Checkpoints`.
 
     Raises:

@@ -17,9 +17,9 @@ from climatenerf.field.protocol import RadianceField, require
 from climatenerf.render.frame import FrameOptions, Picture, encoded_8bit, see_frame
 from climatenerf.render.irradiance import scene_irradiance
 from climatenerf.scene.scene import Scene
-from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.description import KeyframedWeather, for_effects
 from climatenerf.weather.effect import Effect, Entity
-from climatenerf.weather.registry import EFFECTS, check_effects, in_order, layer_table
+from climatenerf.weather.registry import check_effects, in_order, installed_effects, layer_table
 from climatenerf.weather.weather import Weather, check
 from climatenerf.weather.world import Preparation, World
 
@@ -56,7 +56,7 @@ class RenderSession:
         times: Float[np.ndarray, "f"] | None = None,
         appearance: Float[Tensor, "1 e"] | None = None,
         progress: Callable[[str, float], None] | None = None,
-        effects: Sequence[Effect] = EFFECTS,
+        effects: Sequence[Effect] | None = None,
     ):
         """Prepare everything that is computed once: light, waves, snowfall.
 
@@ -69,18 +69,21 @@ class RenderSession:
             times: moments of the frames, s. Default: 0 s alone.
             appearance: exposure and light of the field's colours; None: the mean of all photos.
             progress: called with what is being done and the fraction that is done, [0, 1].
-            effects: effects that `weather` has sections for.
+            effects: the effects to render with; None takes the installed ones. A section of the
+                weather that has values of its own needs its effect among them.
 
         Raises:
             UserError: a value out of its range, a level above the whole scene, effects that clash,
-                or a field that lacks what an effect needs.
+                a section of the weather without its effect, or a field that lacks what an effect
+                needs.
         """
         if camera_positions is None:
             views = scene.of_split("train")
             camera_positions = np.stack([scene.c2w_world(view)[:3, 3] for view in views])
         self.field = field
         self.scene = scene
-        self.effects = in_order(check_effects(tuple(effects)))
+        used = installed_effects() if effects is None else check_effects(tuple(effects))
+        self.effects = in_order(used)
         self._camera_positions = camera_positions
         self._times = np.zeros(1) if times is None else times
         self._appearance = appearance
@@ -99,8 +102,7 @@ class RenderSession:
         Raises:
             UserError: as the constructor; the session then keeps its weather.
         """
-        if isinstance(weather, Weather):
-            weather = KeyframedWeather(weather, {})
+        weather = for_effects(weather, self.effects)
         moments = [check(weather.at(float(t)), self.effects) for t in self._times]
         prepared = {}
         for effect in self.effects:
@@ -110,10 +112,12 @@ class RenderSession:
                 continue
             require(self.field, effect.needs, f"the weather effect {effect.name!r}")
             key = _key(effect, own)
-            if self._keys.get(effect.name) != key:
-                prepared[effect.name] = key, function(self._preparation(own))
+            if self._keys.get(effect.name) == key:
+                entity = self._entities[effect.name]
             else:
-                self._entities[effect.name].check(own)
+                entity = function(self._preparation(own))
+                prepared[effect.name] = key, entity
+            entity.check(own)
         for name, (key, entity) in prepared.items():
             self._keys[name], self._entities[name] = key, entity
         self.weather = weather

@@ -332,19 +332,19 @@ def _scale_report(report: dict[str, Any], where: str) -> dict[str, dict[str, flo
     out = {}
     for name in report:
         entry = parsing.entries(report, name, f"scale_report of {where}")
-        place = f"scale_report.{name} of {where}"
+        location = f"scale_report.{name} of {where}"
         out[name] = {
-            "times": parsing.number(entry, "times", place, 1 / MAX_SCALE, MAX_SCALE),
-            "error": parsing.number(entry, "error", place, 0.0),
+            "times": parsing.number(entry, "times", location, 1 / MAX_SCALE, MAX_SCALE),
+            "error": parsing.number(entry, "error", location, 0.0),
         }
     return out
 
 
 def _up_report(report: dict[str, Any], where: str) -> dict[str, Any]:
     """Return the report on up: the methods used, as a text, and the angles of all methods."""
-    place = f"up_report of {where}"
-    angles = {key: parsing.number(report, key, place) for key in report if key != "used"}
-    return {"used": parsing.text(report, "used", place)} | angles if "used" in report else angles
+    location = f"up_report of {where}"
+    angles = {key: parsing.number(report, key, location) for key in report if key != "used"}
+    return {"used": parsing.text(report, "used", location)} | angles if "used" in report else angles
 
 
 def _texts(table: dict[str, Any], key: str, where: str) -> list[str]:

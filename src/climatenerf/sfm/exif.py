@@ -72,9 +72,9 @@ def read_exif(image: Image.Image) -> Exif:
     words = [detail.get(tag) for tag in (ExifTags.Base.DateTimeOriginal, SUBSECONDS)]
     taken = ".".join(str(word).strip("\0 ") for word in words if word) if words[0] else ""
     found = Exif(camera, _focal(detail, *image.size), gps, down, orientation, taken)
-    shown = found.down_as_shown
+    down = found.down_as_shown
     # If gravity would point up in the picture, the orientation tag is stale: the axes are unknown.
-    return replace(found, down=None) if shown and shown[1] < -0.5 else found
+    return replace(found, down=None) if down and down[1] < -0.5 else found
 
 
 def _phone_gravity(note: object, decoder: object) -> Down | None:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from climatenerf.core.errors import UserError, shown
+from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.listing import visible
 from climatenerf.core.storage import explain, make_folder
 from climatenerf.scene import Camera, Scene, read_scene, save_scene
@@ -103,14 +103,14 @@ class Captured:
         scene: the scene, in metres.
         model: result of structure from motion.
         unposed: pictures without pose, with reason and remedy.
-        kept: the user's files that are kept in the scene folder, relative to it.
+        user_files: the user's files that stay in the scene folder, relative to it.
         length_error: why known lengths could not be used; None if they could.
     """
 
     scene: Scene
     model: Model
     unposed: list[Unposed]
-    kept: list[str]
+    user_files: list[str]
     length_error: UserError | None
 
 
@@ -123,9 +123,11 @@ def check_settings(settings: CaptureSettings) -> None:
     """
     out = settings.out
     if not 64 <= settings.features <= 32768:
-        raise UserError(f"--features must lie between 64 and 32768; got {shown(settings.features)}")
+        raise UserError(
+            f"--features must lie between 64 and 32768; got {excerpt(settings.features)}"
+        )
     if not 0 <= settings.seed < 2**31:
-        raise UserError(f"--seed must lie between 0 and 2147483647; got {shown(settings.seed)}")
+        raise UserError(f"--seed must lie between 0 and 2147483647; got {excerpt(settings.seed)}")
     height = settings.camera_height
     if height is not None and not 0 < height <= MAX_CAMERA_HEIGHT:
         raise UserError(
@@ -196,8 +198,8 @@ def _capture(settings: CaptureSettings, listener: Listener, fresh: bool) -> Capt
     except UserError:
         discard_scene(out, fresh)
         raise
-    kept = install_scene(out, new, list(settings.sidecars))
-    return Captured(scene, model, unposed, kept, length_error)
+    user_files = install_scene(out, new, list(settings.sidecars))
+    return Captured(scene, model, unposed, user_files, length_error)
 
 
 def with_known_lengths(scene: Scene, known: Sequence[tuple[str, float]], marks: Path) -> Scene:

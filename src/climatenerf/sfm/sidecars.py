@@ -34,13 +34,13 @@ class Photo:
         source: path relative to the folder of photos.
         lens: camera of the photo, before undistortion.
         orientation: EXIF orientation, 1 to 8.
-        shown: True if `lens` describes the picture as shown, False if as stored.
+        as_displayed: True if `lens` describes the picture as displayed, False if as stored.
     """
 
     source: str
     lens: Camera
     orientation: int
-    shown: bool
+    as_displayed: bool
 
 
 def import_sidecars(scene: Scene, kind: str, folder: Path, photos: Mapping[str, Photo]) -> Scene:
@@ -97,15 +97,15 @@ def _infer_stored(
 
     Only photos that EXIF rotates by 90 degrees show the difference in the shape of their file.
     """
-    stored = shown = 0
+    stored = displayed = 0
     for name, sidecar in values.items():
         photo = photos[name]
         if photo.orientation >= 5 and photo.lens.width != photo.lens.height:
             same = _same_shape(sidecar, photo.lens)
-            stored += same != photo.shown
-            shown += same == photo.shown
+            stored += same != photo.as_displayed
+            displayed += same == photo.as_displayed
     ambiguous = any(photos[name].orientation in (2, 3, 4) for name in values)
-    return stored > shown, bool(stored or shown) or not ambiguous
+    return stored > displayed, bool(stored or displayed) or not ambiguous
 
 
 def _same_shape(values: np.ndarray, lens: Camera) -> bool:
@@ -123,10 +123,10 @@ def _to_lens_frame(
     """
     quarter_turn = photo.orientation >= 5
     if quarter_turn and photo.lens.width != photo.lens.height:
-        as_stored = _same_shape(values, photo.lens) != photo.shown
-    if as_stored and photo.shown:
+        as_stored = _same_shape(values, photo.lens) != photo.as_displayed
+    if as_stored and photo.as_displayed:
         values = orient(values, photo.orientation)
-    elif not as_stored and not photo.shown:
+    elif not as_stored and not photo.as_displayed:
         values = orient(values, {6: 8, 8: 6}.get(photo.orientation, photo.orientation))
     if not _same_shape(values, photo.lens):
         raise UserError(

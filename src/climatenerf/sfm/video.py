@@ -139,8 +139,9 @@ def extract_frames(
 def hdr_of_video(ffmpeg: str, video: Path) -> HdrVideo | None:
     """Return the HDR signal of a video from its first frame; None for SDR.
 
-    The frame and not the container is asked, since the decoder knows both, and signals such as
-    "BT.2020, preferably HLG" of broadcasts. Dolby Vision of phones (profile 8.4) is HLG.
+    ffmpeg decodes a frame, because the signal may be written in the container, in the video stream
+    or in both. Broadcasts also use "BT.2020, preferably HLG". Dolby Vision of phones
+    (profile 8.4) is HLG.
     """
     command = [
         ffmpeg,

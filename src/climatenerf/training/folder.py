@@ -1,4 +1,4 @@
-"""Checks of run folders before a fit. Imports no torch, so that errors appear at once."""
+"""Checks of run folders before a fit. Does not import torch: errors appear at once."""
 
 import dataclasses
 from pathlib import Path

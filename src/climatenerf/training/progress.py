@@ -1,4 +1,4 @@
-"""What a fit tells after each step."""
+"""What a fit reports after each step."""
 
 from dataclasses import dataclass
 

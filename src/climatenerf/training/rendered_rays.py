@@ -18,9 +18,9 @@ class RenderedRays:
     dt: Float[Tensor, "s"]
     """Extent of each sample along its ray, grid units."""
     weights: Float[Tensor, "s"]
-    """Share of the ray's light that each sample absorbs."""
+    """Fraction of the ray's light that each sample absorbs."""
     transmittance: Float[Tensor, "n"]
-    """Share of the light that passes all samples of a ray."""
+    """Fraction of the light that passes all samples of a ray."""
 
 
 @dataclass(frozen=True)

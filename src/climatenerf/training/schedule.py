@@ -1,4 +1,4 @@
-"""What changes in the course of a fit, as one dataclass of plain numbers. Imports no torch.
+"""What changes in the course of a fit, as one dataclass of plain numbers. Does not import torch.
 
 Training progress runs from 0 to 1. The methods are pure functions of it.
 """

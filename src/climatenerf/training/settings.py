@@ -1,4 +1,4 @@
-"""Settings of a fit, as plain values. Imports no torch."""
+"""Settings of a fit, as plain values. Does not import torch."""
 
 from dataclasses import asdict, dataclass, field, replace
 

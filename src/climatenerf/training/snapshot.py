@@ -1,4 +1,4 @@
-"""Checkpoints on disk: files that belong together, replaced and read as one. Imports no torch.
+"""Checkpoints on disk: files that belong together, replaced and read as one. Does not import torch.
 
 A writer makes all files of a checkpoint in `RUN/.next`, the field first, and then moves them into
 the run folder, again the field first. All state one identity. A reader takes the field of the run

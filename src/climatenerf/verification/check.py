@@ -1,4 +1,4 @@
-"""The result of one check. Loads no torch."""
+"""The result of one check. Does not import torch."""
 
 import math
 from dataclasses import dataclass

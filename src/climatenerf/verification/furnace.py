@@ -40,7 +40,7 @@ KIRCHHOFF = "Kirchhoff's law of radiation"
 
 def checks(device: torch.device = CPU) -> Iterator[Check]:
     """Render white weather in a white scene."""
-    place = AnalyticField(
+    field = AnalyticField(
         [HalfSpace(colour=WHITE)],
         zenith=WHITE,
         horizon=WHITE,
@@ -50,13 +50,13 @@ def checks(device: torch.device = CPU) -> Iterator[Check]:
     smog = Smog(sigma=0.3, height_falloff=5.0, colour=WHITE)
     waves = Flood(level=0.3, wind_speed=4.0, attenuation=(0.0, 0.0, 0.0), colour=WHITE, ior=IOR)
     muddy = Flood(level=0.3, wind_speed=4.0, clarity=0.5, colour=WHITE, ior=IOR)
-    yield smog_furnace(radiance(frame_in(place, Weather(smog=smog), VIEW)))
-    session = session_in(place, Weather(flood=waves), VIEW)
+    yield smog_furnace(radiance(frame_in(field, Weather(smog=smog), VIEW)))
+    session = session_in(field, Weather(flood=waves), VIEW)
     clear = radiance(session.frame(VIEW.camera, VIEW.c2w))
     session.change(Weather(flood=muddy))
     yield water_furnace(clear, radiance(session.frame(VIEW.camera, VIEW.c2w)))
     # From nearer, as the edge of the snow is not level.
-    yield snow_furnace(radiance(frame_in(place, Weather(snow=Snow(depth=0.1)), NEAR)))
+    yield snow_furnace(radiance(frame_in(field, Weather(snow=Snow(depth=0.1)), NEAR)))
 
 
 def smog_furnace(measured: Float[np.ndarray, "h w 3"]) -> Check:

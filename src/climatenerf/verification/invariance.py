@@ -50,10 +50,10 @@ DEFINITION = "definition"
 
 def checks(device: torch.device = CPU) -> Iterator[Check]:
     """Render a rising street with two boxes, and compare its frames with each other."""
-    place = street(device)
+    field = street(device)
 
     def seen(weather: Weather) -> Frame:
-        return session_in(place, weather, VIEW).frame(VIEW.camera, VIEW.c2w)
+        return session_in(field, weather, VIEW).frame(VIEW.camera, VIEW.c2w)
 
     clean = seen(Weather())
     wet = [seen(Weather(flood=Flood(level=level, wind_speed=0.0))) for level in LEVELS]
@@ -67,8 +67,8 @@ def checks(device: torch.device = CPU) -> Iterator[Check]:
     nothing = seen(Weather(**NOTHING))
     yield no_effect(clean, nothing)
     yield no_effect_on_layers(clean, nothing)
-    clear = clear_fraction(place, VIEW)
-    yield faint_smog(clean, seen(Weather(**FAINT)), sky_of(place, VIEW), clear)
+    clear = clear_fraction(field, VIEW)
+    yield faint_smog(clean, seen(Weather(**FAINT)), sky_of(field, VIEW), clear)
     still = Flood(level=-1.0, wind_speed=0.0)
     yield faint("flood", clean, seen(Weather(flood=still)), clear)
     yield faint("snow", clean, seen(Weather(snow=Snow(depth=1e-4))), clear)
@@ -129,10 +129,10 @@ def water_depth(wet: Frame, clean: Frame) -> Check:
     directions = VIEW.directions()
     distance = plane_distance(VIEW.eye, directions, NORMAL)
     ground = np.abs(clean.layers["depth"] - distance) < 0.01
-    shown = ground & (wet.layers["mask_water"] > 0.999)
-    expected = LEVELS[-1] - (VIEW.eye[2] + distance[shown] * directions[shown][:, 2])
-    errors = np.abs(wet.layers["water_depth"][shown] - expected)
-    error = 1000 * float(errors.max()) if shown.any() else math.nan
+    flooded = ground & (wet.layers["mask_water"] > 0.999)
+    expected = LEVELS[-1] - (VIEW.eye[2] + distance[flooded] * directions[flooded][:, 2])
+    errors = np.abs(wet.layers["water_depth"][flooded] - expected)
+    error = 1000 * float(errors.max()) if flooded.any() else math.nan
     compares = "layer water_depth with the level over the sloping ground"
     return Check("flood water depth", compares, error, 5.0, "mm", "geometry of the ray")
 

@@ -19,6 +19,7 @@ from climatenerf.verification.check import Check
 from climatenerf.verification.closed_forms import linear_from_display
 from climatenerf.verification.setting import Viewpoint, clear_fraction, radiance, sky_of
 from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.registry import EFFECTS
 from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
@@ -40,7 +41,7 @@ def checks(field: Field, scene: Scene, viewpoint: Viewpoint) -> Iterator[Check]:
     yield stored_numbers(field.state_dict())
 
     def seen(weather: Weather, layers: tuple[str, ...] = ()) -> Frame:
-        session = RenderSession(field, scene, weather, viewpoint.eye[None])
+        session = RenderSession(field, scene, weather, viewpoint.eye[None], effects=EFFECTS)
         return session.frame(viewpoint.camera, viewpoint.c2w, layers=layers)
 
     clean = seen(Weather())

@@ -16,6 +16,7 @@ from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.render.session import Frame, RenderSession
 from climatenerf.render.volume import camera_rays
 from climatenerf.scene.scene import Scene, View
+from climatenerf.weather.registry import EFFECTS
 from climatenerf.weather.weather import Weather
 
 Vector = tuple[float, float, float]
@@ -75,7 +76,7 @@ def session_in(field: AnalyticField, weather: Weather, viewpoint: Viewpoint) -> 
     pose = looking(tuple(viewpoint.eye.tolist()), (0.0, 1.0, -0.3))
     view = View("view.png", Path("view.png"), 0, pose)
     scene = Scene(Path("."), "analytic", (camera,), (view,))
-    return RenderSession(protocol_of(field), scene, weather, np.zeros((1, 3)))
+    return RenderSession(protocol_of(field), scene, weather, np.zeros((1, 3)), effects=EFFECTS)
 
 
 def frame_in(field: AnalyticField, weather: Weather, viewpoint: Viewpoint) -> Frame:

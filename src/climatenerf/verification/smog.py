@@ -108,5 +108,5 @@ def _depth_error(measured: Float[np.ndarray, "n"], expected: Float[np.ndarray, "
 def _seen(smog: Smog, device: torch.device) -> Frame:
     ground = HalfSpace(colour=GROUND)
     box = ((-200.0, -200.0, -2.0), (200.0, 200.0, 6.0))
-    place = AnalyticField([ground], 2e4, zenith=SKY, horizon=SKY, box=box, device=device)
-    return frame_in(place, Weather(smog=smog), VIEW)
+    field = AnalyticField([ground], 2e4, zenith=SKY, horizon=SKY, box=box, device=device)
+    return frame_in(field, Weather(smog=smog), VIEW)

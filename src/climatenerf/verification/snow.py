@@ -24,8 +24,8 @@ GEOMETRY = "geometry of the ray"
 
 def checks(device: torch.device = CPU) -> Iterator[Check]:
     """Let snow of several depths lie on a plane, and measure it in the picture."""
-    place = AnalyticField([HalfSpace()], box=((-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)), device=device)
-    session = session_in(place, Weather(snow=Snow(depth=DEPTHS[0])), VIEW)
+    field = AnalyticField([HalfSpace()], box=((-2.0, -2.0, -1.0), (2.0, 2.0, 2.0)), device=device)
+    session = session_in(field, Weather(snow=Snow(depth=DEPTHS[0])), VIEW)
     frames = []
     for depth in DEPTHS:
         session.change(Weather(snow=Snow(depth=depth)))

@@ -93,9 +93,9 @@ def checks(device: torch.device = CPU) -> Iterator[Check]:
 
     scene = _floating_boxes(device)
     still = _still(level=MIRROR_LEVEL, attenuation=OPAQUE, gloss=1e9)
-    shown = frame_in(scene, Weather(flood=still), MIRROR_VIEW)
+    water_picture = frame_in(scene, Weather(flood=still), MIRROR_VIEW)
     image = frame_in(scene, Weather(), MIRROR_VIEW.mirrored(MIRROR_LEVEL))
-    yield mirror(radiance(shown), radiance(image), shown.layers["mask_water"])
+    yield mirror(radiance(water_picture), radiance(image), water_picture.layers["mask_water"])
 
 
 def incidence() -> Float[np.ndarray, "n"]:
@@ -189,7 +189,7 @@ def wet_bottom(measured: Float[np.ndarray, "3"]) -> Check:
 
 
 def mirror(
-    shown: Float[np.ndarray, "h w 3"],
+    water_picture: Float[np.ndarray, "h w 3"],
     image: Float[np.ndarray, "h w 3"],
     water: Float[np.ndarray, "h w"],
 ) -> Check:
@@ -199,7 +199,7 @@ def mirror(
     over blue are what it reflects. 0.001 is 60 dB.
     """
     wet = water > 0.999
-    reflected = shown[wet][:, :2] / np.maximum(shown[wet][:, 2:], 1e-9)
+    reflected = water_picture[wet][:, :2] / np.maximum(water_picture[wet][:, 2:], 1e-9)
     error = float(np.sqrt(np.mean((reflected - image[wet][:, :2]) ** 2)))
     compares = "what still water reflects with the mirrored camera's picture, RMS"
     return Check("mirror image", compares, error, 1e-3, "1", "law of reflection")

@@ -7,17 +7,17 @@
     [smog]
     visibility = "200 m"
 
-Sections, names, units and ranges come from the effects. Loads no torch.
+Sections, names, units and ranges come from the effects. Does not import torch.
 """
 
 import difflib
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from climatenerf.core.errors import UserError, one_line, shown
+from climatenerf.core.errors import UserError, excerpt, one_line
 from climatenerf.core.parsing import read_toml
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import EFFECTS, parameters
@@ -48,6 +48,27 @@ class KeyframedWeather:
         return weather
 
 
+def for_effects(weather: Weather | KeyframedWeather, effects: Sequence[Effect]) -> KeyframedWeather:
+    """Weather over time with a section for each effect.
+
+    Sections of other effects stay if they have their defaults.
+
+    Raises:
+        UserError: a section has values that no effect would render.
+    """
+    film = weather if isinstance(weather, KeyframedWeather) else KeyframedWeather(weather, {})
+    known = {effect.name for effect in effects}
+    keyframed = {name.partition(".")[0] for name in film.keyframes}
+    for name, section in film.base.sections.items():
+        if name not in known and (name in keyframed or section != type(section)()):
+            raise UserError(
+                f"the weather has a section {name!r} that no effect renders (there are"
+                f" {', '.join(sorted(known)) or 'none'}); pass effects= with its Effect, or install"
+                " its package"
+            )
+    return replace(film, base=film.base.with_sections(effects))
+
+
 def read_weather(path: Path, effects: Sequence[Effect] = EFFECTS) -> KeyframedWeather:
     """Read a weather file.
 
@@ -74,7 +95,7 @@ def weather_from_table(
             weather = weather.with_value("seed", _integer(entries))
             continue
         if not isinstance(entries, Mapping):
-            raise UserError(f"[{section}] must be a table of values; got {shown(entries)}")
+            raise UserError(f"[{section}] must be a table of values; got {excerpt(entries)}")
         for key, raw in entries.items():
             item = _nearest(key, list(known[section]), f"key in [{section}]")
             name, parameter = f"{section}.{item}", known[section][item]
@@ -199,7 +220,7 @@ def _read_keyframes(name: str, parameter: Parameter, raw: Mapping[str, Any]) -> 
 
 def _integer(raw: Any) -> int:
     if isinstance(raw, bool) or not isinstance(raw, int):
-        raise UserError(f"seed must be a whole number; got {shown(raw)}")
+        raise UserError(f"seed must be a whole number; got {excerpt(raw)}")
     return raw
 
 

@@ -1,4 +1,4 @@
-"""What a weather effect is: one package, described by one `Effect`. Loads no torch.
+"""What a weather effect is: one package, described by one `Effect`. Does not import torch.
 
 An effect states its parameters, the layers it writes, what it needs of a field and what its
 preparation depends on. Its entity, which does the physics, is loaded when the effect is present:
@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Protocol
 
+from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.layer_table import Layer
 from climatenerf.weather.units import Parameter, parameters_of
 
@@ -53,7 +54,7 @@ class Measure:
 
     Attributes:
         name: Key in the sidecar, with its unit.
-        layer: The layer whose mean is taken.
+        layer: The layer whose mean is taken: of any effect, or one that every frame has.
         mask: Only over pixels where this layer is above 0.5; None: over the whole frame.
     """
 
@@ -69,7 +70,7 @@ class Effect:
     Attributes:
         name: Section of the weather file and prefix of the flags: letters, digits, underscores.
         parameters: Frozen dataclass with a default for each field, and a `units.Parameter` in each
-            annotation. It loads no torch.
+            annotation. Its module does not import torch.
         enabled_by: Fields that put the effect into the scene when one of them is not None.
         prepare: "package.module:function", or the function: takes a `world.Preparation` and returns
             an `Entity`. None: the section only informs other effects.
@@ -109,8 +110,19 @@ class Effect:
         return {item.name: item.default for item in fields(self.parameters)}
 
     def load(self) -> "Callable[[Preparation], Entity] | None":
-        """The function that prepares the entity; its module is imported here."""
+        """The function that prepares the entity; its module is imported here.
+
+        Raises:
+            UserError: the module cannot be imported, or has no such function.
+        """
         if not isinstance(self.prepare, str):
             return self.prepare
         module, _, function = self.prepare.partition(":")
-        return getattr(importlib.import_module(module), function)
+        try:
+            return getattr(importlib.import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            raise UserError(
+                f"the prepare function {self.prepare!r} of the weather effect {self.name!r} does"
+                f" not load ({one_line(str(error), 200)}); correct its name, or install what it"
+                " needs"
+            ) from error

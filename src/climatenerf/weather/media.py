@@ -56,9 +56,9 @@ def attenuate(
         total = torch.stack(depths).sum(0)
         own = sum(d[:, None] * c for d, c in zip(depths, sources, strict=True))
         own = own / total[:, None].clamp_min(_TINY)
-        left = torch.exp(-total)
-        arriving = arriving + (passed * (1 - left))[:, None] * own
-        passed, start, before = passed * left, end, after
+        transmitted = torch.exp(-total)
+        arriving = arriving + (passed * (1 - transmitted))[:, None] * own
+        passed, start, before = passed * transmitted, end, after
     return arriving + passed[:, None] * radiance
 
 

@@ -2,7 +2,7 @@
 
 Inside the program every quantity is a plain float in SI units (angles: radians). A `Parameter` in a
 dataclass field's annotation states unit and range once: flags, help, weather files, keyframes and
-checks all read it. Importing this module loads neither torch nor pint.
+checks all read it. Importing this module does not import torch or pint.
 """
 
 import functools
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from tyro.constructors import PrimitiveConstructorSpec
 
-from climatenerf.core.errors import UserError, one_line, shown
+from climatenerf.core.errors import UserError, excerpt, one_line
 
 if TYPE_CHECKING:
     import pint
@@ -102,13 +102,13 @@ def parse_quantity(text: str, kind: Kind, where: str = "") -> float:
 
 def format_quantity(value: float, kind: Kind) -> str:
     """Write an SI value back with its unit, so that `parse_quantity` returns the same float."""
-    shown = value / kind.scale
+    number = value / kind.scale
     for digits in (6, 9, 12):  # 35 deg is written "35 deg", not "35.00000000000001 deg"
-        rounded = round(shown, digits)
+        rounded = round(number, digits)
         if rounded * kind.scale == value:
-            shown = rounded
+            number = rounded
             break
-    return f"{shown:.0f} {kind.unit}" if _is_small_integer(shown) else f"{shown!r} {kind.unit}"
+    return f"{number:.0f} {kind.unit}" if _is_small_integer(number) else f"{number!r} {kind.unit}"
 
 
 def _is_small_integer(value: float) -> bool:
@@ -167,7 +167,7 @@ class Parameter(PrimitiveConstructorSpec[Any]):
         try:
             return self.text(value)
         except OverflowError:
-            return shown(value)
+            return excerpt(value)
 
     def check(self, value: float | tuple[float, ...] | None, name: str) -> None:
         """Check a value against the range; `name` is the field's, such as "flood.wind_speed".
@@ -197,16 +197,16 @@ class Parameter(PrimitiveConstructorSpec[Any]):
         if self.kind is not None:
             if not isinstance(raw, str):
                 message = f'{where} must be {self.kind.name} such as "{self.kind.example}"'
-                raise UserError(f"{message}; got {shown(raw)}")
+                raise UserError(f"{message}; got {excerpt(raw)}")
             return parse_quantity(raw, self.kind, where)
         if self.count == 1:
             if isinstance(raw, bool) or not isinstance(raw, int | float):
-                raise UserError(f"{where} must be a number; got {shown(raw)}")
+                raise UserError(f"{where} must be a number; got {excerpt(raw)}")
             return float(raw)
         numbers = isinstance(raw, list | tuple) and len(raw) == self.count
         if not numbers or any(isinstance(x, bool) or not isinstance(x, int | float) for x in raw):
             raise UserError(
-                f"{where} must be three numbers such as [0.5, 0.4, 0.3]; got {shown(raw)}"
+                f"{where} must be three numbers such as [0.5, 0.4, 0.3]; got {excerpt(raw)}"
             )
         return tuple(float(x) for x in raw)
 

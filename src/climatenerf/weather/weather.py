@@ -1,4 +1,4 @@
-"""The parameters of all effects at one moment. Loads no torch.
+"""The parameters of all effects at one moment. Does not import torch.
 
 Values are SI floats (angles in radians); a flag or a weather file gives them with a unit. Every
 section is always there, and its main value None means that the effect is absent. Colours are

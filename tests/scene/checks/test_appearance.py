@@ -46,7 +46,7 @@ def test_few_photos_are_read_and_compared_with_those_that_share_points(scene):
 def test_exchanged_photos_are_found_and_named(scene):
     (finding,) = corrected(exchanged(scene, (0, 16))).findings
     assert finding.code == "photo-exchanged" and "000.png" in finding.message
-    assert finding.message.startswith("2 of 24 photos") and finding.remedy
+    assert finding.message.startswith("2 of 24 compared photos") and finding.remedy
     assert finding.file == str(scene.views[16].path), "the file that has the name of another"
 
 

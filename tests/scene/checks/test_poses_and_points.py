@@ -8,8 +8,8 @@ from support.textured_scene import CAMERA, textured_scene
 
 from climatenerf.scene.checks.check import corrected
 from climatenerf.scene.checks.conventions import inverse
-from climatenerf.scene.checks.matching import agreeing_share
-from climatenerf.scene.checks.points import point_shares
+from climatenerf.scene.checks.matching import agreeing_fraction
+from climatenerf.scene.checks.points import inside_fractions
 
 
 @pytest.fixture(scope="module")
@@ -130,8 +130,8 @@ def test_matches_that_meet_behind_the_cameras_do_not_agree():
     second[0, 3] = 0.5
     rays = [points - pose[:3, 3] for pose in (first, second)]
     found = (*(each / np.linalg.norm(each, axis=1, keepdims=True) for each in rays), 1 / 300)
-    assert agreeing_share(first, second, found) == 1
-    assert agreeing_share(inverse(first), inverse(second), found) == 0
+    assert agreeing_fraction(first, second, found) == 1
+    assert agreeing_fraction(inverse(first), inverse(second), found) == 0
 
 
 def test_photos_without_matches_are_noted(scene, tmp_path):
@@ -178,7 +178,7 @@ def test_cameras_at_one_position_are_reported(scene):
 
 
 def test_shares_count_points_in_front_and_inside(scene):
-    shares = point_shares(scene.cameras, scene.views, scene.points)
-    assert shares.recorded and (shares.by_view == 1).all() and not shares.doubtful
+    fractions = inside_fractions(scene.cameras, scene.views, scene.points)
+    assert fractions.recorded and (fractions.by_view == 1).all() and not fractions.doubtful
     turned = with_poses(scene, lambda pose: pose @ OPENGL)
-    assert point_shares(turned.cameras, turned.views, turned.points).median == 0
+    assert inside_fractions(turned.cameras, turned.views, turned.points).median == 0

@@ -6,7 +6,7 @@ from numba import njit, prange
 
 @njit(cache=True, parallel=True)
 def label_votes(x, radius, views, thresholds, consensus):
-    """Write on which balls (x, radius) the views' masks agree; the twin says how.
+    """Write on which balls (x, radius) the views' masks agree, as specified by the twin.
 
     views: (depths inside the masks, flat; start of each view; sizes [v,2]; pinholes [v,4]; c2w).
     """

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.core.errors import UserError, shown
+from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.parsing import read_toml
 from climatenerf.scene.alignment.scale import rescaled, with_scale_evidence
 from climatenerf.scene.findings import Finding
@@ -86,7 +86,7 @@ def _pixel(value: object, name: str, end: str, path: Path) -> tuple[float, float
         if len(numbers) == 2 and np.isfinite(numbers).all():
             return float(numbers[0]), float(numbers[1])
     raise UserError(
-        f"[{name}.{end}] in {path} contains {shown(value)}; replace it by a pixel such as"
+        f"[{name}.{end}] in {path} contains {excerpt(value)}; replace it by a pixel such as"
         " [812, 440]"
     )
 

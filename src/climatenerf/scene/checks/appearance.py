@@ -27,7 +27,7 @@ SPACING = 1.5  # pixels between samples
 MAX_POINTS = 150  # of a pair
 MIN_POINTS = 20  # of a pair, on patches inside both photos
 PARTNERS = 2  # photos with which each is compared
-MIN_MEDIAN = 0.6  # of a capture in which single photos can be told to be wrong
+MIN_MEDIAN = 0.6  # of a capture in which wrong photos can be identified
 MAX_WRONG = 0.65  # of that median: correlation of a photo that shows something else
 DOUBTFUL = 0.8  # median below which other focal lengths are tried
 BETTER = 0.1  # correlation that another focal length must gain
@@ -77,8 +77,8 @@ def appearance_findings(scene: Scene) -> list[Finding] | None:
         return []
     names = examples([view.name for view in wrong])
     message = (
-        f"{len(wrong)} of {len(best)} photos that were looked at do not show what other photos show"
-        f" of the same points, as if files were exchanged ({names})"
+        f"{len(wrong)} of {len(best)} compared photos do not match the others around shared points,"
+        f" as if files were exchanged ({names})"
     )
     remedy = "give these files their right names, or remove them"
     return [Finding("photo-exchanged", message, remedy, file=str(wrong[0].path))]

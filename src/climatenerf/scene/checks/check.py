@@ -40,24 +40,24 @@ def corrected(scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]]
         The scene, without photos whose cameras are far off, with what was found in `findings`.
     """
     scene, findings = _with_corrected_cameras(scene)
-    shares = None
+    fractions = None
     if scene.points is not None and len(scene.points):
-        scene, shares, odd = agreeing_convention(scene, point_transforms)
+        scene, fractions, odd = agreeing_convention(scene, point_transforms)
         findings += odd
-    recorded = shares is not None and shares.recorded
+    recorded = fractions is not None and fractions.recorded
     if not recorded and not any(f.code == "pose-axes" for f in findings):
         with contextlib.suppress(UserError):  # a photo that cannot be read: loading it reports that
             scene, odd = matching_findings(scene)
             findings += odd
     total = len(scene.views)
     before = scene.views
-    scene, odd = without_outliers(scene, shares)
-    if shares is not None and len(scene.views) < total:
-        left = [view in scene.views for view in before]
-        shares = replace(shares, by_view=shares.by_view[left])
+    scene, odd = without_outliers(scene, fractions)
+    if fractions is not None and len(scene.views) < total:
+        remaining = [view in scene.views for view in before]
+        fractions = replace(fractions, by_view=fractions.by_view[remaining])
     findings += odd
-    if shares is not None:
-        findings += view_findings(scene, shares)
+    if fractions is not None:
+        findings += view_findings(scene, fractions)
     if recorded and not any(f.code in ("pose-axes", "points-outside") for f in findings):
         with contextlib.suppress(UserError):
             findings += _photo_findings(scene)

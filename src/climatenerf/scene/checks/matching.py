@@ -27,8 +27,8 @@ MIN_MARGIN = 0.04  # of the best correlation over the second best
 MIN_MATCHES = 25  # of a pair
 TOLERANCE = 1.0  # pixels from the epipolar line, of poses in the right convention
 LOOSE_TOLERANCE = 4.0  # pixels, of imprecise poses such as those of a phone
-AGREE = 0.7  # share of matches that agree; right poses have 0.9, wrong matches are the rest
-BETTER = 0.2  # share that another convention must gain
+AGREE = 0.7  # fraction of matches that agree; right poses have 0.9, wrong matches are the rest
+BETTER = 0.2  # fraction that another convention must gain
 DISAGREE = 0.4  # wrong poses have up to 0.6: neighbouring epipolar lines are nearly parallel
 FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.71, 1.41, 2.0, 2.83, 4.0)
 MAX_ANGLE = 35.0  # degrees between the viewing directions of a pair
@@ -56,21 +56,21 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
     pairs, matches = [pairs[i] for i in usable], [matches[i] for i in usable]
 
     def agreement(change: Callable[[Pose], Pose], tolerance: float = TOLERANCE) -> float:
-        shares = [
-            agreeing_share(change(a.c2w), change(b.c2w), found, tolerance)
+        fractions = [
+            agreeing_fraction(change(a.c2w), change(b.c2w), found, tolerance)
             for (a, b), found in zip(pairs, matches, strict=True)
         ]
-        return float(np.median(shares))
+        return float(np.median(fractions))
 
     given = agreement(lambda pose: pose)
     if given >= AGREE:
         return scene, []
-    shares = [agreement(change) for _, change in CONVENTIONS]
-    best = int(np.argmax(shares))
-    if shares[best] >= AGREE and shares[best] > given + BETTER:
+    fractions = [agreement(change) for _, change in CONVENTIONS]
+    best = int(np.argmax(fractions))
+    if fractions[best] >= AGREE and fractions[best] > given + BETTER:
         what, change = CONVENTIONS[best]
         message = (
-            f"The poses {what}; they are converted ({shares[best]:.0%} of the matches between"
+            f"The poses {what}; they are converted ({fractions[best]:.0%} of the matches between"
             f" neighbouring photos then agree with them, {given:.0%} before)"
         )
         finding = Finding("pose-axes", message, "correct the file to keep it from being guessed")
@@ -95,24 +95,24 @@ def _other_focal_length(
 
     def agreement(factor: float) -> float:
         scaled = [tuple(each / (factor, factor, 1.0) for each in found[:2]) for found in matches]
-        shares = [
-            agreeing_share(
+        fractions = [
+            agreeing_fraction(
                 a.c2w,
                 b.c2w,
                 (*(each / np.linalg.norm(each, axis=1, keepdims=True) for each in rays), pixel),
             )
             for (a, b), rays, (*_, pixel) in zip(pairs, scaled, matches, strict=True)
         ]
-        return float(np.median(shares))
+        return float(np.median(fractions))
 
-    shares = {factor: agreement(factor) for factor in FOCAL_FACTORS}
-    best = max(shares, key=lambda factor: shares[factor])
-    if shares[best] < AGREE or shares[best] < given + BETTER:
+    fractions = {factor: agreement(factor) for factor in FOCAL_FACTORS}
+    best = max(fractions, key=lambda factor: fractions[factor])
+    if fractions[best] < AGREE or fractions[best] < given + BETTER:
         return None
     focal = scene.cameras[pairs[0][0].camera].fx
     message = (
-        f"{shares[best]:.0%} of the matches between neighbouring photos agree with a focal length"
-        f" of about {best * focal:.0f} pixels, {given:.0%} with the given {focal:.0f}"
+        f"{fractions[best]:.0%} of the matches between neighbouring photos agree with a focal"
+        f" length of about {best * focal:.0f} pixels, {given:.0%} with the given {focal:.0f}"
     )
     remedy = "check that the intrinsics belong to photos of this size"
     return Finding("focal-disagrees", message, remedy, file=str(scene.root))
@@ -138,8 +138,8 @@ def neighbours(views: Sequence[View]) -> list[tuple[View, View]]:
     pairs = pairs[:: max(1, -(-len(pairs) // PAIRS))]
     named = {(a.name, b.name) for a, b in pairs}
     for i in np.unique(np.linspace(0, len(views) - 2, PAIRS).astype(int)):
-        apart = np.linalg.norm(position[i] - position[i + 1]) > 0
-        if apart and (views[i].name, views[i + 1].name) not in named:
+        moved = np.linalg.norm(position[i] - position[i + 1]) > 0
+        if moved and (views[i].name, views[i + 1].name) not in named:
             pairs.append((views[i], views[i + 1]))
     return pairs
 
@@ -197,13 +197,13 @@ def _described(
     return np.stack([column + 0.5, row + 0.5], axis=-1), patches, camera
 
 
-def agreeing_share(
+def agreeing_fraction(
     first: Float[np.ndarray, "4 4"],
     second: Float[np.ndarray, "4 4"],
     found: Match,
     tolerance: float = TOLERANCE,
 ) -> float:
-    """Return the share of matches on their epipolar lines and in front of both cameras.
+    """Return the fraction of matches on their epipolar lines and in front of both cameras.
 
     Inverted poses of cameras with equal orientation have the same epipolar lines, since only the
     baseline changes its sign, but their rays meet behind them. Nearly parallel rays count as in

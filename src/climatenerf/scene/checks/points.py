@@ -19,25 +19,25 @@ from climatenerf.scene.checks.intrinsics import SAME_SHAPE, scaled_by, size_rati
 from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.scene import Scene, View
 
-MAX_POINTS = 1000  # points a view; more change a share by less than two hundredths
+MAX_POINTS = 1000  # points a view; more change a fraction by less than two hundredths
 MAX_VIEWS = 48  # views of which other conventions are tried
 MIN_POINTS = 8  # seen points from which a view is judged
-FEW_SEEN = 0.5  # share of a photo's own points inside it below which its pose is in doubt
-FEW_UNION = 0.5  # share of all points inside any photo; a laser scan may reach far beyond them
-FEW_ALL = 0.05  # median share of all points inside a photo
-BETTER = 0.3  # share that another convention must gain to be taken
+FEW_SEEN = 0.5  # fraction of a photo's own points inside it below which its pose is in doubt
+FEW_UNION = 0.5  # fraction of all points inside any photo; a laser scan may reach far beyond them
+FEW_ALL = 0.05  # median fraction of all points inside a photo
+BETTER = 0.3  # fraction that another convention must gain to be taken
 SMALLER = 0.75  # of the middle: principal points of smaller photos; rarer crops reach it too
-STILL_INSIDE = 0.95  # of the share of points, with intrinsics scaled to the photo
+STILL_INSIDE = 0.95  # of the fraction of points, with intrinsics scaled to the photo
 
 
 @dataclass(frozen=True)
-class Shares:
-    """Shares of the sparse points in front of the cameras and inside the photos, 0 to 1.
+class InsideFractions:
+    """Fractions of the sparse points in front of the cameras and inside the photos, 0 to 1.
 
     Attributes:
         by_view: Of the view's own points where these are recorded, of all points otherwise; NaN
             for a view with fewer than `MIN_POINTS` points.
-        union: Share of all points inside at least one photo.
+        union: Fraction of all points inside at least one photo.
         recorded: Whether the capture records which photos show a point.
     """
 
@@ -64,11 +64,11 @@ class Shares:
         return self.union < FEW_UNION and self.median < FEW_ALL
 
 
-def point_shares(
+def inside_fractions(
     cameras: Sequence[Camera],
     views: Sequence[View],
     points: Float[np.ndarray, "n 3"],
-) -> Shares:
+) -> InsideFractions:
     """Measure how many points fall into the photos.
 
     Args:
@@ -79,20 +79,20 @@ def point_shares(
     recorded = any(view.seen is not None and len(view.seen) for view in views)
     common = points[_spread(len(points), MAX_POINTS)]
     inside_any = np.zeros(len(common), bool)
-    shares = np.full(len(views), np.nan)
+    fractions = np.full(len(views), np.nan)
     for i, view in enumerate(views):
         camera = cameras[view.camera]
         if recorded:
             seen = np.empty(0, np.int64) if view.seen is None else view.seen
             own = points[seen[_spread(len(seen), MAX_POINTS)]]
             if len(own) >= MIN_POINTS:
-                shares[i] = _inside(camera, view.c2w, own).mean()
+                fractions[i] = _inside(camera, view.c2w, own).mean()
         else:
             inside = _inside(camera, view.c2w, common)
             inside_any |= inside
-            shares[i] = inside.mean()
-    union = float(np.nanmean(shares)) if recorded and np.isfinite(shares).any() else 0.0
-    return Shares(shares, union if recorded else float(inside_any.mean()), recorded)
+            fractions[i] = inside.mean()
+    union = float(np.nanmean(fractions)) if recorded and np.isfinite(fractions).any() else 0.0
+    return InsideFractions(fractions, union if recorded else float(inside_any.mean()), recorded)
 
 
 def _spread(count: int, limit: int) -> np.ndarray:
@@ -157,8 +157,8 @@ def of_smaller_photos(scene: Scene) -> tuple[Scene, list[Finding]]:
         cameras.append(scaled_by(camera, size_ratio(across, down)) if small else camera)
     if tuple(cameras) == scene.cameras:
         return scene, []
-    before = point_shares(scene.cameras, scene.views, scene.points).agreement
-    after = point_shares(cameras, scene.views, scene.points).agreement
+    before = inside_fractions(scene.cameras, scene.views, scene.points).agreement
+    after = inside_fractions(cameras, scene.views, scene.points).agreement
     if after < STILL_INSIDE * before:
         return scene, []
     old, new = next((a, b) for a, b in zip(scene.cameras, cameras, strict=True) if a != b)
@@ -173,7 +173,7 @@ def of_smaller_photos(scene: Scene) -> tuple[Scene, list[Finding]]:
 
 def agreeing_convention(
     scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]] = ()
-) -> tuple[Scene, Shares, list[Finding]]:
+) -> tuple[Scene, InsideFractions, list[Finding]]:
     """Return the scene in the convention in which its points fall into its photos.
 
     Args:
@@ -181,53 +181,53 @@ def agreeing_convention(
         point_transforms: Transforms that the points may lack.
 
     Returns:
-        The scene, the shares of its points, and what is odd.
+        The scene, the fractions of its points, and what is odd.
     """
     assert scene.points is not None
     scene, findings = of_smaller_photos(scene)
     assert scene.points is not None
-    shares = point_shares(scene.cameras, scene.views, scene.points)
-    if not shares.doubtful:
-        return scene, shares, findings
+    fractions = inside_fractions(scene.cameras, scene.views, scene.points)
+    if not fractions.doubtful:
+        return scene, fractions, findings
     chosen = _spread(len(scene.views), MAX_VIEWS)
-    best, best_shares = None, _shares_of(scene, chosen)
-    first = best_shares.agreement
+    best, best_fractions = None, _fractions_of(scene, chosen)
+    first = best_fractions.agreement
     for other in other_conventions(scene, point_transforms):
-        found = _shares_of(other.scene, chosen)
-        if not found.doubtful and found.agreement > max(best_shares.agreement, first + BETTER):
-            best, best_shares = other, found
-    what = "its own sparse points" if shares.recorded else "the sparse points"
+        found = _fractions_of(other.scene, chosen)
+        if not found.doubtful and found.agreement > max(best_fractions.agreement, first + BETTER):
+            best, best_fractions = other, found
+    what = "its own sparse points" if fractions.recorded else "the sparse points"
     if best is not None:
         assert best.scene.points is not None
         finding = Finding(
             best.code,
-            f"{best.message} (inside a photo are then {best_shares.agreement:.0%} of {what},"
+            f"{best.message} (inside a photo are then {best_fractions.agreement:.0%} of {what},"
             f" {first:.1%} before)",
             "correct the file to keep it from being guessed",
         )
         found, cloud = best.scene, best.scene.points
-        return found, point_shares(found.cameras, found.views, cloud), [*findings, finding]
+        return found, inside_fractions(found.cameras, found.views, cloud), [*findings, finding]
     finding = Finding(
         "points-outside",
-        f"Only {shares.agreement:.1%} of {what} lie inside a photo and in front of its camera",
+        f"Only {fractions.agreement:.1%} of {what} lie inside a photo and in front of its camera",
         "check that intrinsics, poses, points and photos belong together; a fit will be blurred",
     )
-    return scene, shares, [*findings, finding]
+    return scene, fractions, [*findings, finding]
 
 
-def _shares_of(scene: Scene, chosen: np.ndarray) -> Shares:
+def _fractions_of(scene: Scene, chosen: np.ndarray) -> InsideFractions:
     assert scene.points is not None
-    return point_shares(scene.cameras, [scene.views[i] for i in chosen], scene.points)
+    return inside_fractions(scene.cameras, [scene.views[i] for i in chosen], scene.points)
 
 
-def view_findings(scene: Scene, shares: Shares) -> list[Finding]:
+def view_findings(scene: Scene, fractions: InsideFractions) -> list[Finding]:
     """Return a finding about photos whose poses contradict their own points, unlike the others'."""
-    if not shares.recorded or shares.doubtful:
+    if not fractions.recorded or fractions.doubtful:
         return []
     wrong = [
         view.name
-        for view, share in zip(scene.views, shares.by_view, strict=True)
-        if share < FEW_SEEN  # False for NaN
+        for view, fraction in zip(scene.views, fractions.by_view, strict=True)
+        if fraction < FEW_SEEN  # False for NaN
     ]
     if not wrong:
         return []

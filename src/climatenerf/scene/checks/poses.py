@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from climatenerf.scene.checks.points import Shares
+from climatenerf.scene.checks.points import InsideFractions
 from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.scene import Scene
 
@@ -33,7 +33,9 @@ def distance_ratios(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " 
     return distance / max(typical, 1e-9)  # all others at one position: 0 / 0
 
 
-def outliers(positions: Float[np.ndarray, "n 3"], shares: Shares | None) -> Bool[np.ndarray, " n"]:
+def outliers(
+    positions: Float[np.ndarray, "n 3"], fractions: InsideFractions | None
+) -> Bool[np.ndarray, " n"]:
     """Return which cameras are so far from the others that their poses are in doubt.
 
     A route of cameras reaches a few times the distance of four fifths of them; a failed
@@ -42,31 +44,33 @@ def outliers(positions: Float[np.ndarray, "n 3"], shares: Shares | None) -> Bool
 
     Args:
         positions: Of the cameras.
-        shares: Of the sparse points inside the photos, if there are points.
+        fractions: Of the sparse points inside the photos, if there are points.
     """
     ratio = distance_ratios(positions)
     far = ratio > OUTLIER
-    if shares is not None and shares.recorded:
-        supported = np.nan_to_num(shares.by_view) >= 0.5
+    if fractions is not None and fractions.recorded:
+        supported = np.nan_to_num(fractions.by_view) >= 0.5
         far &= ~supported | (ratio > CERTAIN_OUTLIER)
     return far
 
 
-def without_outliers(scene: Scene, shares: Shares | None) -> tuple[Scene, list[Finding]]:
+def without_outliers(
+    scene: Scene, fractions: InsideFractions | None
+) -> tuple[Scene, list[Finding]]:
     """Return the scene without photos whose cameras are far off, and a finding about them.
 
     More than `MAX_OUTLIERS` of the photos are a second group rather than errors; they stay.
     """
     positions = np.stack([view.c2w[:3, 3] for view in scene.views])
-    far = outliers(positions, shares)
+    far = outliers(positions, fractions)
     if not far.any():
         return scene, []
-    kept = tuple(view for view, out in zip(scene.views, far, strict=True) if not out)
+    remaining = tuple(view for view, out in zip(scene.views, far, strict=True) if not out)
     names = [view.name for view, out in zip(scene.views, far, strict=True) if out]
     rest = positions[~far]
     extent = float(np.linalg.norm(rest - np.median(rest, axis=0), axis=1).max())
     distance = np.linalg.norm(positions[far] - np.median(rest, axis=0), axis=1)
-    few = len(names) <= max(1, MAX_OUTLIERS * len(far)) and len(kept) >= MIN_LEFT
+    few = len(names) <= max(1, MAX_OUTLIERS * len(far)) and len(remaining) >= MIN_LEFT
     what = "they are left out" if few else "they are too many to be left out"
     message = (
         f"{counted(len(names), 'photo')} with cameras {distance.min():.3g} units from the others,"
@@ -74,7 +78,7 @@ def without_outliers(scene: Scene, shares: Shares | None) -> tuple[Scene, list[F
     )
     remedy = "compute their poses again to use them" if few else "remove them or correct the poses"
     finding = Finding("pose-outlier", message, remedy, file=str(scene.root))
-    return (replace(scene, views=kept) if few else scene), [finding]
+    return (replace(scene, views=remaining) if few else scene), [finding]
 
 
 def duplicate_findings(scene: Scene) -> list[Finding]:

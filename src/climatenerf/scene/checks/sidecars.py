@@ -22,8 +22,8 @@ MIN_POINTS = 20  # points of a view on known depths, usable pixels or labels
 MAX_DEPTH_SPREAD = 0.15  # of log depth over points; metric depth is mostly within a tenth
 UNIT_FACTORS = (1000.0, 100.0, 39.37, 3.281, 1 / 3.281, 1 / 39.37, 0.01, 0.001)
 UNIT_TOLERANCE = 1.25  # of the scale; that of an assumed camera height is known to 30 %
-MAX_SKY_POINTS = 0.5  # share of points on the sky; distant trees and wires make some
-MIN_HIDDEN_POINTS = 0.8  # share of points hidden by masks that are inverted
+MAX_SKY_POINTS = 0.5  # fraction of points on the sky; distant trees and wires make some
+MIN_HIDDEN_POINTS = 0.8  # fraction of points hidden by masks that are inverted
 SKY = 10  # Cityscapes train id
 
 
@@ -245,16 +245,16 @@ def _unreadable(error: UserError, path: Path | None, code: str = "unreadable") -
 
 
 def unused_findings(
-    scene: Scene, posed: Sequence[View], told: Collection[Path] = ()
+    scene: Scene, posed: Sequence[View], reported: Collection[Path] = ()
 ) -> list[Finding]:
     """Return photos without pose, and sidecars of no photo, in the folders that views use.
 
     Args:
         scene: The scene.
         posed: All photos with poses, also those that are left out for another reason.
-        told: Files that another finding names.
+        reported: Files that another finding names.
     """
-    used = {str(view.path) for view in posed} | {str(path) for path in told}
+    used = {str(view.path) for view in posed} | {str(path) for path in reported}
     for view in posed:
         used |= {str(p) for p in (view.label_path, view.mask_path, view.depth_path) if p}
     findings = []

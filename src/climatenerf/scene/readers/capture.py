@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.errors import UserError, shown
+from climatenerf.core.errors import UserError, excerpt
 from climatenerf.scene.findings import Finding
 from climatenerf.scene.label_spaces import TRAIN_IDS
 from climatenerf.scene.readers.ply import MAX_POSITION
@@ -78,7 +78,7 @@ def checked_camera(camera: Camera, where: str) -> Camera:
             f"A camera in {where} has focal length 0; calibrate again or correct the file."
         )
     if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
-        size = f"{shown(camera.width)}x{shown(camera.height)}"
+        size = f"{excerpt(camera.width)}x{excerpt(camera.height)}"
         raise UserError(f"A camera in {where} has size {size} pixels; correct the file.")
     return camera
 

@@ -1,8 +1,13 @@
 """Free-space constraint: where space must be empty, and where density near the ground is an error.
 
-Cells of the occupancy grid are forced empty if no view sees them, if they lie right in front of a
-camera, if the views agree that only sky is behind them, or if they are above the ground and most
-views see ground behind them. Cells near sparse points are protected from the first three.
+A cell of the occupancy grid is forced empty in four cases:
+
+1. No view sees it.
+2. It lies right in front of a camera.
+3. The views agree that only sky is behind it.
+4. It is above the ground, and most views see ground behind it.
+
+Cells near sparse points are protected from the first three.
 
 Elsewhere, density above the ground is penalised but allowed: a crest may hide a ditch and what is
 in it, and the ground height does not resolve every step. Obstacles on the ground are exempt, with a

@@ -143,18 +143,6 @@ def refract(
     return out / out.norm(dim=-1, keepdim=True), cos2_t <= 0
 
 
-def pixel_rotation(pixel: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Return an angle in [0, pi/2) per pixel: interleaved gradient noise (Jimenez 2014).
-
-    Neighbouring pixels get different angles. Rotating the glossy sample set by this angle replaces
-    the five ghost images of a fixed set by fine grain, which supersampling averages away. The angle
-    depends on the pixel coordinates (column, row) alone, not on chunks or threads.
-    """
-    x, y = pixel[:, 0].double(), pixel[:, 1].double()
-    noise = (52.9829189 * (0.06711056 * x + 0.00583715 * y).frac()).frac()
-    return (noise * math.pi / 2).to(pixel.dtype)
-
-
 def glossy_rays(
     reflected: Float[Tensor, "n 3"],
     vertical_variance: Float[Tensor, "n"],

@@ -75,7 +75,7 @@ class Water:
         t: Float[Tensor, "n"],
         pixel_angle: Float[Tensor, "n"],
     ) -> Float[Tensor, "s"]:
-        """Share of each sample behind the plane: 0 or 1 but in the pixels of the waterline.
+        """Fraction of each sample behind the plane: 0 or 1 but in the pixels of the waterline.
 
         The soft edge lies on the wet side (0 at the waterline, 1 half a pixel from it), so that
         water under the ground shows nowhere; the visible edge moves by a quarter of a pixel. Its
