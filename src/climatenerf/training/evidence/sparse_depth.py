@@ -10,6 +10,7 @@ from torch import Tensor
 
 from climatenerf.core.device import CPU, integers, to_device
 from climatenerf.scene.scene import Scene
+from climatenerf.scene.withheld import is_withheld
 from climatenerf.training.dataset import TrainingPixels
 
 
@@ -43,6 +44,8 @@ class SparseDepth:
 def read_sparse_depth(scene: Scene, device: torch.device = CPU) -> SparseDepth | None:
     """Return one ray, on `device`, for each sparse point that each training view observes.
 
+    Points that are withheld for scores are left out; see `scene.withheld`.
+
     Returns:
         None if the scene has no points, or no view's observations are known.
     """
@@ -50,7 +53,7 @@ def read_sparse_depth(scene: Scene, device: torch.device = CPU) -> SparseDepth |
     origins, ends, images = [np.empty((0, 3))], [np.empty((0, 3))], [np.empty(0, int)]
     for index, view in enumerate(scene.of_split("train")):
         if points is not None and view.seen is not None:
-            ends.append(points[view.seen])
+            ends.append(points[view.seen[~is_withheld(view.seen)]])
             images.append(np.full(len(ends[-1]), index))
             origins.append(np.broadcast_to(scene.c2w_world(view)[:3, 3], ends[-1].shape))
     origin, end = np.concatenate(origins), np.concatenate(ends)
