@@ -12,7 +12,9 @@ import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import write_json
 from climatenerf.field.checkpoint import save_field
+from climatenerf.render import run_terrain
 from climatenerf.scene import Camera, Scene, View, save_scene
+from climatenerf.scene.terrain import Terrain, load_terrain
 
 SIZE = (32, 18)
 
@@ -82,6 +84,50 @@ def test_a_weather_file_and_an_appearance_change_the_frames(run, tmp_path):
     clear, smog, photo = (pictures(tmp_path / name) for name in ("clear", "smog", "photo"))
     assert np.array_equal(*clear) and not np.array_equal(*smog)
     assert not np.array_equal(clear[0], photo[0])
+
+
+def test_completed_ground_is_in_frames_layers_and_the_sidecar(run, tmp_path, monkeypatch):
+    """A floor at z = -1 below all that the random field holds; it is found once."""
+    calls = []
+
+    def find(field, scene, progress=None):
+        calls.append(field)
+        flat = np.zeros((81, 81), np.float32)
+        no, unknown = np.zeros(flat.shape, bool), np.full(flat.shape, 255, np.uint8)
+        return Terrain((-9.0, -12.0), 0.25, flat - 1.0, flat + 0.1, unknown, no, no)
+
+    (run.folder / "terrain.npz").unlink(missing_ok=True)
+    monkeypatch.setattr(run_terrain, "find_terrain", find)
+    options = {"path": "still:0002", "frames": 1, "size": SIZE, "layers": ["seen", "depth"]}
+    found = {}
+    for name, complete in (("with", True), ("again", True), ("without", False)):
+        movie = climatenerf.render_movie(run, tmp_path / name, **options, complete_ground=complete)
+        sidecar = json.loads((movie.parent / "movie.json").read_text())
+        assert sidecar["complete_ground"] is complete
+        seen = np.load(movie.parent / "seen" / "0000.npz")["seen"]
+        measured = sidecar["frames"][0]["measured"]["completed_ground_fraction"]
+        assert measured == pytest.approx(1 - seen.mean(), abs=1e-4)
+        assert "seen" in sidecar["layers"]
+        found[name] = pictures(movie.parent)[0], seen, sidecar["render"]
+    assert calls == [run.field] and (run.folder / "terrain.npz").is_file()
+    assert found["with"][2] == found["again"][2] != found["without"][2], "frames have other keys"
+    assert np.array_equal(found["with"][0], found["again"][0])
+    assert found["with"][1].min() < 0.5 and (found["without"][1] == 1).all()
+    changed = (found["with"][0] != found["without"][0]).any(-1)
+    assert changed.any() and not changed[found["with"][1] > 0.999].any()
+    (run.folder / "terrain.npz").unlink()
+
+
+def test_a_run_that_shows_no_ground_keeps_its_field(run):
+    """The random field is fog: no photo's ray ends on ground."""
+    saved = run.folder / "terrain.npz"
+    saved.unlink(missing_ok=True)
+    assert run.completed() is run.field
+    assert load_terrain(saved) == (None, run.checkpoint)
+    saved.write_bytes(b"damaged")
+    with pytest.raises(UserError, match="delete it, and the next render makes it again"):
+        run.completed()
+    saved.unlink()
 
 
 def test_invalid_arguments_are_refused_before_anything_is_written(run, tmp_path):

@@ -33,6 +33,7 @@ from climatenerf.weather.weather import Weather
 
 if TYPE_CHECKING:
     from climatenerf.field.hash_field import Field
+    from climatenerf.render.completed_ground import CompletedField
 
 PathText = str | PathLike[str]
 Progress = Callable[[str, float], None]
@@ -48,12 +49,33 @@ class Run:
         field: The radiance field.
         scene: The capture, in world metres with z up.
         digest: Hash of the files that both were read from; None takes that of the folder's files.
+        checkpoint: Identity of the field's checkpoint; "" for runs of earlier versions.
     """
 
     folder: Path
     field: "Field"
     scene: Scene
     digest: str | None = None
+    checkpoint: str = ""
+
+    def completed(self, progress: Progress | None = None) -> "Field | CompletedField":
+        """Return the field with ground where no photo shows it.
+
+        The terrain is read from the run folder, or made and saved there, which takes seconds. The
+        field itself is returned if the photos show too little ground.
+
+        Args:
+            progress: called with "ground" and the fraction that is done.
+
+        Raises:
+            UserError: the saved terrain is damaged.
+        """
+        from climatenerf.render.completed_ground import CompletedField
+        from climatenerf.render.run_terrain import terrain_of_run
+
+        given = self.folder, self.field, self.scene, self.checkpoint
+        terrain = terrain_of_run(*given, progress)
+        return self.field if terrain is None else CompletedField(self.field, terrain)
 
     def camera(
         self, photo: str | None = None, size: tuple[int, int] | None = None
@@ -196,7 +218,7 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
     from climatenerf.output.job import hash_of_files
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
-    from climatenerf.training.snapshot import CONFIG, FIELD, SCENE, read_together
+    from climatenerf.training.snapshot import CONFIG, FIELD, SCENE, identity_of, read_together
 
     where = resolve_device(device)
     folder = Path(folder)
@@ -205,7 +227,8 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
         field = load_field(folder, where)
         check_config(paths[CONFIG].parent)
         scene = load_scene(paths[SCENE])
-        return Run(folder, field, scene, hash_of_files([paths[FIELD], paths[SCENE]]))
+        digest = hash_of_files([paths[FIELD], paths[SCENE]])
+        return Run(folder, field, scene, digest, identity_of(paths[FIELD]) or "")
 
     return read_together(folder, read)
 
@@ -226,6 +249,7 @@ def render_movie(
     part: tuple[int, int] | None = None,
     join_only: bool = False,
     preview: bool = False,
+    complete_ground: bool = True,
     progress: Progress | None = None,
     note: Callable[[str], None] | None = None,
     effects: Sequence[Effect] | None = None,
@@ -251,7 +275,9 @@ def render_movie(
         part: (i, n) renders the frames whose index is i - 1 modulo n, and joins nothing.
         join_only: render nothing; join the finished frames.
         preview: show the frame at work in `preview.png`.
-        progress: called with the effect that is prepared, then with "frames" and "movie".
+        complete_ground: let a terrain stand in where no photo shows the ground.
+        progress: called with what is prepared ("ground", an effect), then with "frames" and
+            "movie".
         note: called with sentences about what was assumed or left out.
         effects: the effects to render with; None takes the installed ones. A section of the weather
             that has values of its own needs its effect among them.
@@ -301,10 +327,12 @@ def render_movie(
         appearance=view,
         effects=used,
         digest=run.digest,
+        complete_ground=complete_ground,
     )
 
     def prepare() -> "jobs.FrameSource":
-        return jobs.frame_source(job, run.field, run.scene, progress)
+        field = run.completed(progress) if complete_ground else run.field
+        return jobs.frame_source(job, field, run.scene, progress)
 
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)

@@ -36,7 +36,8 @@ def test_help_has_no_words_of_the_parser(verb, capsys):
         main([verb, "--help"])
     found = capsys.readouterr().out
     assert end.value.code in (0, None) and f"climatenerf {verb}" in found
-    assert "None" not in found and "--no-" not in found
+    switches = found.replace("--no-complete-ground", "")  # the one that is on by default
+    assert "None" not in found and "--no-" not in switches
 
 
 def test_boxes_of_utf_8_and_of_ascii_give_the_same_sentence():

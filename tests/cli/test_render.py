@@ -36,6 +36,30 @@ def test_a_shorter_render_removes_the_frames_of_an_earlier_longer_one(run_folder
     assert len(sidecar["frames"]) == 1 and sidecar["weather"]["smog"]["visibility"] == "50 m"
 
 
+def test_ground_is_completed_unless_a_flag_says_no(run_folder, tmp_path, capsys):
+    args = ["render", run_folder, "--size", "48x27", "--frames", "1", "--layers", "seen"]
+    assert run_cli(*args, "-o", tmp_path / "with") == 0
+    assert (run_folder / "terrain.npz").is_file()
+    assert run_cli(*args, "-o", tmp_path / "without", "--no-complete-ground") == 0
+    seen, keys = [], []
+    for name, complete in (("with", True), ("without", False)):
+        sidecar = json.loads((tmp_path / name / "movie.json").read_text())
+        assert sidecar["complete_ground"] is complete
+        keys.append(sidecar["render"])
+        seen.append(np.load(tmp_path / name / "seen" / "0000.npz")["seen"])
+    assert keys[0] != keys[1]
+    assert seen[0].min() >= 0 and seen[0].max() <= 1 and (seen[1] == 1).all()
+    (tmp_path / "with" / "movie.json").unlink()
+    damaged = run_folder / "terrain.npz"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:100])
+    try:
+        message = error_message(capsys, *args, "-o", tmp_path / "damaged")
+        assert "terrain.npz" in message and "delete it" in message
+    finally:
+        damaged.write_bytes(whole)
+
+
 def test_flags_of_an_absent_effect_give_a_warning(run_folder, tmp_path, capsys):
     args = ["render", str(run_folder), *map(str, SMALL), "--frames", "1", "-o", str(tmp_path)]
     assert cli.main([*args, "--flood.wind-speed", "4 m/s", "--snow.depth", "1 cm"]) == 0

@@ -54,6 +54,7 @@ def test_a_frame_key_depends_on_everything_that_a_frame_depends_on(monkeypatch):
         dataclasses.replace(job, layers=("depth", "normal")),
         dataclasses.replace(job, formats=("png",)),
         dataclasses.replace(job, appearance=0),
+        dataclasses.replace(job, complete_ground=False),
         other_path(job, c2w=moved),
         other_path(job, cameras=(zoomed, *job.path.cameras[1:])),
         make_job(4),

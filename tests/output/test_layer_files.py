@@ -16,11 +16,13 @@ from support.analytic_fields import AnalyticField, Box, HalfSpace
 from support.exr import read_exr
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.classes import SOLID
+from climatenerf.core.classes import SOLID, TERRAIN, UNKNOWN
 from climatenerf.field.capabilities import CLASSES, DENSITY
 from climatenerf.output.layers import save_layers
+from climatenerf.render.completed_ground import CompletedField
 from climatenerf.render.session import RenderSession
 from climatenerf.scene.scene import Scene, View
+from climatenerf.scene.terrain import Terrain
 from climatenerf.weather.description import weather_from_table
 from climatenerf.weather.registry import layer_table
 
@@ -56,13 +58,22 @@ class Labelled(AnalyticField):
         return torch.zeros(len(selected), 3), logits
 
 
+def continued_ground():
+    """Terrain at the height of the ground, which the field holds as far as x = 2.5 m."""
+    x, y = np.meshgrid(np.arange(-9, 9.1, 0.25), np.arange(-9, 9.1, 0.25))
+    seen, height = x < 2.5, (0.05 / 0.998749 * y).astype(np.float32)
+    label = np.where(seen, TERRAIN, UNKNOWN).astype(np.uint8)
+    error = np.full_like(height, 0.05)
+    return Terrain((-9.0, -9.0), 0.25, height, error, label, seen, np.zeros_like(seen))
+
+
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     folder = tmp_path_factory.mktemp("layers")
     ground = HalfSpace((0.0, -0.05, 0.998749), 0.0)
-    field = Labelled(
-        [ground, Box((-1.6, 0.5, -1.0), (-0.2, 2.0, 1.0))], box=((-9, -9, -3), (9,) * 3)
-    )
+    boxes = [ground, Box((-1.6, 0.5, -1.0), (-0.2, 2.0, 1.0))]
+    inner = Labelled(boxes, box=((-9, -9, -3), (2.5, 9, 9)))
+    field = CompletedField(inner, continued_ground())
     views = tuple(View(f"{i}.png", folder / f"{i}.png", 0, C2W) for i in range(3))
     scene = Scene(folder, "test", (CAMERA,), views)
     return RenderSession(field, scene, weather_from_table(WEATHER))

@@ -43,6 +43,9 @@ class Render:
     """Exposure and light of the frames: mean, or those of a training photo, such as 0012.jpg."""
     preview: bool = False
     """Show the frame at work in OUT/preview.png: coarse at first, finer pass by pass."""
+    complete_ground: bool = True
+    """Leave holes where no photo shows the ground, such as below the cameras. By default a smooth
+    terrain completes the ground there; the layer seen shows where."""
     layers: tuple[str, ...] = ()
     """Measured layers to write beside the frames: all, or names such as depth; a wrong name lists
     them."""
@@ -118,6 +121,7 @@ def run(
             part=part,
             join_only=options.join,
             preview=options.preview,
+            complete_ground=options.complete_ground,
             progress=bars,
             note=progress.say,
             effects=used,

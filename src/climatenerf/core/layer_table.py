@@ -44,6 +44,14 @@ FRAME_LAYERS = (
         16,
         1.0,
     ),
+    Layer(
+        "seen",
+        "1",
+        "fraction of the pixel that photos show; the rest is completed ground",
+        1 / 255,
+        8,
+        1.0,
+    ),
 )
 """Layers of every frame, whatever the weather."""
 ON_DEMAND = frozenset({"normal", "label"})

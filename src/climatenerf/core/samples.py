@@ -11,6 +11,9 @@ MIN_WEIGHT = 1e-4
 MIN_TAU = 1e-3
 """Initial pruning threshold: optical depth below which a sample counts as empty."""
 
+COMPLETED = -2
+"""Id of samples on ground that no photo shows; see `render.completed_ground`."""
+
 
 @dataclass
 class Samples:

@@ -41,7 +41,7 @@ from climatenerf.scene import Scene
 from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
 from climatenerf.weather.effect import Effect
-from climatenerf.weather.registry import EFFECTS, MEAN_TRANSMITTANCE, layer_table
+from climatenerf.weather.registry import COMPLETED_GROUND, EFFECTS, MEAN_TRANSMITTANCE, layer_table
 
 if TYPE_CHECKING:
     from climatenerf.field.protocol import RadianceField
@@ -89,6 +89,7 @@ class RenderJob:
         appearance: Index of the training view whose exposure and light the frames have; None takes
             the mean.
         effects: The effects that the weather has sections for.
+        complete_ground: Whether the terrain stands in where no photo shows the ground.
     """
 
     run: str
@@ -100,6 +101,7 @@ class RenderJob:
     formats: tuple[LayerFormat, ...] = ("npz",)
     appearance: int | None = None
     effects: tuple[Effect, ...] = EFFECTS
+    complete_ground: bool = True
 
     @property
     def table(self) -> dict[str, Layer]:
@@ -132,6 +134,7 @@ class RenderJob:
             "layers": self.layers,
             "formats": self.formats,
             "appearance": self.appearance,
+            "complete_ground": self.complete_ground,
             "effects": {effect.name: effect.version for effect in self.effects},
         }
         return _hash(described)
@@ -157,6 +160,7 @@ def plan(
     appearance: int | None = None,
     effects: Sequence[Effect] = EFFECTS,
     digest: str | None = None,
+    complete_ground: bool = True,
 ) -> RenderJob:
     """Return the job that renders a fitted run along a path.
 
@@ -171,6 +175,7 @@ def plan(
         appearance: index of a training view, from `appearance_index`; None takes the mean.
         effects: the effects that the weather has sections for.
         digest: hash of the run's files that were read; None takes that of the files as they are.
+        complete_ground: whether the terrain stands in where no photo shows the ground.
 
     Raises:
         UserError: a value is out of range, the frames are too large, the run is incomplete, or EXR
@@ -194,6 +199,7 @@ def plan(
         formats,
         appearance,
         tuple(effects),
+        complete_ground,
     )
 
 
@@ -484,7 +490,10 @@ def measured(
     layers: dict[str, Float[np.ndarray, "h w *c"]], effects: Sequence[Effect] = EFFECTS
 ) -> dict[str, float]:
     """Return the means over a frame that its effects name; see `Effect.measures`."""
-    found = {MEAN_TRANSMITTANCE: float(layers["transmittance"].mean())}
+    found = {
+        MEAN_TRANSMITTANCE: float(layers["transmittance"].mean()),
+        COMPLETED_GROUND: 1.0 - float(layers["seen"].mean()),
+    }
     for measure in (measure for effect in effects for measure in effect.measures):
         values = layers[measure.layer]
         where = np.ones(values.shape, bool) if measure.mask is None else layers[measure.mask] > 0.5
@@ -528,6 +537,7 @@ def _sidecar(job: RenderJob, scene: Scene, out: Path) -> dict[str, Any]:
         records.append(FrameRecord(file, time, camera, c2w, layers, weather, numbers))
     about: dict[str, Any] = {"path": job.path.name, "notes": list(job.path.notes), "fps": job.fps}
     about["appearance_of_training_view"] = job.appearance  # null: the mean
+    about["complete_ground"] = job.complete_ground
     about |= {"supersample": job.supersample, "frames_wanted": len(job), "render": job.key, **facts}
     seed = job.weather.base.seed
     weather = weather_to_table(job.weather, job.effects)

@@ -48,5 +48,5 @@ def trace_field(
         torch.where(transmittance < SKY_OPACITY, depth, torch.full_like(depth, torch.inf)),
         torch.zeros_like(rgb),
         torch.ones_like(depth),
-        dict.fromkeys(world.layer_names, nothing),
+        dict.fromkeys(world.layer_names, nothing) | {"seen": torch.ones_like(depth)},
     )

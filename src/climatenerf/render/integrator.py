@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.samples import MIN_WEIGHT, offsets_of
+from climatenerf.field.capabilities import COMPLETES
 from climatenerf.field.compositing import (
     NEVER,
     RENDER_STEP,
@@ -85,7 +86,10 @@ def _trace(
     n, device = rays_o.shape[0], rays_o.device
     surfaces = world.surfaces if bounces > 0 else ()
     step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
-    if not world.media and not world.matters:
+    measured = bounces == BOUNCES
+    # Camera rays that may end on completed ground measure where they do.
+    short = not (measured and COMPLETES in world.field.capabilities)
+    if short and not world.media and not world.matters:
         # Most reflected rays rise, and see what they would without weather.
         meets = torch.zeros(n, dtype=torch.bool, device=device)
         for surface in surfaces:
@@ -93,7 +97,7 @@ def _trace(
         if not bool(meets.all()):
             dry, wet = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
             given = rays_o[dry], rays_d[dry], t_min[dry], step_scale
-            parts = [trace_field(world, *given, measured=bounces == BOUNCES)]
+            parts = [trace_field(world, *given, measured)]
             if wet.numel():
                 rotation = None if sample_rotation is None else sample_rotation[wet]
                 given = rays_o[wet], rays_d[wet], pixel_angle[wet], rotation, t_min[wet]
@@ -164,7 +168,7 @@ def _trace(
         for name, values in extra.items():
             layers[name][hit] = values
 
-    if bounces < BOUNCES:
+    if not measured:
         return radiance_alone(rgb)
     shares = LightFractions(along, kind, front, surface_weight, sky_weight, t_surface)
     return measure(world, rays_o, rays_d, rgb, shares, normal, layers)

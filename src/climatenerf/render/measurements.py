@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.core.samples import MIN_WEIGHT, offsets_of
+from climatenerf.core.samples import COMPLETED, MIN_WEIGHT, offsets_of
 from climatenerf.ops import compositing
 from climatenerf.weather import media
 from climatenerf.weather.world import SKY_OPACITY, TINY, RaySamples, RenderOutput, World
@@ -64,6 +64,10 @@ def measure(
         layers[matter.thickness_layer] = thickness
         seen = ((weight > 0.5) & (shares.surface <= 0.5)).nonzero()[:, 0]
         normal[seen] = matter.normal(rays_o[seen] + depth[seen, None] * rays_d[seen])
+    layers["seen"] = torch.ones_like(depth)
+    if samples.ids is not None:
+        completed = shares.along.weights * (samples.ids == COMPLETED)
+        layers["seen"] = (1 - total(completed, samples.offsets)).clamp(0, 1)
     return RenderOutput(rgb, depth, normal, passed, layers)
 
 

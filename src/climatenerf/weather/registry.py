@@ -21,8 +21,9 @@ from climatenerf.weather.units import Parameter
 
 EFFECTS: tuple[Effect, ...] = (SMOG, FLOOD, SNOW, SUN)
 ENTRY_POINTS = "climatenerf.effects"
-MEAN_TRANSMITTANCE = "mean_transmittance"
-"""Measure of every frame."""
+MEAN_TRANSMITTANCE, COMPLETED_GROUND = "mean_transmittance", "completed_ground_fraction"
+FRAME_MEASURES = (MEAN_TRANSMITTANCE, COMPLETED_GROUND)
+"""Measures of every frame."""
 
 
 @functools.cache
@@ -149,7 +150,7 @@ def _check_references(effects: Sequence[Effect]) -> None:
     """
     values = {"seed", *(effect.name for effect in effects), *parameters(effects)}
     layers = layer_table(effects).keys() - ON_DEMAND
-    measures = {MEAN_TRANSMITTANCE: "every frame"}
+    measures: dict[str, str] = dict.fromkeys(FRAME_MEASURES, "every frame")
     for effect in effects:
         what = f"the weather effect {effect.name!r}"
         for name in effect.prepared_from:

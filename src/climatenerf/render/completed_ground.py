@@ -1,0 +1,327 @@
+"""A field whose ground has no holes: where no photo shows the ground, the terrain stands in.
+
+Photos look ahead, so a fitted field often has no ground below the cameras, and snow, water and
+shadows have nothing to lie on. Rays that pass from above to below the terrain at one of its
+completed nodes end there, in the colour of the ground around.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from torch import Tensor
+
+from climatenerf.core.classes import SOLID, TERRAIN, UNKNOWN
+from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.samples import COMPLETED, Samples
+from climatenerf.field.capabilities import CLASSES, COMPLETES, FUSED, NORMALS
+from climatenerf.field.compositing import composited
+from climatenerf.field.protocol import RadianceField, observed
+from climatenerf.ops import compositing, heightfield
+from climatenerf.ops.heightfield_reference import bilinear
+from climatenerf.scene.terrain import Terrain, nearest_known
+
+THICKNESS = 0.04  # m, of the completed ground
+OPTICAL_DEPTH = 14.0  # across it: 1e-6 of the light passes
+ON_GROUND = 0.05  # m; a position this near to the completed ground has its colour
+DROP = 0.1  # m, by which the raster passes below the edge of the ground that the field holds
+OVERLAP = 3  # nodes
+NO_ID = -1  # of samples of a field that gives none
+SMOOTHING = 20  # steps of diffusion at each level of a continuation
+
+
+@dataclass(frozen=True)
+class CompletedField:
+    """A field (`field.protocol.RadianceField`) with completed ground."""
+
+    field: RadianceField
+    """The field that photos were fitted to."""
+    terrain: Terrain
+    """The ground; its `completed` nodes are what this class adds."""
+
+    # --- the terrain as tensors -----------------------------------------------------------------
+
+    @cached_property
+    def _height(self) -> Float[Tensor, "rows columns"]:
+        """Heights in cells above the world's origin, lowered where the field holds the ground."""
+        lowered = self.terrain.height - DROP * self.terrain.seen.astype(np.float32)
+        return self._tensor((lowered / self.terrain.cell).astype(np.float32))
+
+    @cached_property
+    def _surface(self) -> Float[Tensor, "rows columns"]:
+        """Heights in cells above the world's origin."""
+        return self._tensor((self.terrain.height / self.terrain.cell).astype(np.float32))
+
+    @cached_property
+    def _completed(self) -> Float[Tensor, "rows columns"]:
+        # Overlaps the field's ground by some nodes, below it, so that no gap is left between them.
+        widened = ndimage.binary_dilation(self.terrain.completed, iterations=OVERLAP)
+        return self._tensor(widened.astype(np.float32))
+
+    @cached_property
+    def _origin(self) -> Float[Tensor, "3"]:
+        return self._tensor(np.array([*self.terrain.origin, 0.0], np.float32))
+
+    @cached_property
+    def _label(self) -> Int[Tensor, "rows columns"]:
+        """Place in `SOLID` of each node's class, continued from the nearest known node."""
+        known = self.terrain.label != UNKNOWN
+        label = np.full(known.shape, TERRAIN)
+        if known.any():
+            label = self.terrain.label[nearest_known(known)[1]]
+        return self._tensor(np.searchsorted(SOLID, label))
+
+    @cached_property
+    def _colours(self) -> dict[bytes, Float[Tensor, "rows columns 3"]]:
+        """Colours of the ground by appearance, computed when first asked for."""
+        return {}
+
+    def _tensor(self, values: np.ndarray) -> Tensor:
+        return to_device(values, self.field.bounds[0].device)
+
+    def _cells(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Convert positions (world m) to cells of the raster."""
+        return (x - self._origin) / self.terrain.cell
+
+    def _on_ground(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Return which positions (world m) lie on completed ground."""
+        at = self._cells(x)
+        height = bilinear(self._height, at[:, :2])
+        side = torch.tensor(self._height.shape[::-1], device=x.device) - 1
+        inside = ((at[:, :2] >= 0) & (at[:, :2] <= side)).all(-1)
+        near = (at[:, 2] - height).abs() * self.terrain.cell < ON_GROUND
+        return inside & near & (bilinear(self._completed, at[:, :2]) > 0.5)
+
+    def crossing(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        t_max: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n"]:
+        """Return the ray lengths (m) at which rays meet completed ground; +inf elsewhere."""
+        cell = self.terrain.cell
+        span = torch.stack([t_min, t_max], dim=-1) / cell
+        o = self._cells(rays_o)
+        t = heightfield.first_crossing(self._height, o, rays_d.contiguous(), span)
+        met = t.isfinite().nonzero()[:, 0]
+        at = o[met, :2] + t[met, None] * rays_d[met, :2]
+        whole = bilinear(self._completed, at) <= 0.5
+        t[met[whole]] = torch.inf
+        return t * cell
+
+    # --- the protocol ---------------------------------------------------------------------------
+
+    @property
+    def near(self) -> float:
+        """Ray length at which camera rays begin, m."""
+        return self.field.near
+
+    @property
+    def bounds(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Lower and upper corner of the box that holds all density, m."""
+        return self.field.bounds
+
+    @property
+    def capabilities(self) -> frozenset[str]:
+        """Those of the field, but for rendering in one launch."""
+        return (self.field.capabilities - {FUSED}) | {COMPLETES}
+
+    def march(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        t_max: Float[Tensor, "n"],
+        step_scale: float = 1.0,
+        *,
+        stop: float = 1e-3,
+        pruning_threshold: float | None = None,
+    ) -> Samples:
+        """Samples of the field, and one where a ray meets completed ground."""
+        t = self.crossing(rays_o, rays_d, t_min, t_max)
+        hit = (t < t_max).nonzero()[:, 0]
+        t_end = torch.minimum(t_max, t)  # what lies below the completed ground is no evidence
+        inner = self.field.march(
+            rays_o,
+            rays_d,
+            t_min,
+            t_end,
+            step_scale,
+            stop=stop,
+            pruning_threshold=pruning_threshold,
+        )
+        if not hit.numel():
+            return inner
+        counts = torch.zeros(t.shape[0] + 1, dtype=torch.long, device=t.device)
+        counts[hit + 1] = 1
+        own = counts.cumsum(0)
+        order, offsets = compositing.merge_order(inner.t, inner.offsets, t[hit], own)
+        extent = torch.full_like(t[hit], THICKNESS)
+        values = {
+            "t": (inner.t, t[hit]),
+            "dt": (inner.dt, extent),
+            "sigma": (inner.sigma, OPTICAL_DEPTH / extent),
+        }
+        ids = order.new_full(inner.t.shape, NO_ID) if inner.ids is None else inner.ids
+        ids = torch.cat([ids, ids.new_full(hit.shape, COMPLETED)])[order]
+        return Samples(offsets, **{k: torch.cat(v)[order] for k, v in values.items()}, ids=ids)
+
+    def colour(
+        self,
+        x: Float[Tensor, "s 3"],
+        d: Float[Tensor, "n 3"],
+        ray: Int[Tensor, "s"] | None = None,
+        *,
+        ids: Int[Tensor, "s"] | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
+    ) -> Float[Tensor, "s 3"]:
+        """Linear radiance; that of completed ground is the same in all directions."""
+        own = self._on_ground(x) if ids is None else ids == COMPLETED
+        # Samples of a field without ids have `NO_ID`.
+        inner_ids = ids if ids is None or not bool((ids[~own] == NO_ID).any()) else None
+        if not bool(own.any()):
+            return self.field.colour(x, d, ray, ids=inner_ids, appearance=appearance)
+        rows = torch.arange(x.shape[0], device=x.device) if ray is None else ray
+        colour = torch.empty(x.shape[0], 3, device=x.device)
+        rest = ~own
+        inner_ids = None if inner_ids is None else inner_ids[rest]
+        colour[rest] = self.field.colour(
+            x[rest], d, rows[rest], ids=inner_ids, appearance=appearance
+        )
+        at = self._cells(x[own])[:, :2]
+        raster = self._colour_raster(appearance)
+        colour[own] = torch.stack([bilinear(raster[..., k], at) for k in range(3)], dim=-1)
+        return colour
+
+    def sky(
+        self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None
+    ) -> Float[Tensor, "n 3"]:
+        """Linear radiance of the field's sky."""
+        return self.field.sky(d, appearance)
+
+    def composite(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        t_min: Float[Tensor, "n"],
+        step_scale: float = 1.0,
+        stop: float = 1e-3,
+        pruning_threshold: float | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """Radiance, transmittance and weighted sum of ray lengths (m), in several launches."""
+        given = t_min, step_scale, stop, pruning_threshold, appearance
+        return composited(self, rays_o, rays_d, *given)
+
+    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Extinction at positions (m), 1/m."""
+        own = self._on_ground(x)
+        return torch.where(own, OPTICAL_DEPTH / THICKNESS, self.field.density(x))
+
+    def surface_heads(
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        samples: Samples,
+        selected: Int[Tensor, "k"],
+    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
+        """Normals and class logits of some samples; of the raster on completed ground."""
+        normal, logits = self.field.surface_heads(rays_o, rays_d, samples, selected)
+        if samples.ids is None:
+            return normal, logits
+        own = (samples.ids[selected] == COMPLETED).nonzero()[:, 0]
+        ray = samples.ray_index()[selected[own]]
+        x = rays_o[ray] + samples.t[selected[own], None] * rays_d[ray]
+        at = self._cells(x)[:, :2]
+        normal[own] = self._normal(at)
+        rows, columns = self._label.shape
+        column = at[:, 0].round().long().clamp(0, columns - 1)
+        row = at[:, 1].round().long().clamp(0, rows - 1)
+        # As sure as a trained head: a logit of 10 against 0.
+        classes = torch.nn.functional.one_hot(self._label[row, column], logits.shape[1])
+        logits[own] = 10.0 * classes.to(logits)
+        return normal, logits
+
+    def _normal(self, at: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+        """Unit normals of the raster at positions in cells."""
+        step = torch.eye(2, device=at.device)
+        slope = [
+            bilinear(self._surface, at + step[k]) - bilinear(self._surface, at - step[k])
+            for k in range(2)
+        ]
+        normal = torch.stack([-slope[0] / 2, -slope[1] / 2, torch.ones_like(slope[0])], dim=-1)
+        return torch.nn.functional.normalize(normal, dim=-1)
+
+    def observed_only(self) -> "CompletedField":
+        """The same, without density that no photo shows; completed ground stays."""
+        return CompletedField(observed(self.field), self.terrain)
+
+    def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
+        """Appearance of a training photo."""
+        return self.field.photo_appearance(index)
+
+    @property
+    def knows_normals(self) -> bool:
+        """Whether the field has learned normals."""
+        return NORMALS in self.field.capabilities
+
+    @property
+    def knows_classes(self) -> bool:
+        """Whether the field has learned classes."""
+        return CLASSES in self.field.capabilities
+
+    # --- colours --------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def _colour_raster(
+        self, appearance: Float[Tensor, "1 e"] | None
+    ) -> Float[Tensor, "rows columns 3"]:
+        """Return the linear radiance of the ground: the field's, continued over completed nodes."""
+        key = b"" if appearance is None else to_numpy(appearance).tobytes()
+        if key not in self._colours:
+            x = self._tensor(self.terrain.nodes().reshape(-1, 3).astype(np.float32))
+            seen = self._tensor(self.terrain.seen.reshape(-1)).nonzero()[:, 0]
+            down = torch.tensor([0.0, 0.0, -1.0], device=x.device).expand(len(seen), 3)
+            colour = torch.zeros_like(x)
+            colour[seen] = self.field.colour(x[seen], down.contiguous(), appearance=appearance)
+            raster = to_numpy(colour).reshape(*self.terrain.height.shape, 3)
+            self._colours[key] = self._tensor(continued(raster, self.terrain.seen))
+        return self._colours[key]
+
+
+def continued(
+    values: Float[np.ndarray, "rows columns c"], known: Bool[np.ndarray, "rows columns"]
+) -> Float[np.ndarray, "rows columns c"]:
+    """Continue known node values smoothly over the others; known ones are kept.
+
+    Averages of the known values go up a pyramid of halved rasters and come down interpolated
+    ("pull-push", Gortler et al. 1996); `SMOOTHING` steps of diffusion then remove the pyramid's
+    pattern.
+    """
+    weight = known.astype(np.float32)[..., None]
+    result = np.where(known[..., None], values, 0.0).astype(np.float32)
+    if max(known.shape) > 1:
+        rows, columns = known.shape
+        odd = ((0, rows % 2), (0, columns % 2), (0, 0))
+
+        def halved(x: np.ndarray) -> np.ndarray:
+            x = np.pad(x, odd)
+            return x[::2, ::2] + x[1::2, ::2] + x[::2, 1::2] + x[1::2, 1::2]
+
+        total, count = halved(result * weight), halved(weight)
+        # 1: four nodes of which none is known, 0/0; they are filled from the next level.
+        coarse = continued(total / np.maximum(count, 1), count[..., 0] > 0)
+        at = np.meshgrid(np.arange(rows) / 2 - 0.25, np.arange(columns) / 2 - 0.25, indexing="ij")
+        finer = [
+            ndimage.map_coordinates(coarse[..., k], at, order=1, mode="nearest")
+            for k in range(values.shape[-1])
+        ]
+        result = np.where(known[..., None], result, np.stack(finer, axis=-1))
+    for _ in range(SMOOTHING):
+        blurred = ndimage.uniform_filter(result, 3, mode="nearest", axes=(0, 1))
+        result = np.where(known[..., None], result, blurred)
+    return result
