@@ -127,6 +127,8 @@ def run(options: Fit) -> int:
     if metrics["interrupted"]:
         progress.say(f"Stopped early; resume with: {resuming(options)}")
     progress.result(summary(metrics))
+    if geometry_line(metrics):
+        progress.say(geometry_line(metrics))
     progress.result(f"run: {options.out}")
     return 0
 
@@ -326,6 +328,21 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
             )
         weights[name] = weight
     return weights
+
+
+def geometry_line(metrics: dict) -> str:
+    """Return one line with the scores that need no reference; "" without any."""
+    forms = {
+        "ground.present": "{:.0%} of the ground is there",
+        "ground.roughness_cm": "its roughness is {:.1f} cm",
+        "neighbours.psnr": "neighbouring photos agree to {:.1f} dB",
+        "floating.share": "{:.2%} of the pixels float",
+        "sky.empty": "{:.1%} of the sky is empty",
+        "points.abs_rel": "depth errs by {:.1%} at points that were withheld",
+    }
+    known = {name: metrics[name] for name in forms if metrics.get(name) is not None}
+    parts = [forms[name].format(value) for name, value in known.items()]
+    return f"Geometry: {'; '.join(parts)}" if parts else ""
 
 
 def summary(metrics: dict) -> str:

@@ -56,6 +56,18 @@ def check_config(run: Path) -> dict:
     return config
 
 
+SCORES = (
+    "ground.present",
+    "ground.roughness_cm",
+    "neighbours.psnr",
+    "floating.components",
+    "floating.share",
+    "sky.empty",
+    "points.abs_rel",
+)
+"""Scores of a run that need no reference; see `evaluation.no_reference`."""
+
+
 def checked_metrics(path: Path) -> dict:
     """Return the content of a run's `metrics.json`, with the types that `fit` writes.
 
@@ -70,6 +82,9 @@ def checked_metrics(path: Path) -> dict:
             parsing.number(metrics, name, where)
     if metrics.get("psnr") is not None:  # all three are written together
         metrics |= {name: parsing.number(metrics, name, where) for name in ("psnr_cc", "ssim")}
+    for name in SCORES:
+        if metrics.get(name) is not None:
+            parsing.number(metrics, name, where)
     return metrics
 
 

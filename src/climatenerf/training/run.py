@@ -15,8 +15,12 @@ from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, make_folder, write_json
 from climatenerf.evaluation.heldout import evaluate
+from climatenerf.evaluation.no_reference import no_reference_scores
+from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
+from climatenerf.render.ground_evidence import terrain_below
+from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.volume import render_view
 from climatenerf.scene.images import (
     downscaled_camera,
@@ -26,6 +30,7 @@ from climatenerf.scene.images import (
     load_relative_depth,
 )
 from climatenerf.scene.scene import Scene
+from climatenerf.scene.terrain import save_terrain
 from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
@@ -39,7 +44,7 @@ from climatenerf.training.optimiser import Diverged
 from climatenerf.training.progress import Report
 from climatenerf.training.settings import FitSettings, as_config
 from climatenerf.training.setup import compile_kernels, make_trainer
-from climatenerf.training.snapshot import METRICS, writing_run
+from climatenerf.training.snapshot import FIELD, METRICS, identity_of, writing_run
 from climatenerf.training.trainer import Trainer
 
 CHECKPOINT_INTERVAL = 60.0  # seconds
@@ -184,8 +189,21 @@ def _fit(
         # The user waits for the end, and a resumed fit will be measured.
         return metrics | {"psnr": None, "ssim": None, "psnr_cc": None}
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
+    metrics |= _find_ground(trainer.field, scene, run)
     write_json(run / METRICS, metrics)
     return metrics
+
+
+def _find_ground(field: Field, scene: Scene, run: Path) -> dict:
+    """Save the terrain of a finished fit, and return the scores that need no reference."""
+    identity = identity_of(run / FIELD) or ""
+    if not field.capabilities & {NORMALS, CLASSES}:
+        save_terrain(None, run, identity)
+        return {}
+    photos = trace_photos(field.observed_only(), scene)
+    terrain = terrain_below(field, photos)
+    save_terrain(terrain, run, identity)
+    return no_reference_scores(field, scene, photos, terrain)
 
 
 def heldout_pixels(scene: Scene, downscale: int) -> int:
