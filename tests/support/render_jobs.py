@@ -42,7 +42,7 @@ def noise_of(job: RenderJob):
     def render(index, preview):
         rng = np.random.default_rng([int(job.key[:8], 16), index])
         picture = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-        names = ("depth", "water_depth", "transmittance", "snow_thickness")
+        names = ("depth", "water_depth", "transmittance", "snow_thickness", "seen")
         layers = {name: rng.random((HEIGHT, WIDTH), np.float32) for name in names}
         layers |= {f"mask_{name}": rng.random((HEIGHT, WIDTH)) for name in ("water", "snow")}
         if preview is not None:
