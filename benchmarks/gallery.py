@@ -5,11 +5,14 @@ python benchmarks/gallery.py ditch RUN --level "-1.5 m" --visibility "60 m" --sn
 
 python benchmarks/gallery.py ditch RUN --surfaces
 python benchmarks/gallery.py street-busy RUN --passers-by
+python benchmarks/gallery.py ditch RUN --ground --level=-1.5m --columns 2
 
 Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
 smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
 shows colours, depth, normals and classes of held-out views. With --passers-by, NAME-passers-by.jpg
-shows the most masked photos, the mask in red, and the field from the same cameras.
+shows the most masked photos, the mask in red, and the field from the same cameras. With --ground,
+NAME-ground.jpg shows photos' cameras turned down by 15 degrees, clean and flooded, without and with
+completed ground.
 """
 
 import argparse
@@ -21,21 +24,27 @@ import numpy as np
 import torch
 from PIL import Image
 
+import climatenerf
 from climatenerf.core.storage import read_safetensors
 from climatenerf.field.checkpoint import load_field
 from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.render.frame import FrameOptions, render_frame
+from climatenerf.render.session import RenderSession
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_image
 from climatenerf.studies.ablation import depth_picture, normal_picture
 from climatenerf.training.folder import OPTIMISER
 from climatenerf.training.transients import MASK_THRESHOLD, TransientMasks
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.units import LENGTH, parse_quantity
+from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import World
 
 # Cityscapes' colours of road, building, vegetation, terrain, sky, person and vehicle.
 PAINT = np.zeros((256, 3), np.uint8)
 PAINT[:7] = [[128, 64, 128], [70, 70, 70], [107, 142, 35], [152, 251, 152], [70, 130, 180],
              [220, 20, 60], [0, 0, 142]]  # fmt: skip
+TURN = -np.radians(15.0)  # of a camera about its x axis, downwards
 GALLERY = Path(__file__).resolve().parents[1] / "docs" / "gallery"
 
 
@@ -109,6 +118,30 @@ def passers_by(run: Path, columns: int) -> Rows:
     return rows
 
 
+def ground(run_folder: Path, options: argparse.Namespace) -> Rows:
+    """Look down from training photos, clean and flooded, without and with completed ground."""
+    run = climatenerf.load_run(run_folder)
+    views = run.scene.of_split("train")
+    chosen = np.linspace(0, len(views) - 1, options.columns + 2).round().astype(int)[1:-1]
+    level = parse_quantity(options.level, LENGTH)
+    weathers = {"clean": Weather(), "flood": Weather(flood=Flood(level=level))}
+    fields = {"as fitted": run.field, "completed": run.completed()}
+    cosine, sine = np.cos(TURN), np.sin(TURN)
+    down = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    rows: Rows = []
+    for label, weather in weathers.items():
+        for kind, field in fields.items():
+            pictures = []
+            for view in (views[i] for i in chosen):
+                c2w = run.scene.c2w_world(view).copy()
+                c2w[:3, :3] = c2w[:3, :3] @ down
+                camera = run.scene.cameras[view.camera]
+                session = RenderSession(field, run.scene, weather, c2w[None, :3, 3])
+                pictures.append(session.frame(camera, c2w).picture)
+            rows.append((f"{label}, {kind}", pictures))
+    return rows
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("name")
@@ -124,15 +157,19 @@ def main() -> None:
     kinds = parser.add_mutually_exclusive_group()
     kinds.add_argument("--surfaces", action="store_true")
     kinds.add_argument("--passers-by", action="store_true")
+    kinds.add_argument("--ground", action="store_true")
     options = parser.parse_args()
     name = options.name
     if options.surfaces:
         name, rows = f"{name}-surfaces", surfaces(options.run, options.columns)
     elif options.passers_by:
         name, rows = f"{name}-passers-by", passers_by(options.run, options.columns)
+    elif options.ground:
+        name, rows = f"{name}-ground", ground(options.run, options)
     else:
         rows = weathers(options.run, options)
-    sheet = contact_sheet(rows, options.columns, cell_width=320)
+    width = 480 if options.ground else 320
+    sheet = contact_sheet(rows, options.columns, cell_width=width)
     path = options.out / f"{name}.jpg"
     size = write_jpeg(path, sheet, max_bytes=150_000)
     common.report("contact sheet", {"file": path.name, "bytes": size})
