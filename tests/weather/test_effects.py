@@ -18,7 +18,7 @@ from support.random_field import random_field
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.core.layer_table import RESERVED_NAMES, Layer
+from climatenerf.core.layer_table import FRAME_LAYERS, RESERVED_NAMES, Layer
 from climatenerf.core.storage import write_json
 from climatenerf.field.checkpoint import save_field
 from climatenerf.output import render_folder
@@ -239,7 +239,8 @@ def test_built_in_effects_are_compatible_and_snow_follows_the_flood():
     assert names.index("flood") < names.index("snow")
     for each in EFFECTS:
         assert each.fields().keys() == {f.name for f in dataclasses.fields(each.parameters)}
-    assert len(layer_table()) == 4 + sum(len(each.layers) for each in EFFECTS)
+    own = sum(len(each.layers) for each in EFFECTS)
+    assert len(layer_table()) == len(FRAME_LAYERS) + own
 
 
 def test_prepared_from_names_existing_parameters():
