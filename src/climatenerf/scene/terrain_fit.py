@@ -184,18 +184,23 @@ def _conjugate_gradients(
     scale = 1 / matrix.diagonal()
     x, residual = start.copy(), target - matrix @ start
     direction = scale * residual
-    power = residual @ direction
+    power = _dot(residual, direction)
     for _ in range(STEPS):
         if power <= 0:  # solved
             break
         image = matrix @ direction
-        step = power / (direction @ image)
+        step = power / _dot(direction, image)
         x += step * direction
         residual -= step * image
         ahead = scale * residual
-        power, before = residual @ ahead, power
+        power, before = _dot(residual, ahead), power
         direction = ahead + (power / before) * direction
     return x
+
+
+def _dot(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"]) -> float:
+    """Return the inner product without BLAS, whose threads wait for each other if cores are busy."""
+    return float((a * b).sum())
 
 
 def _standard_error(
