@@ -199,7 +199,7 @@ def _conjugate_gradients(
 
 
 def _dot(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"]) -> float:
-    """Return the inner product without BLAS, whose threads wait for each other if cores are busy."""
+    """Return the inner product without BLAS, whose threads wait for each other on busy cores."""
     return float((a * b).sum())
 
 
