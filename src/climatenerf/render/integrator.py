@@ -87,9 +87,8 @@ def _trace(
     surfaces = world.surfaces if bounces > 0 else ()
     step_scale = RENDER_STEP if bounces == BOUNCES else SECONDARY_STEP
     measured = bounces == BOUNCES
-    # Camera rays that may end on completed ground measure where they do.
-    short = not (measured and COMPLETES in world.field.capabilities)
-    if short and not world.media and not world.matters:
+    completes = measured and COMPLETES in world.field.capabilities  # its layer needs all samples
+    if not (completes or world.media or world.matters):
         # Most reflected rays rise, and see what they would without weather.
         meets = torch.zeros(n, dtype=torch.bool, device=device)
         for surface in surfaces:

@@ -72,13 +72,10 @@ class Trainer:
         decays = [self.settings.decay if grid is field.appearance_grid else 0.0 for grid in grids]
         self.grid_adam = GridAdam(grids, decays)
         # 1e-15: a parameter whose gradient was always 0 has moments of 0, 0/0.
-        self.net_adam = torch.optim.Adam(
-            parameter_groups(field, self.masks, self.poses, self.settings, self.evidence.knows_sky),
-            self.settings.net_rate,
-            betas=(0.9, 0.99),
-            eps=1e-15,
-            fused=True,
-        )
+        nets = field, self.masks, self.poses
+        groups = parameter_groups(*nets, self.settings, self.evidence.knows_sky)
+        rate = self.settings.net_rate
+        self.net_adam = torch.optim.Adam(groups, rate, (0.9, 0.99), eps=1e-15, fused=True)
         self.discarded = DiscardedSteps()
         self.steps = 0
         self.seconds = 0.0
