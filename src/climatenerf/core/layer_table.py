@@ -47,7 +47,7 @@ FRAME_LAYERS = (
     Layer(
         "seen",
         "1",
-        "fraction of the pixel that photos show; the rest is completed ground",
+        "fraction of the dry pixel that photos show; the rest is completed ground",
         1 / 255,
         8,
         1.0,

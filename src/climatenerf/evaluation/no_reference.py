@@ -170,14 +170,15 @@ def _neighbours(photos: list[PhotoRays], scene: Scene) -> tuple[float | None, st
             continue
         mine, other = (_colours(photos[k], scene) for k in (i, j))
         x = photos[i].x.reshape(-1, 3)
-        pixel, seen = _project(photos[j].camera, photos[j].c2w, x)
+        at, seen = _project(photos[j].camera, photos[j].c2w, x)
+        pixel = at.astype(int)
         length = np.linalg.norm(x - eyes[j], axis=-1)
         seen[seen] &= photos[j].t[pixel[seen, 1], pixel[seen, 0]] > (1 - HIDDEN) * length[seen]
         if seen.sum() < MIN_ENDS:
             continue
         a = mine.reshape(-1, 3)[seen].astype(np.float64)
-        b = other[pixel[seen, 1], pixel[seen, 0]].astype(np.float64)
-        gain = np.median(a, 0) / np.maximum(np.median(b, 0), 1.0)  # a black photo: 0/0
+        b = _bilinear(other, at[seen])
+        gain = a.mean(0) / np.maximum(b.mean(0), 1.0)  # a black photo: 0/0
         squares += float((((a - gain * b) / 255) ** 2).sum())
         count += a.size
     if not count:
@@ -194,16 +195,26 @@ def _colours(photo: PhotoRays, scene: Scene) -> UInt8[np.ndarray, "h w 3"]:
 
 def _project(
     camera: Camera, c2w: Float[np.ndarray, "4 4"], x: Float[np.ndarray, "n 3"]
-) -> tuple[np.ndarray, Bool[np.ndarray, "n"]]:
-    """Return the pixels (column, row) of positions, and which are finite and inside the frame."""
+) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+    """Return where positions appear (x, y; px), and which are finite and inside the frame."""
     finite = np.isfinite(x).all(-1)
-    pixel = np.zeros((len(x), 2), int)
+    found = np.zeros((len(x), 2))
     inside = np.zeros(len(x), bool)
     at = camera.project((x[finite] - c2w[:3, 3]) @ c2w[:3, :3])
     good = ((at >= 0) & (at < (camera.width, camera.height))).all(-1)  # NaN behind: False
     inside[finite] = good
-    pixel[inside] = at[good].astype(int)
-    return pixel, inside
+    found[inside] = at[good]
+    return found, inside
+
+
+def _bilinear(
+    picture: UInt8[np.ndarray, "h w 3"], at: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 3"]:
+    """Interpolate a picture between the centres of its pixels."""
+    rows = [at[:, 1] - 0.5, at[:, 0] - 0.5]
+    channels = np.moveaxis(picture.astype(np.float64), -1, 0)
+    sampled = [ndimage.map_coordinates(each, rows, order=1, mode="nearest") for each in channels]
+    return np.stack(sampled, axis=-1)
 
 
 def _floating(

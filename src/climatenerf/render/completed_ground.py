@@ -17,7 +17,7 @@ from torch import Tensor
 from climatenerf.core.classes import SOLID, TERRAIN, UNKNOWN
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import COMPLETED, Samples
-from climatenerf.field.capabilities import CLASSES, COMPLETES, FUSED, NORMALS
+from climatenerf.field.capabilities import COMPLETES, FUSED
 from climatenerf.field.compositing import composited
 from climatenerf.field.protocol import RadianceField, observed
 from climatenerf.ops import compositing, heightfield
@@ -67,7 +67,7 @@ class CompletedField:
 
     @cached_property
     def _label(self) -> Int[Tensor, "rows columns"]:
-        """Place in `SOLID` of each node's class, continued from the nearest known node."""
+        """Index in `SOLID` of each node's class, continued from the nearest known node."""
         known = self.terrain.label != UNKNOWN
         label = np.full(known.shape, TERRAIN)
         if known.any():
@@ -263,16 +263,6 @@ class CompletedField:
     def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
         """Appearance of a training photo."""
         return self.field.photo_appearance(index)
-
-    @property
-    def knows_normals(self) -> bool:
-        """Whether the field has learned normals."""
-        return NORMALS in self.field.capabilities
-
-    @property
-    def knows_classes(self) -> bool:
-        """Whether the field has learned classes."""
-        return CLASSES in self.field.capabilities
 
     # --- colours --------------------------------------------------------------------------------
 

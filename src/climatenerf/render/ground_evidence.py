@@ -1,9 +1,9 @@
 """The terrain of a fitted run: what its photos' rays meet, as heights of ground.
 
-Rays of the photos end on the fitted field. Ends that are ground by their class, or where there are
-no classes by their normal and by lying lowest, are heights with an error, and a smooth surface is
-fitted to them (`scene.terrain_fit`). Then two things are found for each node: whether the field
-holds ground there, and whether any photo shows it.
+Rays of the photos end on the fitted field. Ends that can be ground by normal and class, and that
+lie near the lower envelope of all ends, are heights with an error. A smooth surface is fitted to
+them (`scene.terrain_fit`). Then two things are found for each node: whether the field holds ground
+there, and whether any photo shows it.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ MIN_UP = 0.5  # z of a normal that may be ground
 DEPTH_ERROR = 0.01  # of a ray length
 SURFACE_ERROR = 0.02  # m
 ENVELOPE_CELL = 0.6  # m, cells whose lowest ends begin the search for ground
-BAND = 0.35  # m around the first surface in which ends count as ground
+BAND = 0.35  # m above the lower envelope in which ends count as ground
 STEEPEST = np.tan(np.radians(40.0))
 CLEARANCE = (0.2, 0.5)  # m above and below the terrain in which the field's ground is looked for
 LIFT = 0.05  # m; nodes are looked at so much above the ground
@@ -126,16 +126,15 @@ def _near_lowest(
 ) -> Bool[np.ndarray, "n"]:
     """Return which ends lie near the lower envelope of all, no steeper than ground can be.
 
-    Ends labelled road or terrain lie at most `BAND` from the surface through them all, or near the
-    envelope; others must lie near the envelope.
+    Ends classified as road or terrain may lie twice as far above it as others.
     """
     if not len(x):
         return np.zeros(0, bool)
     low = x[:, :2].min(0)
-    at = ((x[:, :2] - low) / ENVELOPE_CELL).astype(np.int64)
+    # Larger cells where ends are kilometres apart, which bounds the memory.
+    cell = max(ENVELOPE_CELL, float((x[:, :2].max(0) - low).max()) / (4 * MAX_NODES))
+    at = ((x[:, :2] - low) / cell).astype(np.int64)
     columns, rows = (at.max(0) + 1).tolist()
-    if columns * rows > MAX_NODES**2 * 16:
-        return np.zeros(len(x), bool)
     row = at[:, 1] * columns + at[:, 0]
     order = np.lexsort((x[:, 2], row))
     nodes, start, count = np.unique(row[order], return_index=True, return_counts=True)
@@ -149,7 +148,7 @@ def _near_lowest(
     span = np.arange(-radius, radius + 1)
     for dy in span:
         for dx in span:
-            rise = STEEPEST * ENVELOPE_CELL * np.hypot(dx, dy)
+            rise = STEEPEST * cell * np.hypot(dx, dy)
             shifted = ndimage.shift(lowest, (dy, dx), order=0, cval=np.inf, prefilter=False)
             envelope = np.minimum(envelope, shifted + rise)
     above = x[:, 2] - envelope.reshape(-1)[row]

@@ -66,7 +66,10 @@ def measure(
         normal[seen] = matter.normal(rays_o[seen] + depth[seen, None] * rays_d[seen])
     layers["seen"] = torch.ones_like(depth)
     if samples.ids is not None:
-        completed = shares.along.weights * (samples.ids == COMPLETED)
+        # Of the dry scene, as the classes are: snow on completed ground rests on a guess.
+        dry = torch.where(shares.kind == 0, samples.sigma * samples.dt, 0.0)
+        weights, _ = compositing.render_weights(dry, samples.offsets)
+        completed = weights * (samples.ids == COMPLETED)
         layers["seen"] = (1 - total(completed, samples.offsets)).clamp(0, 1)
     return RenderOutput(rgb, depth, normal, passed, layers)
 

@@ -6,15 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.classes import SKY, SOLID
-from climatenerf.core.device import to_device, to_numpy
-from climatenerf.core.samples import offsets_of
+from climatenerf.core.device import to_numpy
 from climatenerf.field.compositing import chunks
 from climatenerf.field.protocol import RadianceField, device_of
-from climatenerf.ops import compositing
+from climatenerf.render.heads import ray_ends
 from climatenerf.render.volume import camera_rays
 from climatenerf.scene.scene import Scene, View
 
@@ -66,36 +63,17 @@ def trace_photos(
         width = max(round(camera.width / max(factor, 1)), 8)
         small = camera.resized(width, max(round(width * camera.height / camera.width), 8))
         rays_o, rays_d = camera_rays(small, c2w, device)
-        parts = [_ends(field, rays_o[chunk], rays_d[chunk]) for chunk in chunks(rays_o)]
-        t, normal, label, through = (to_numpy(torch.cat(each)) for each in zip(*parts, strict=True))
         size = (small.height, small.width)
-        t, d = t.astype(np.float64), to_numpy(rays_d).astype(np.float64)
-        ends = np.isfinite(t)[:, None]
-        x = np.where(ends, to_numpy(rays_o) + np.where(ends, t[:, None], 0.0) * d, np.inf)
-        x, d, normal = (each.reshape(*size, 3) for each in (x, d, normal))
-        t, label, through = (each.reshape(size) for each in (t, label, through))
+        parts = [
+            ray_ends(field, rays_o[chunk], rays_d[chunk], END_STEP, END_WEIGHT)
+            for chunk in chunks(rays_o)
+        ]
+        t, normal, label, through = (
+            to_numpy(torch.cat([getattr(part, name) for part in parts])).reshape(*size, *shape)
+            for name, shape in (("t", ()), ("normal", (3,)), ("label", ()), ("transmittance", ()))
+        )
+        t, d = t.astype(np.float64), to_numpy(rays_d).astype(np.float64).reshape(*size, 3)
+        ends = np.isfinite(t)[..., None]
+        x = np.where(ends, c2w[:3, 3] + np.where(ends, t[..., None], 0.0) * d, np.inf)
         photos.append(PhotoRays(view, small, c2w, x, t, d, normal, label, through))
     return photos
-
-
-def _ends(
-    field: RadianceField, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], UInt8[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return ray lengths (m), normals, classes and transmittance; +inf, 0, sky without an end."""
-    near = torch.full_like(rays_o[:, 0], field.near)
-    samples = field.march(rays_o, rays_d, near, torch.full_like(near, 1e9), END_STEP)
-    weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
-    keep = (weights > END_WEIGHT).nonzero()[:, 0]
-    weights, offsets = weights[keep], offsets_of(samples.ray_index()[keep], len(near))
-    normal, logits = field.surface_heads(rays_o, rays_d, samples, keep)
-    solid = transmittance < 0.5
-
-    def mean(values: Float[Tensor, "s c"]) -> Float[Tensor, "n c"]:
-        return compositing.accumulate(weights, values, offsets)
-
-    # 1e-6: a ray that meets nothing, 0/0; its length is infinite.
-    total = mean(torch.ones_like(weights)[:, None])[:, 0].clamp_min(1e-6)
-    t = torch.where(solid, mean(samples.t[keep, None])[:, 0] / total, torch.inf)
-    normal = torch.nn.functional.normalize(mean(normal), dim=-1) * solid[:, None]
-    kind = to_device(SOLID, t.device)[mean(logits).argmax(-1)].to(torch.uint8)
-    return t, normal, torch.where(solid, kind, torch.full_like(kind, SKY)), transmittance

@@ -180,7 +180,11 @@ def _differences(shape: tuple[int, ...], cell: float) -> tuple[Matrix, Matrix]:
 def _conjugate_gradients(
     matrix: Matrix, target: Float[np.ndarray, "n"], start: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n"]:
-    """Solve a symmetric positive system approximately, with Jacobi's preconditioner."""
+    """Solve a symmetric positive system approximately, with Jacobi's preconditioner.
+
+    As `scipy.sparse.linalg.cg`, which is several times slower on busy cores
+    (`benchmarks/ground.py`): the threads of BLAS wait for each other in its inner products.
+    """
     scale = 1 / matrix.diagonal()
     x, residual = start.copy(), target - matrix @ start
     direction = scale * residual
@@ -199,7 +203,7 @@ def _conjugate_gradients(
 
 
 def _dot(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"]) -> float:
-    """Return the inner product without BLAS, whose threads wait for each other on busy cores."""
+    """Return the inner product without BLAS."""
     return float((a * b).sum())
 
 
