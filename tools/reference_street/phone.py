@@ -22,8 +22,8 @@ def photo(
     """
     electrons = np.clip(linear, 0, 1) * WHITE / BALANCE
     raw = rng.poisson(electrons) + READ_NOISE * rng.standard_normal(electrons.shape)
-    shown = encode(raw / WHITE * BALANCE) / 255.0 @ _YCBCR.T
+    ycbcr = encode(raw / WHITE * BALANCE) / 255.0 @ _YCBCR.T
     blurs = (LUMA_BLUR, CHROMA_BLUR, CHROMA_BLUR)
-    smooth = [ndimage.gaussian_filter(shown[..., k], blur) for k, blur in enumerate(blurs)]
+    smooth = [ndimage.gaussian_filter(ycbcr[..., k], blur) for k, blur in enumerate(blurs)]
     rgb = np.stack(smooth, -1) @ np.linalg.inv(_YCBCR).T
     return np.round(255 * np.clip(rgb, 0, 1)).astype(np.uint8)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 FEATURES, SEED = 4096, 0  # as `climatenerf capture`
 
 
-def motion_points(
+def sfm_points(
     views: Sequence["View"], camera: "Camera", work: Path
 ) -> tuple[Float[np.ndarray, "n 3"], list[Int[np.ndarray, "k"]]]:
     """Match photos as `climatenerf capture` does, and triangulate with their true poses.

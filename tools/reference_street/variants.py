@@ -18,7 +18,7 @@ from PIL import Image
 from tools.reference_street.layout import heldout_poses
 from tools.reference_street.phone import photo
 from tools.reference_street.publish import save_arrays, variant_folder, write_list, write_sums
-from tools.reference_street.tracks import motion_points
+from tools.reference_street.tracks import sfm_points
 from tools.reference_street.write import mean_of, save_portable
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def write_sparse(out: Path) -> None:
 def write_tracks(store: Path, out: Path) -> None:
     """Write the variant with points of structure from motion."""
     scene = _variant_scene(out, "tracks", out.name)
-    save_portable(_with_motion_points(scene, store / "tracks"))
+    save_portable(_with_sfm_points(scene, store / "tracks"))
     write_list(scene.root, f"../{out.name}", _tests())
 
 
@@ -97,7 +97,7 @@ def write_hard(store: Path, out: Path) -> None:
     """Write the variant with few photos of plain ground and points found on those photos."""
     plain = variant_folder(out, "plain").name
     scene = _fewer_photos(_variant_scene(out, "hard", plain))
-    save_portable(_with_motion_points(scene, store / "tracks-hard"))
+    save_portable(_with_sfm_points(scene, store / "tracks-hard"))
     write_list(scene.root, f"../{out.name}", _tests(), clean=f"../{plain}")
 
 
@@ -125,8 +125,8 @@ def _fewer_photos(scene: "Scene") -> "Scene":
     return replace(scene, views=views)
 
 
-def _with_motion_points(scene: "Scene", work: Path) -> "Scene":
-    points, seen = motion_points(scene.of_split("train"), scene.cameras[0], work)
+def _with_sfm_points(scene: "Scene", work: Path) -> "Scene":
+    points, seen = sfm_points(scene.of_split("train"), scene.cameras[0], work)
     found = dict(zip([view.name for view in scene.of_split("train")], seen, strict=True))
     nothing = np.empty(0, int)
     views = tuple(replace(view, seen=found.get(view.name, nothing)) for view in scene.views)
