@@ -12,6 +12,7 @@ from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import BUILDING, ROAD
 from climatenerf.evaluation.no_reference import no_reference_scores
 from climatenerf.field.analytic import Box, HalfSpace
+from climatenerf.render import ground_evidence
 from climatenerf.render.ground_evidence import terrain_below
 from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.volume import render_view
@@ -29,6 +30,14 @@ EYES = [(-1.5, -4.0, 1.6), (-0.5, -4.2, 1.6), (0.5, -3.8, 1.6), (1.5, -4.0, 1.6)
 def field(*more, classes=(ROAD, BUILDING)):
     extra = [BUILDING] * len(more)
     return LabelledField([GROUND, WALL, *more], classes=(*classes, *extra), box=WIDE)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_nodes():
+    """Keep rasters small."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ground_evidence, "MAX_NODES", 96)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -311,7 +311,7 @@ def test_snow_lies_on_completed_ground():
     assert seen.layers["mask_snow"].min() > 0.99
     assert (seen.layers["snow_thickness"] - 0.1).abs().max() < 0.01
     assert ((o + seen.depth[:, None] * d)[:, 2] - 0.1).abs().max() < 0.025
-    assert (seen.layers["seen"] > 0.99).all(), "snow hides the completed ground"
+    assert (seen.layers["seen"] < 0.01).all(), "the snow lies on ground that no photo shows"
 
 
 @pytest.mark.parametrize(
