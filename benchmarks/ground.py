@@ -5,8 +5,7 @@ python benchmarks/ground.py RUN --size 800x450 --pitch 15 --repeats 5
 
 `cameras` has the fraction of training photos below which the field holds ground, photos show the
 place without ground in the field, or the terrain completes it. Frames are rendered from the middle
-training photo, turned down by --pitch degrees, without and with completed ground in turns. `solver`
-compares the spline's conjugate gradients with SciPy's on the same heights.
+training photo, turned down by --pitch degrees, without and with completed ground in turns.
 """
 
 import argparse
@@ -16,7 +15,6 @@ from typing import Any
 
 import common
 import numpy as np
-from scipy.sparse import diags_array, linalg
 
 import climatenerf
 from climatenerf.cli.render import parse_size
@@ -26,11 +24,9 @@ from climatenerf.render.completed_ground import CompletedField
 from climatenerf.render.ground_evidence import terrain_below
 from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.session import RenderSession
-from climatenerf.scene import terrain_fit
+from climatenerf.scene import Scene
 from climatenerf.scene.terrain import Terrain
 from climatenerf.weather.weather import Weather
-
-OWN = terrain_fit._conjugate_gradients
 
 
 def main() -> None:
@@ -62,12 +58,11 @@ def main() -> None:
         "cell_m": terrain.cell,
         "cameras": below_cameras(terrain, run.scene),
         "frames": frames(run, terrain, options),
-        "solver_s": solvers(options.repeats),
     }
     common.report("terrain and completed ground", results)
 
 
-def below_cameras(terrain: Terrain, scene: climatenerf.Scene) -> dict[str, float]:
+def below_cameras(terrain: Terrain, scene: Scene) -> dict[str, float]:
     """Return where ground is below the training photos' cameras, as fractions of the photos."""
     eyes = np.stack([scene.c2w_world(view)[:3, 3] for view in scene.of_split("train")])
     column, row = np.rint((eyes[:, :2] - terrain.origin) / terrain.cell).astype(int).T
@@ -101,29 +96,6 @@ def frames(run: Any, terrain: Terrain, options: argparse.Namespace) -> dict[str,
         "completed_fraction": completed,
         "seconds": {name: common.spread(values) for name, values in times.items()},
     }
-
-
-def solvers(repeats: int) -> dict[str, Any]:
-    """Time the spline through 20 000 heights with the program's solver and with SciPy's."""
-
-    def scipy(matrix: Any, target: np.ndarray, start: np.ndarray) -> np.ndarray:
-        scale: Any = diags_array(1 / matrix.diagonal())
-        steps = terrain_fit.STEPS
-        return linalg.cg(matrix, target, start, rtol=1e-9, maxiter=steps, M=scale)[0]
-
-    random = np.random.default_rng(0)
-    xy = random.uniform(-20, 20, (20_000, 2))
-    z = 0.05 * xy[:, 0] + 0.3 * np.sin(xy[:, 1] / 6) + random.normal(0, 0.02, len(xy))
-    heights = terrain_fit.Heights(np.c_[xy, z], np.full(len(xy), 0.02))
-    times: dict[str, list[float]] = {"own": [], "scipy": []}
-    for _ in range(repeats):
-        for name, solver in (("own", OWN), ("scipy", scipy)):
-            terrain_fit._conjugate_gradients = solver
-            start = time.perf_counter()
-            terrain_fit.fit_heights(heights, (-22.0, -22.0), 0.15, (294, 294))
-            times[name].append(time.perf_counter() - start)
-    terrain_fit._conjugate_gradients = OWN
-    return {name: common.spread(values) for name, values in times.items()}
 
 
 if __name__ == "__main__":

@@ -21,7 +21,8 @@ Matrix = Any
 
 COARSEST = 17  # nodes along the longer side, where the solution begins
 ROUNDS = 4  # of reweighted least squares on each raster
-STEPS = 40  # of conjugate gradients a round
+STEPS = 40  # of conjugate gradients a round, at most
+TOLERANCE = 1e-9  # of their residual, relative
 BENDING = 3.0  # weight of the squared second difference over 1 m, m^-2
 TENSION = 0.02  # weight of the squared slope; heights are forgotten over sqrt(BENDING/TENSION) m
 BEND_LIMIT = 0.05  # 1/m; curvature beyond it costs linearly: a kerb, a step, the edge of a bank
@@ -144,7 +145,8 @@ def _solve(data: _Cells, start: Float[np.ndarray, "r c"], cell: float) -> Float[
         if h.size <= DIRECT:
             h = linalg.spsolve(matrix.tocsc(), target)
         else:
-            h = _conjugate_gradients(matrix, target, h)
+            scale: Matrix = sparse.diags_array(1 / matrix.diagonal())  # Jacobi's preconditioner
+            h = linalg.cg(matrix, target, h, rtol=TOLERANCE, maxiter=STEPS, M=scale)[0]
     return h.reshape(start.shape)
 
 
@@ -175,36 +177,6 @@ def _differences(shape: tuple[int, ...], cell: float) -> tuple[Matrix, Matrix]:
     ]
     stacked: tuple[Matrix, Matrix] = sparse.vstack(bends), sparse.vstack(slopes)
     return stacked[0].tocsr(), stacked[1].tocsr()
-
-
-def _conjugate_gradients(
-    matrix: Matrix, target: Float[np.ndarray, "n"], start: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "n"]:
-    """Solve a symmetric positive system approximately, with Jacobi's preconditioner.
-
-    As `scipy.sparse.linalg.cg`, which is several times slower on busy cores
-    (`benchmarks/ground.py`): the threads of BLAS wait for each other in its inner products.
-    """
-    scale = 1 / matrix.diagonal()
-    x, residual = start.copy(), target - matrix @ start
-    direction = scale * residual
-    power = _dot(residual, direction)
-    for _ in range(STEPS):
-        if power <= 0:  # solved
-            break
-        image = matrix @ direction
-        step = power / _dot(direction, image)
-        x += step * direction
-        residual -= step * image
-        ahead = scale * residual
-        power, before = _dot(residual, ahead), power
-        direction = ahead + (power / before) * direction
-    return x
-
-
-def _dot(a: Float[np.ndarray, "n"], b: Float[np.ndarray, "n"]) -> float:
-    """Return the inner product without BLAS."""
-    return float((a * b).sum())
 
 
 def _standard_error(
