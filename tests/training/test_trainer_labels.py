@@ -204,6 +204,9 @@ def test_multiview_matches_on_the_ground_are_dropped(scene):
     assert trainer.evidence.depths[0] is points
     assert len(trainer.evidence.depths[1].depth) == pytest.approx(2000 - on_ground, abs=20)
     alone = make_trainer(pixels, extent, settings, None, matched)
+    assert alone.evidence.free_space.ground is not None, "matches alone show the ground as well"
+    unused = dataclasses.replace(settings, losses=Losses(ground_height=0.0))
+    alone = make_trainer(pixels, extent, unused, None, matched)
     assert alone.evidence.free_space.ground is None and alone.evidence.depths == (matched,)
 
 

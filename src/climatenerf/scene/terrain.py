@@ -27,7 +27,7 @@ MAX_LENGTH = 1e7  # m from the world's origin
 
 
 @dataclass(frozen=True)
-class Terrain:
+class HeightRaster:
     """Ground heights on a lattice; every array has one value a node."""
 
     origin: tuple[float, float]
@@ -38,17 +38,6 @@ class Terrain:
     """World z of the ground, m."""
     error: Float32[np.ndarray, "rows columns"]
     """Standard error of the height, m."""
-    label: UInt8[np.ndarray, "rows columns"]
-    """Road, terrain, or `UNKNOWN` where it is not seen."""
-    seen: Bool[np.ndarray, "rows columns"]
-    """Whether the field holds the ground."""
-    open: Bool[np.ndarray, "rows columns"]
-    """Where the field holds no ground although photos show the place, or the error is too large."""
-
-    @property
-    def completed(self) -> Bool[np.ndarray, "rows columns"]:
-        """Nodes at which the raster is the only evidence of ground."""
-        return ~(self.seen | self.open)
 
     def sample(
         self, values: Float[np.ndarray, "rows columns"], xy: Float[np.ndarray, "n 2"]
@@ -80,6 +69,23 @@ class Terrain:
         x = self.origin[0] + self.cell * np.arange(columns)
         y = self.origin[1] + self.cell * np.arange(rows)
         return np.stack([*np.meshgrid(x, y), self.height.astype(np.float64)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Terrain(HeightRaster):
+    """The ground of a run: heights with class and evidence."""
+
+    label: UInt8[np.ndarray, "rows columns"]
+    """Road, terrain, or `UNKNOWN` where it is not seen."""
+    seen: Bool[np.ndarray, "rows columns"]
+    """Whether the field holds the ground."""
+    open: Bool[np.ndarray, "rows columns"]
+    """Where the field holds no ground although photos show the place, or the error is too large."""
+
+    @property
+    def completed(self) -> Bool[np.ndarray, "rows columns"]:
+        """Nodes at which the raster is the only evidence of ground."""
+        return ~(self.seen | self.open)
 
 
 def nearest_known(

@@ -1,6 +1,6 @@
 """A smooth ground through uncertain heights: a robust tension spline on a raster.
 
-Minimises the data's Huber loss plus bending energy (thin plate) plus a little stretching energy
+Minimises a robust loss of the data plus bending energy (thin plate) plus a little stretching energy
 (membrane), which keeps the continuation beyond the data from tilting away (Smith & Wessel 1990,
 "Gridding with continuous curvature splines in tension"). Bending beyond a limit costs linearly, so
 kerbs, steps and banks stay. Solved from coarse to fine by conjugate gradients.
@@ -26,12 +26,16 @@ TOLERANCE = 1e-9  # of their residual, relative
 BENDING = 3.0  # weight of the squared second difference over 1 m, m^-2
 TENSION = 0.02  # weight of the squared slope; heights are forgotten over sqrt(BENDING/TENSION) m
 BEND_LIMIT = 0.05  # 1/m; curvature beyond it costs linearly: a kerb, a step, the edge of a bank
-OUTLIER = 2.0  # standard errors beyond which a height costs linearly
+OUTLIER = 2.0  # standard errors beyond which a height is an outlier
+BELOW = 0.5  # factor of a squared outlier below the surface, which is rarer than one above
+FINE = 1.2  # m; cells from which on outliers cost their logarithm
 MAX_COUNT = 8.0  # heights in one of the finest cells that count as independent
 GROWTH = 0.04  # m of standard error a metre away from the nearest height, on level ground
 MIN_ERROR = 0.01  # m
+MIN_TRUST = 0.1  # of a height; below it, it is an outlier and shows nothing of the ground
+SPREAD = 1.6  # standard errors in the mean distance of trusted heights from the ground
 MAX_RESIDUAL = 0.3  # m; larger ones are errors of the data, not of the ground
-DATA_AREA = 1e-3  # m^4; a height of standard error s weighs this over s^2 against the energies
+DATA_AREA = 2e-3  # m^4; a height of standard error s weighs this over s^2 against the energies
 DIRECT = 6000  # nodes up to which systems are solved directly
 
 
@@ -43,6 +47,12 @@ class Heights:
     """Positions, world m."""
     error: Float[np.ndarray, "n"]
     """Standard error of each height, m."""
+
+    def with_more(self, others: "Heights") -> "Heights":
+        """Return these heights and others."""
+        return Heights(
+            np.concatenate([self.x, others.x]), np.concatenate([self.error, others.error])
+        )
 
 
 def fit_heights(
@@ -66,8 +76,8 @@ def fit_heights(
     middle = float(np.median(heights.x[:, 2]))
     while True:
         size = tuple(-(-(n - 1) // factor) + 1 for n in shape)
-        data = _binned(heights, origin, cell * factor, size, middle, MAX_COUNT * factor**2)
         start = np.zeros(size) if solution is None else _enlarged(solution, size)
+        data = _binned(heights, origin, cell * factor, start, middle, MAX_COUNT * factor**2)
         solution = _solve(data, start, cell * factor)
         if factor == 1:
             break
@@ -92,18 +102,23 @@ def _binned(
     heights: Heights,
     origin: tuple[float, float],
     cell: float,
-    size: tuple[int, ...],
+    trend: Float[np.ndarray, "r c"],
     middle: float,
     most: float,
 ) -> _Cells:
     """Return the median height around each node, relative to `middle`.
 
-    At most `most` heights of a node count as independent.
+    Heights are moved to their node along a trend, else the median of a steep cell is biased by
+    where its heights lie. At most `most` heights of a node count as independent.
     """
-    at = np.rint((heights.x[:, :2] - np.array(origin)) / cell).astype(np.int64)
-    inside = ((at >= 0) & (at < (size[1], size[0]))).all(-1)
-    row = at[inside, 1] * size[1] + at[inside, 0]
-    z, error = heights.x[inside, 2] - middle, heights.error[inside]
+    exact = (heights.x[:, :2] - np.array(origin)) / cell
+    at = np.rint(exact).astype(np.int64)
+    rows, columns = trend.shape
+    inside = ((at >= 0) & (at < (columns, rows))).all(-1)
+    exact, (column, row) = exact[inside], at[inside].T
+    here = ndimage.map_coordinates(trend, exact.T[::-1], order=1, mode="nearest")
+    z = heights.x[inside, 2] - middle - here + trend[row, column]
+    row, error = row * columns + column, heights.error[inside]
     order = np.lexsort((z, row))
     row, z, weight = row[order], z[order], 1 / error[order] ** 2
     nodes, start, count = np.unique(row, return_index=True, return_counts=True)
@@ -127,14 +142,20 @@ def _enlarged(
 
 
 def _solve(data: _Cells, start: Float[np.ndarray, "r c"], cell: float) -> Float[np.ndarray, "r c"]:
-    """Minimise on one raster, from a start, by reweighted least squares."""
+    """Minimise on one raster, from a start, by reweighted least squares.
+
+    Outliers cost linearly (Huber). On fine rasters they then cost only their logarithm (Cauchy),
+    and heights above the surface less than those below: leaves and walls labelled ground stand on
+    it, and would lift it.
+    """
     bends, slopes = _differences(start.shape, cell)
     area = cell**2
     stretching = TENSION * area * (slopes.T @ slopes)
     h: Any = start.reshape(-1)
-    for _ in range(ROUNDS):
-        residual = np.abs(h[data.row] - data.z) * np.sqrt(data.weight)
-        trust = data.weight / np.maximum(residual / OUTLIER, 1)
+    for k in range(ROUNDS):
+        residual = (data.z - h[data.row]) * np.sqrt(data.weight) / OUTLIER
+        cauchy = 1 + np.where(residual > 0, 1, BELOW) * residual**2
+        trust = data.weight / (cauchy if k and cell < FINE else np.maximum(np.abs(residual), 1))
         curvature = np.abs(bends @ h)
         stiffness: Any = BENDING * area / np.maximum(curvature / BEND_LIMIT, 1)
         matrix: Matrix = (bends.T @ sparse.diags_array(stiffness) @ bends + stretching).tocsr()
@@ -184,25 +205,27 @@ def _standard_error(
 ) -> Float[np.ndarray, "r c"]:
     """Return the error of the heights: the data's spread near by, growing away from the data.
 
+    Outliers count as little as in the fit.
+
     On a slope it grows faster, since tension forgets the slope: at a distance x from the data,
     x^2 / 2 over the length of forgetting is missing for each unit of slope.
     """
-    known = np.zeros(solution.size, bool)
-    known[data.row] = True
-    known = known.reshape(solution.shape)
-    residual = np.zeros(solution.size)
-    residual[data.row] = np.minimum(np.abs(solution.reshape(-1)[data.row] - data.z), MAX_RESIDUAL)
+    off = np.abs(solution.reshape(-1)[data.row] - data.z)
+    trust, residual = np.zeros(solution.size), np.zeros(solution.size)
+    trust[data.row] = 1 / (1 + (off * np.sqrt(data.weight) / OUTLIER) ** 2)
+    residual[data.row] = trust[data.row] * np.minimum(off, MAX_RESIDUAL)
+    known = (trust >= min(MIN_TRUST, trust.max())).reshape(solution.shape)
     radius = max(round(1.0 / cell), 1)  # nodes; a metre
     share, mean, uphill, across = (
         ndimage.uniform_filter(each.astype(float), 2 * radius + 1, mode=mode)
         for each, mode in (
-            (known, "constant"),
+            (trust.reshape(solution.shape), "constant"),
             (residual.reshape(solution.shape), "constant"),
             *((slope, "nearest") for slope in np.gradient(solution, cell)),
         )
     )
     distance, nearest = nearest_known(known, cell)
-    spread = (mean / np.maximum(share, 1e-9))[nearest]  # at data the share is above 0
+    spread = (mean / np.maximum(share, 1e-9))[nearest]  # at data the trust is above 0
     growth = GROWTH * distance
     forgotten = np.hypot(uphill, across)[nearest] * distance**2 / (2 * np.sqrt(BENDING / TENSION))
-    return np.sqrt(np.maximum(1.25 * spread, MIN_ERROR) ** 2 + growth**2 + forgotten**2)
+    return np.sqrt(np.maximum(SPREAD * spread, MIN_ERROR) ** 2 + growth**2 + forgotten**2)

@@ -396,3 +396,8 @@ def sky_edge(label: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         ]
         near.append(np.any(shifted, axis=0))
     return (sky | other) & near[0] & near[1]
+
+
+def is_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Return which merged classes are ground."""
+    return torch.stack([label == kind for kind in GROUND]).any(0)

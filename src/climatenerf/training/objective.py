@@ -20,8 +20,7 @@ from climatenerf.field.density_slope import finite_difference_normal
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import compositing
 from climatenerf.training import losses
-from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels
-from climatenerf.training.evidence.free_space import is_ground
+from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels, is_ground
 from climatenerf.training.evidence.gather import Evidence
 from climatenerf.training.evidence.monocular_depth import DepthAlignment
 from climatenerf.training.rendered_rays import RenderedRays, VisibleSamples

@@ -15,19 +15,22 @@ margin of one cell: at first a trunk is haze wider than the trunk. Once the fiel
 own classes, density in that margin that it classifies as ground is penalised too.
 """
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from climatenerf.core.classes import GROUND, SOLID
-from climatenerf.core.device import to_device
+from climatenerf.core.classes import SOLID
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.hash_field import Field
 from climatenerf.field.occupancy import dilated
 from climatenerf.ops import reference
-from climatenerf.training.dataset import TrainingPixels
+from climatenerf.scene.terrain_fit import Heights
+from climatenerf.training.dataset import TrainingPixels, is_ground
 from climatenerf.training.evidence.frusta import intersects_frustum, within_camera_range
-from climatenerf.training.evidence.ground_height import fit_ground_height
-from climatenerf.training.evidence.sparse_depth import SparseDepth
+from climatenerf.training.evidence.ground_height import GroundHeight, fit_ground_height
+from climatenerf.training.evidence.ground_sweep import ground_pictures
+from climatenerf.training.evidence.sparse_depth import SparseDepth, concatenate
 from climatenerf.training.settings import FitSettings
 from climatenerf.training.static_shapes import Buffers
 
@@ -35,6 +38,8 @@ CHUNK = 2**18  # cells looked up at once, to bound the memory of their centres
 SAME_POINT = 1e-4  # grid units within which two measurements are of one point
 STEP = 0.05  # grid units along a ray over which its approach to the ground is measured
 MIN_APPROACH = 0.02  # descent over distance; flatter rays give no position, at worst 0/0
+SURFACE_ERROR = 0.02  # m, of the height of a measured point of the ground
+DEPTH_ERROR = 0.01  # of its ray length
 MIN_POINTS = 20  # of a photo, for its camera's clearance
 NEAR_QUANTILE = 0.02  # of the distances of a photo's points: the nearest, without outliers
 CLEARANCE_FACTOR = 0.8  # of that distance; matter closer to the camera would show points
@@ -49,6 +54,7 @@ class FreeSpace:
         pixels: TrainingPixels,
         sparse: SparseDepth | None,
         settings: FitSettings,
+        matched: SparseDepth | None = None,
     ):
         """Fit the ground and force the first cells empty.
 
@@ -57,11 +63,12 @@ class FreeSpace:
             pixels: The training photos, with label hulls if there are labels.
             sparse: Sparse depth of those photos.
             settings: `free_space` switches forced empty cells, `losses.ground_height` the ground.
+            matched: depths from multi-view stereo, which show the ground as well.
         """
-        self.field, self.pixels, self.sparse = field, pixels, sparse
+        self.field, self.pixels, self.sparse, self.matched = field, pixels, sparse, matched
         self.enabled, self.poses_move = settings.free_space, settings.refine_poses
         self.class_of_logit = to_device(SOLID, field.centre.device)
-        self.uses_ground = settings.losses.ground_height > 0 and sparse is not None
+        self.uses_ground = settings.losses.ground_height > 0
         self.fit_ground()
         self.force_empty()
 
@@ -73,16 +80,33 @@ class FreeSpace:
         """
         q = self.field.centre.new_zeros(0, 3)
         self.ground, self.step_points, on_ground = None, q, q.new_zeros(0, dtype=torch.bool)
+        if self.uses_ground:
+            self.ground = self.find_ground()
         if self.uses_ground and self.sparse is not None:
             q, on_ground = self.classify_points(self.sparse)
-            self.ground = fit_ground_height(q[on_ground])
         if self.ground is not None:
             # Steps and banks must not be flattened.
             height = self.ground.height_above(q)[0]
-            is_step = on_ground & (height.abs() > self.ground.tolerance)
+            is_step = on_ground & (height.abs() > self.ground.tolerance_at(q))
             self.step_points, on_ground = q[is_step], on_ground & ~is_step
         self.obstacle_points = q[~on_ground]
         self.obstacle_hull = None
+
+    def find_ground(self) -> GroundHeight | None:
+        """Fit the ground height to measured points on rays labelled ground, and to the photos."""
+        kinds = [each for each in (self.sparse, self.matched) if each is not None]
+        if not kinds:
+            return None
+        rays = concatenate(kinds)
+        rays = rays.select(is_ground(self.pixels.label_towards(rays.image, rays.rays_d)))
+        t, slope = (to_numpy(each).astype(np.float64) for each in (rays.depth, rays.rays_d[:, 2]))
+        heights = Heights(
+            to_numpy(rays.points).astype(np.float64),
+            np.hypot(SURFACE_ERROR, DEPTH_ERROR * t * np.abs(slope)),
+        )
+        centre = to_numpy(self.field.centre).astype(np.float64)
+        unit, device = self.field.unit, self.field.centre.device
+        return fit_ground_height(heights, centre, unit, ground_pictures(self.pixels), device)
 
     def classify_points(
         self, sparse: SparseDepth
@@ -151,7 +175,8 @@ class FreeSpace:
         near = within_camera_range(x, radius, self.pixels.frusta, centres, clearance)
         if self.ground is not None:
             height, valid = self.ground.height_above(self.field.to_grid(x))
-            near &= ~valid | (height > radius / self.field.unit + self.ground.tolerance)
+            tolerance = self.ground.tolerance_at(self.field.to_grid(x))
+            near &= ~valid | (height > radius / self.field.unit + tolerance)
         return near
 
     def rasterise_points(self) -> None:
@@ -248,7 +273,7 @@ class FreeSpace:
         height, valid = self.ground.height_above(q)
         height_ahead, _ = self.ground.height_above(q + STEP * rays_d)
         approach = (height - height_ahead) / STEP
-        excess = height.sign() * (height.abs() - self.ground.tolerance).clamp_min(0.0)
+        excess = height.sign() * (height.abs() - self.ground.tolerance_at(q)).clamp_min(0.0)
         off = buffers.indices("off ground", valid & (approach > MIN_APPROACH) & (excess != 0))
         cells, _ = self.field.occupancy.cell_index(q[off])
         penalised = torch.zeros_like(off, dtype=torch.bool)
@@ -265,8 +290,3 @@ class FreeSpace:
         """Return where the field's own classes at q (grid units) are ground."""
         _, logits = self.field.surface_at(reference.contract(q))
         return is_ground(self.class_of_logit[logits.argmax(-1)])
-
-
-def is_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
-    """Return which merged classes are ground."""
-    return torch.stack([label == kind for kind in GROUND]).any(0)

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from climatenerf.core.classes import SOLID_OF, UNKNOWN
 from climatenerf.field.hash_field import Field
-from climatenerf.training.dataset import TrainingPixels
-from climatenerf.training.evidence.free_space import FreeSpace, is_ground
+from climatenerf.training.dataset import TrainingPixels, is_ground
+from climatenerf.training.evidence.free_space import FreeSpace
 from climatenerf.training.evidence.sky_prior import SkyPrior, fit_sky_prior
 from climatenerf.training.evidence.sparse_depth import SparseDepth
 from climatenerf.training.settings import FitSettings
@@ -54,7 +54,7 @@ def gather_evidence(
         matched: rays with depths from multi-view stereo, some of them wrong.
     """
     sky_prior = fit_sky_prior(pixels, generator)
-    free_space = FreeSpace(field, pixels, points, settings)
+    free_space = FreeSpace(field, pixels, points, settings, matched)
     if matched is not None and free_space.ground is not None:
         # On the ground the map is better: matched windows mix fences with the lawns behind.
         label = pixels.label_towards(matched.image, matched.rays_d)

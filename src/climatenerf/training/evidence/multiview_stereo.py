@@ -248,20 +248,38 @@ def undistorted_grey(
     grey = rgb.astype(np.float32) @ np.array(LUMA, np.float32)
     if usable is not None:
         grey[~usable] = np.nan
+    return _to_levels(undistorted(camera, grey, device))
+
+
+def undistorted(
+    camera: Camera,
+    values: Float32[np.ndarray, "hw"],
+    device: torch.device = CPU,
+    mode: str = "bilinear",
+) -> Float32[np.ndarray, "h w"]:
+    """Resample a picture to a pinhole camera of the same size and intrinsics; NaN outside it.
+
+    Args:
+        camera: Of the picture.
+        values: Of its pixels, row by row.
+        device: Where it is resampled.
+        mode: "bilinear" or "nearest".
+    """
     if not camera.distorted:
-        return _to_levels(grey).reshape(camera.height, camera.width)
+        return values.reshape(camera.height, camera.width)
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     d = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
     pixel = to_device(camera.project(d).astype(np.float32), device)
     size = torch.tensor([camera.width, camera.height], device=device)
     resampled = torch.nn.functional.grid_sample(
-        to_device(grey, device).view(1, 1, camera.height, camera.width),
+        to_device(values, device).view(1, 1, camera.height, camera.width),
         (2 * pixel / size - 1).nan_to_num(9.0)[None],
+        mode=mode,
         align_corners=False,
         padding_mode="border",
     )
     outside = ~((pixel >= 0) & (pixel < size)).all(-1)
-    return _to_levels(to_numpy(resampled[0, 0].masked_fill(outside, torch.nan)))
+    return to_numpy(resampled[0, 0].masked_fill(outside, torch.nan))
 
 
 def _to_levels(grey: Float32[np.ndarray, "*n"]) -> UInt8[np.ndarray, "*n"]:
