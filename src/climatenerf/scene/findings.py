@@ -36,17 +36,19 @@ CODES: dict[str, str] = {
     "focal-disagrees": "Matches between photos agree with another focal length.",
     "focal-exif": "The focal length disagrees with that in the photos' EXIF records.",
     "principal-point": "The principal point is far from the middle of the picture.",
+    "distortion-disagrees": "Photos show their points without the given lens distortion.",
     "distortion-fold": "The lens distortion cannot be inverted everywhere in the picture.",
     # Poses.
     "pose-outlier": "A camera is very far from the others; it is left out.",
     "pose-duplicate": "Several photos have the same pose.",
     "pose-no-baseline": "All cameras are at one position, so depth cannot be found.",
     "pose-axes": "The poses have the axes of another convention; converted.",
-    "pose-disagrees": "The pose of a photo contradicts the points that were seen in it.",
+    "pose-disagrees": "The pose of a photo contradicts its own points, or its matches with others.",
     "matches-few": "Too few matches between photos to check the poses.",
     "matches-disagree": "Matches between neighbouring photos contradict their poses.",
     # Points.
     "points-outside": "Most sparse points lie in no picture.",
+    "points-disagree": "Photos do not look alike where the sparse points lie in them.",
     "points-frame": "The sparse points are in another frame than the poses; transformed.",
     # Depths, masks, labels.
     "depth-empty": "Depth files hold no known depth.",
