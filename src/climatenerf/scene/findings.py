@@ -60,8 +60,9 @@ CODES: dict[str, str] = {
     "mask-hides-all": "Masks hide all of their photos.",
     "mask-hides-nothing": "Masks hide nothing.",
     "mask-inverted": "Masks hide what the capture's points were found on.",
+    "labels-empty": "Label files hold no known class.",
     "labels-foreign": "Label files hold ids that their numbering does not define.",
-    "labels-disagree": "Labels contradict the sparse points: points lie on the sky.",
+    "labels-disagree": "Labels contradict the sparse points, up or each other.",
     # World frame and scale.
     "ground-missing": "No ground was found below the cameras; its height is assumed.",
     "origin-moved": "The world's origin is moved near the cameras.",

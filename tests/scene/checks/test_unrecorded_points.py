@@ -1,6 +1,7 @@
 """Photos, poses and points of captures that do not record which photos show a point."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from climatenerf.scene.checks.appearance import appearance_findings
 from climatenerf.scene.checks.check import corrected
 from climatenerf.scene.checks.matching import matching_findings, suspects
 from climatenerf.scene.checks.visibility import visible, with_visible_points
+from climatenerf.scene.scene import View
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +78,8 @@ def test_a_camera_that_stands_elsewhere_is_named(even):
 def test_two_cameras_with_names_in_turn_are_no_suspects():
     eyes = [(0.1 * i, 2.0 * (i % 2), 1.6) for i in range(20)]
     poses = [look_at(eye, (eye[0], 9.0 - 18 * (i % 2), 1.0)) for i, eye in enumerate(eyes)]
-    scene_views = [type("V", (), {"c2w": pose})() for pose in poses]
-    assert suspects(scene_views) == []
+    views = [View(f"{i:02}.png", Path(f"{i:02}.png"), 0, pose) for i, pose in enumerate(poses)]
+    assert suspects(views) == []
 
 
 def test_points_in_another_scale_are_told_from_wrong_poses(scene):
@@ -126,4 +128,5 @@ def test_points_behind_nearer_ones_are_hidden():
 def test_rows_refer_to_all_points(scene):
     many = np.repeat(scene.points, 10, axis=0)  # more than are projected
     found = with_visible_points(replace(scene, points=many), [3])
-    assert found.views[3].seen.max() > len(scene.points) and found.views[4].seen is None
+    seen = found.views[3].seen
+    assert seen is not None and seen.max() > len(scene.points) and found.views[4].seen is None

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError, explain
 from climatenerf.core.listing import visible
+from climatenerf.core.regular_files import check_regular
 from climatenerf.core.rotations import rotation_matrices
 from climatenerf.core.text import decode, lines_of, read_text
 from climatenerf.scene.file_names import FileNames
@@ -259,6 +260,7 @@ class _Cursor:
     def __init__(self, path: Path):
         self.path = path
         try:
+            check_regular(path)
             self.data = path.read_bytes()
         except OSError as error:
             raise explain(error, path) from None
