@@ -47,6 +47,7 @@ CODES: dict[str, str] = {
     "matches-few": "Too few matches between photos to check the poses.",
     "matches-disagree": "Matches between neighbouring photos contradict their poses.",
     # Points.
+    "points-missing": "Images of a COLMAP model show points that it lacks.",
     "points-outside": "Most sparse points lie in no picture.",
     "points-disagree": "Photos do not look alike where the sparse points lie in them.",
     "points-frame": "The sparse points are in another frame than the poses; transformed.",

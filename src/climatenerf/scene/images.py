@@ -327,7 +327,8 @@ def read_depth(path: Path, scale: float = MILLIMETRES) -> Float[np.ndarray, "h w
         raise _array_error("depth", path, error) from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
         depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
-    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.number) or not depth.size:
+    real = np.issubdtype(depth.dtype, np.number) and not np.iscomplexobj(depth)
+    if depth.ndim != 2 or not real or not depth.size:
         raise UserError(
             f"The depth {path} is not an array of numbers of shape height x width; replace it."
         )

@@ -42,6 +42,8 @@ ALONG_RAY = 1 / CAMERA.directions()[..., 2]
         (lambda depth: depth * 1.1, []),  # a network's metres
         (lambda depth: depth * 1000, ["depth-unit"]),
         (lambda depth: depth / 1000, ["depth-unit"]),
+        (lambda depth: depth * 1.5, []),  # worse metres of a network
+        (lambda depth: depth * 3.281, ["depth-unit"]),
         (lambda depth: depth * ALONG_RAY, ["depth-ray-length"]),
         (lambda depth: 3 / depth, ["depth-inverse"]),
         (lambda depth: depth * (1 + 0.7 * np.sin(np.arange(320) / 9)), ["depth-disagrees"]),
@@ -215,3 +217,22 @@ def test_labels_of_other_photos_are_found(tmp_path):
     assert by_place(yard, 0) == []
     (finding,) = by_place(yard, 7)
     assert finding.code == "labels-disagree" and "other photos" in finding.message
+
+
+@pytest.mark.parametrize(
+    ("in_a_metre", "named"),
+    [(1000, None), (100, "centimetres"), (256, "KITTI"), (5000, "TUM")],
+)
+def test_the_unit_of_integer_depths_is_named(scene, tmp_path, in_a_metre, named):
+    def integers(view):
+        return np.minimum(in_a_metre * depth_of(view.c2w), 65535).astype(np.uint16)
+
+    found = depth_findings(with_files(scene, tmp_path, "depth_path", integers, ".png"))
+    units = [str(each) for each in found if each.code == "depth-unit"]
+    assert [named in each for each in units] == ([] if named is None else [True])
+
+
+def test_depths_may_differ_as_much_as_the_scale_is_uncertain(scene, tmp_path):
+    given = with_files(scene, tmp_path, "depth_path", lambda view: 2.2 * depth_of(view.c2w))
+    assert codes(depth_findings(given)) == ["depth-unit"]
+    assert depth_findings(replace(given, scale_error=0.5)) == []

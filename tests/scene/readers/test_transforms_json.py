@@ -318,3 +318,22 @@ def test_a_truth_value_is_no_number(tmp_path):
     write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **intrinsics)
     with pytest.raises(UserError, match="fl_x in .* is not a number"):
         read_transforms(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("of_file", "of_frames", "told"),
+    [
+        ({"depth_unit_scale_factor": 0.001, "integer_depth_scale": 0.001}, {}, None),
+        ({"depth_unit_scale_factor": 0.001, "integer_depth_scale": 0.01}, {}, "contradicts"),
+        ({}, {"depth_unit_scale_factor": 0.01}, "of single frames (3 times)"),
+        ({"depth_unit_scale_factor": 0.01}, {"depth_unit_scale_factor": 0.01}, None),
+    ],
+)
+def test_units_of_depth_that_are_not_used_are_told(tmp_path, of_file, of_frames, told):
+    write_images(tmp_path, images_of(3))
+    write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **NERFSTUDIO, **of_file)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    data["frames"] = [{**frame, **of_frames} for frame in data["frames"]]
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    found = read_transforms(tmp_path).findings
+    assert [told in each.message for each in found] == ([] if told is None else [True])

@@ -26,8 +26,19 @@ SIMILAR_FOLDERS = {
     "depth": ("depths",),
 }
 """Names of folders that other programs give to what is read from each folder."""
-UNIT_FACTORS = (1000.0, 100.0, 39.37, 3.281, 1 / 3.281, 1 / 39.37, 0.01, 0.001)
-UNIT_TOLERANCE = 1.25  # of the scale; that of an assumed camera height is known to 30 %
+UNITS = {
+    1.0: "metres",
+    1000.0: "millimetres",
+    100.0: "centimetres",
+    39.37: "inches",
+    3.281: "feet",
+    0.001: "kilometres",
+    256.0: "1/256 m, as in KITTI",
+    5000.0: "1/5000 m, as in TUM RGB-D",
+    10000.0: "tenths of a millimetre",
+}
+"""Names of the units of depth files, by their number in a metre."""
+MIN_UNIT_RATIO = 2.0  # between depths and points; metres of a network are up to 1.5 times wrong
 MIN_HIDDEN_POINTS = 0.8  # fraction of points hidden by masks that are inverted
 MAX_DENSER = 2.0  # density of points on what masks show, over the mean; an object has more
 
@@ -133,17 +144,22 @@ def _kind_of_depth(
         yield Finding("depth-disagrees", message, remedy)
         return
     times = float(np.exp(np.median(ratio)))
-    # A wrong scale of the scene differs less than two units of length do.
-    tolerance = UNIT_TOLERANCE if scene.scale_error < 0.1 else 2.0
-    for factor in UNIT_FACTORS:
-        if max(times / factor, factor / times) < tolerance and abs(np.log(factor)) > 3:
-            message = (
-                f"The depth files are {times:.4g} times the depths in metres"
-                f" (scale from {scene.scale_source}), as if in another unit"
-            )
-            remedy = "convert NPY and NPZ to metres; give the scale of PNG in transforms.json"
-            yield Finding("depth-unit", message, remedy)
-            return
+    # The error of the scale is one standard deviation.
+    if max(times, 1 / times) < max(MIN_UNIT_RATIO, (1 + scene.scale_error) ** 2):
+        return
+    path = next(view.depth_path for view in scene.views if view.depth_path is not None)
+    in_a_metre = times / (scene.depth_scale if path.suffix == ".png" else 1.0)
+    unit = min(UNITS, key=lambda number: abs(np.log(in_a_metre / number)))
+    message = (
+        f"The depth files are {times:.3g} times the depths of the sparse points in metres (scale"
+        f" from {scene.scale_source}, +-{scene.scale_error:.0%}), as if one metre had"
+        f" {in_a_metre:.3g} units of theirs ({UNITS[unit]} are nearest)"
+    )
+    remedy = (
+        "convert NPY and NPZ to metres, give the scale of PNG in transforms.json, or give the scale"
+        " of the scene if that is wrong"
+    )
+    yield Finding("depth-unit", message, remedy)
 
 
 def _spread(values: Float[np.ndarray, " n"]) -> float:

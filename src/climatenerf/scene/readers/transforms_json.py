@@ -88,6 +88,7 @@ def read_transforms(root: Path) -> Capture:
             view = _view(frame, data, files_below, path, cameras)
             absent += _absent_depth(frame, view, files_below)
             absent += _count_unread(frame, files_below, unread)
+            _count_frame_scales(frame, data, unread)
             key = normalised(frame["file_path"])
             key = respelled.get(folded(key), key)
             held_out = key in heldout or name in SPLIT_FILES[1:]
@@ -97,8 +98,11 @@ def read_transforms(root: Path) -> Capture:
                 unlisted += 1
         absent += _count_unread(data, files_below, unread)
         depth_scale = _depth_scale(data, str(path)) or depth_scale
+        if len({data[key] for key in _DEPTH_SCALES if data.get(key) is not None}) > 1:
+            unread[f"{_DEPTH_SCALES[1]}, which contradicts {_DEPTH_SCALES[0]}"] = 1
         transforms += _point_transforms(data)
-        if isinstance(cloud := data.get("ply_file_path"), str):
+        cloud = data.get("ply_file_path")
+        if isinstance(cloud, str):
             if (file := files_below.find(cloud)) is not None:
                 points = read_points(file)
             elif cloud not in files_below.ambiguous:
@@ -168,15 +172,32 @@ def _count_unread(table: dict[str, Any], files: FileNames, unread: dict[str, int
     for key, value in table.items():
         if key in _UNREAD_NUMBERS:
             found = isinstance(value, int | float) and bool(value)
-        elif key in _READ_PATHS and value is not None and not isinstance(value, str):
-            key, found = f"{key} that is no text", True
-        elif key in _READ_PATHS or not _names_a_file(key, value):
+        elif key in _READ_PATHS:
+            found = not isinstance(value, str | None)
+            key = f"{key} that is no text"
+        elif not _names_a_file(key, value):
             continue
         elif not (found := files.find(value) is not None) and value not in files.ambiguous:
             absent += [] if _is_folder(files.folder / normalised(value)) else [value]
         if found:
             unread[key] = unread.get(key, 0) + 1
     return absent
+
+
+def _count_frame_scales(
+    frame: dict[str, Any], data: dict[str, Any], unread: dict[str, int]
+) -> None:
+    """Count the units of depth files that a frame has for itself and that differ from the file's.
+
+    Args:
+        frame: A frame.
+        data: The whole file.
+        unread: Gets the counts.
+    """
+    for key in _DEPTH_SCALES:
+        if frame.get(key) is not None and frame[key] != data.get(key):
+            name = f"{key} of single frames"
+            unread[name] = unread.get(name, 0) + 1
 
 
 def _names_a_file(key: str, value: Any) -> bool:
