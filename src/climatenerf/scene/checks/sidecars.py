@@ -153,7 +153,7 @@ def _kind_of_depth(
     message = (
         f"The depth files are {times:.3g} times the depths of the sparse points in metres (scale"
         f" from {scene.scale_source}, +-{scene.scale_error:.0%}), as if one metre had"
-        f" {in_a_metre:.3g} units of theirs ({UNITS[unit]} are nearest)"
+        f" {in_a_metre:.4g} units of theirs (nearest: {UNITS[unit]})"
     )
     remedy = (
         "convert NPY and NPZ to metres, give the scale of PNG in transforms.json, or give the scale"
