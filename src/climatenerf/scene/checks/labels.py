@@ -22,7 +22,8 @@ SEVEN_SKY_AREA = 0.05  # least area of what is sky in the numbering `seven`
 SEVEN_SKY_POINTS = 0.25  # points on it, over those of its area
 MAX_POINTS = 1000  # of a view whose labels are compared between views
 MIN_PAIRS = 500  # of labels of one point in two views
-BETTER = 0.05  # agreement beyond chance that the labels of other photos must gain
+MIN_AGREEMENT = 0.5  # beyond chance; right labels of noisy networks have that at least
+BETTER = 0.1  # agreement beyond chance that the labels of other photos must gain
 
 
 def label_findings(scene: Scene) -> list[Finding]:
@@ -139,10 +140,13 @@ def _of_other_photos(
         found = np.concatenate(
             [labels[row, column] for labels, (_, row, column) in zip(moved, at, strict=True)]
         )[order][by_point]
-        same = float((found[1:] == found[:-1])[pair].mean())
-        chance = float(((np.bincount(found) / len(found)) ** 2).sum())
+        known = pair & (found[1:] != UNKNOWN) & (found[:-1] != UNKNOWN)
+        if known.sum() < MIN_PAIRS:  # labels of few things alone tell nothing
+            return False
+        same = float((found[1:] == found[:-1])[known].mean())
+        chance = float(((np.bincount(found[1:][known]) / known.sum()) ** 2).sum())
         agreement.append((same - chance) / max(1 - chance, 1e-3))
-    return max(agreement) > agreement[0] + BETTER
+    return max(agreement) > max(agreement[0] + BETTER, MIN_AGREEMENT)
 
 
 def _every(at: Projected, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
