@@ -21,6 +21,9 @@ RENDER = ("render", "run", "-o", "out")
         (("fit",), "missing from climatenerf fit: PATH, -o PATH, --out PATH; see"),
         (("fit", "a", "-o", "b", "--preset", "x"), "invalid choice 'x' for argument '--preset'"),
         (("fit", "a", "-o", "b", "--minutes", "x"), "--minutes must be a number; got 'x'"),
+        ((*RENDER, "--layers", "depth", "--layer-format"), "--layer-format names no format"),
+        (("export", "a", "-o", "b", "--format"), "--format names no format; give transforms"),
+        (("check", ""), "a path is empty; name it"),
         ((*RENDER, "--size"), "missing value for argument '--size'"),
     ],
 )  # fmt: skip

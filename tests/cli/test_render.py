@@ -13,6 +13,7 @@ from PIL import Image
 from support.command_line import STREET, error_message, run_cli
 
 from climatenerf import cli
+from climatenerf.api import load_run
 from climatenerf.core.storage import read_safetensors, write_safetensors
 from climatenerf.field.checkpoint import load_field, save_field
 from climatenerf.output.job import appearance_index
@@ -83,6 +84,14 @@ def test_a_render_overwrites_no_foreign_file(run_folder, tmp_path, capsys, name)
     assert mine.name in error_message(capsys, *args)
     assert mine.read_bytes() == b'{"mine": 1}'
     assert [p for p in (tmp_path / "mine").rglob("*") if p.is_file()] == [mine]
+
+
+def test_frames_go_neither_into_the_run_nor_among_photos(run_folder, capsys):
+    run = load_run(run_folder)
+    for out in (run_folder, run.scene.views[0].path.parent):
+        before = sorted(out.iterdir())
+        assert "name another" in error_message(capsys, "render", run_folder, "-o", out)
+        assert sorted(out.iterdir()) == before
 
 
 def test_a_preview_changes_no_frame_and_is_removed(run_folder, tmp_path):

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 
+import numpy as np
 import pytest
 from support.command_line import error_message, run_cli
 
@@ -117,3 +118,17 @@ def test_the_table_is_aligned():
     lines = verify.table([GOOD, BAD]).splitlines()
     assert lines[0].index("figure") == lines[1].index("0.25 %") == lines[2].index("0.02")
     assert lines[0].index("what") == lines[1].index("contrast") == lines[2].index("water")
+
+
+def test_only_pixels_with_a_single_surface_are_judged(run_folder):
+    """Fog has no depth at which the formula of smog could be evaluated."""
+    field, scene = load_field(run_folder), load_scene(run_folder)
+    camera = scene.cameras[0].resized(24, 16)
+    viewpoint = Viewpoint(camera, scene.views[0].c2w)
+    none = own_run.single_surface(field, viewpoint, 0.0)
+    some = own_run.single_surface(field, viewpoint, 100.0)
+    assert none.shape == some.shape == (16, 24) and not none.any() and some.any()
+    dried = [np.full((16, 24), 1.0), np.zeros((16, 24))]
+    assert own_run.nested(dried, some).figure == some.sum()
+    fog = own_run.nested(dried, none)
+    assert fog.verdict == "info" and math.isnan(fog.figure)

@@ -76,3 +76,13 @@ def test_what_is_no_file_is_not_found_under_another_spelling(tmp_path):
     files = FileNames(tmp_path)
     assert files.find("pipe.jpg") is None and files.find("loop.jpg") is None
     assert codes(files) == []
+
+
+def test_several_pictures_of_a_name_without_suffix_are_told(tmp_path):
+    touch(tmp_path, "a.jpg", "a.png", "b.jpg")
+    os.link(tmp_path / "b.jpg", tmp_path / "b.JPG")  # one file, as on disks that ignore case
+    files = FileNames(tmp_path)
+    files.note_alternatives("a", ["a.png", "a.jpg", "a.heic"])
+    files.note_alternatives("b", ["b.jpg", "b.JPG"])
+    (finding,) = files.findings()
+    assert finding.code == "name-ambiguous" and "'a' matches a.png, a.jpg" in finding.message

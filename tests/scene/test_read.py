@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -13,6 +15,8 @@ from support.scene_builders import (
 from climatenerf.core.errors import UserError
 from climatenerf.scene import load_image, read_scene, save_scene
 from climatenerf.scene.images import load_labels, load_mask
+
+SIZES = {"w": 32, "h": 24, "fl_x": 30.0, "fl_y": 31.0, "cx": 16.0, "cy": 12.0}
 
 
 def make(tmp_path, count=9, points=()):
@@ -165,6 +169,66 @@ def test_duplicate_names_raise(tmp_path):
     write_images(tmp_path / "images", names_of(4))
     write_colmap(tmp_path / "sparse/0", ring(4), [*names_of(3), "000.png"])
     with pytest.raises(UserError, match=r"000\.png has two poses"):
+        read_scene(tmp_path)
+
+
+def test_two_names_of_one_file_are_two_poses(tmp_path):
+    write_images(tmp_path / "images", names_of(4))
+    names = [f"images/{name}" for name in names_of(3)] + ["images/../images/000.png"]
+    write_transforms(tmp_path / "transforms.json", ring(4), names, **SIZES)
+    with pytest.raises(UserError, match=r"000\.png has two poses"):
+        read_scene(tmp_path)
+
+
+def test_photos_under_roundabout_names_have_poses(tmp_path):
+    write_images(tmp_path / "images", names_of(4))
+    names = [f"images/../images/{name}" for name in names_of(4)]
+    write_transforms(tmp_path / "transforms.json", ring(4), names, **SIZES)
+    scene = read_scene(tmp_path)
+    assert not [each for each in scene.findings if each.code == "photo-without-pose"]
+
+
+def test_a_name_without_suffix_with_two_pictures_is_told(tmp_path):
+    write_images(tmp_path / "images", [*names_of(4), "001.jpg"])
+    names = [f"images/{name.removesuffix('.png')}" for name in names_of(4)]
+    write_transforms(tmp_path / "transforms.json", ring(4), names, **SIZES)
+    found = [each for each in read_scene(tmp_path).findings if each.code == "name-ambiguous"]
+    assert len(found) == 1 and "images/001.png, images/001.jpg" in found[0].message
+
+
+@pytest.mark.parametrize(("name", "read"), [("mask", "masks"), ("depths", "depth")])
+def test_folders_with_a_similar_name_are_noted(tmp_path, name, read):
+    make(tmp_path)
+    write_images(tmp_path / name, names_of(9))
+    found = [each for each in read_scene(tmp_path).findings if each.code == "sidecar-unused"]
+    assert f"9 files in {name}/, which is not read" in str(found) and read in found[0].remedy
+
+
+@pytest.mark.parametrize("kind", ["masks", "labels", "depth"])
+def test_headers_of_all_sidecars_are_read(tmp_path, kind):
+    """One file among more than those whose pixels are read."""
+    make(tmp_path, 60)
+    (tmp_path / kind).mkdir()
+    for name in names_of(60):
+        size = (24, 32) if name == "007.png" else (32, 24)
+        if kind == "depth":
+            np.save(tmp_path / kind / name.replace("png", "npy"), np.ones(size[::-1]))
+        else:
+            Image.new("L", size).save(tmp_path / kind / name)
+    errors = [each for each in read_scene(tmp_path).findings if each.severity == "error"]
+    assert any("007" in each.message and "24x32" in each.message for each in errors), errors
+
+
+def test_what_special_files_are_is_told(tmp_path):
+    make(tmp_path)
+    (tmp_path / "images/003.png").unlink()
+    os.mkfifo(tmp_path / "images/003.png")
+    (finding,) = [f for f in read_scene(tmp_path).findings if f.code == "photo-missing"]
+    assert "003.png, which is a pipe" in finding.message
+    os.mkfifo(tmp_path / "transforms.json")
+    for name in ("cameras.txt", "cameras.bin"):
+        (tmp_path / "sparse/0" / name).unlink(missing_ok=True)
+    with pytest.raises(UserError, match=r"transforms\.json is a pipe"):
         read_scene(tmp_path)
 
 

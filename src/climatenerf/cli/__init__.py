@@ -251,7 +251,10 @@ def _run(words: list[str]) -> int:
 
 
 def _check_out(words: Sequence[str]) -> None:
-    """Refuse an empty output folder, such as `-o "$OUT"` without OUT: it would be parsed as "."."""
+    """Refuse an empty path, such as `-o "$OUT"` without OUT: it would be parsed as "."."""
+    for before, word in itertools.pairwise(["", *words]):
+        if not word.strip() and not before.startswith("-"):
+            raise UserError("a path is empty; name it, or give . for the working folder")
     for flag, value in itertools.pairwise([*words, "-"]):
         empty = flag in ("-o", "--out") and not value.strip()
         if empty or flag.strip() in ("-o=", "--out="):

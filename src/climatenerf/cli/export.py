@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
 from climatenerf.scene import read_scene
 from climatenerf.scene.export import export_colmap, export_transforms
@@ -25,7 +26,13 @@ class Export:
 
 
 def run(options: Export) -> int:
-    """Write the files, and print where they are."""
+    """Write the files, and print where they are.
+
+    Raises:
+        UserError: `--format` names none, or the capture cannot be used.
+    """
+    if not options.format:
+        raise UserError("--format names no format; give transforms, colmap or both")
     scene = read_scene(options.scene)
     progress.report_findings(scene.findings)
     writers = {"transforms": export_transforms, "colmap": export_colmap}

@@ -1,5 +1,6 @@
 """``climatenerf render RUN -o OUT``: movies and measured layers in any weather."""
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
@@ -12,6 +13,7 @@ from climatenerf.cli import progress
 from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.input_limits import MAX_FRAMES
+from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects
@@ -88,6 +90,8 @@ def run(
     size = parse_size(options.size)
     if not 1 <= options.frames <= MAX_FRAMES or not 1 <= options.supersample <= 8:
         raise UserError(f"--frames must be from 1 to {MAX_FRAMES}, --supersample from 1 to 8")
+    if options.layers and not options.layer_format:
+        raise UserError("--layer-format names no format; give npz, png or exr")
     part = parse_part(options.part)
     if part is not None and options.join:
         raise UserError(
@@ -105,6 +109,7 @@ def run(
     from climatenerf.api import load_run, render_movie
 
     run = load_run(options.run, device=options.device)
+    check_out(options.out, options.run, run.scene)
     with progress.StageBars() as bars:
         made = render_movie(
             run,
@@ -128,6 +133,22 @@ def run(
         )
     progress.result(f"{'movie' if part is None else 'frames'}: {made}")
     return 0
+
+
+def check_out(out: Path, run: Path, scene: Scene) -> None:
+    """Check that frames would lie neither beside the files of the run nor beside photos.
+
+    Raises:
+        UserError: they would, and a later reading of that folder would take them for its own.
+    """
+    folder = os.path.realpath(out)
+    if folder == os.path.realpath(run):
+        raise UserError(f"-o {out} is the folder of the run; name another, such as {out / 'movie'}")
+    if folder in {os.path.realpath(view.path.parent) for view in scene.views}:
+        raise UserError(
+            f"-o {out} holds photos of the capture, among which frames would later be taken for"
+            " photos; name another folder"
+        )
 
 
 def parse_part(text: str | None) -> tuple[int, int] | None:

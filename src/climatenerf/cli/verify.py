@@ -16,7 +16,7 @@ from climatenerf.verification.check import Check
 if TYPE_CHECKING:
     from climatenerf.api import Run
 
-WIDTH = 96  # pixels of the pictures of a run
+WIDTH = 48  # pixels of the pictures of a run
 SCHEMA_VERSION = 1
 
 

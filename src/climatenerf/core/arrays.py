@@ -12,6 +12,8 @@ from typing import IO
 
 import numpy as np
 
+from climatenerf.core.regular_files import check_regular
+
 MAX_BYTES = 2**30
 """Bytes of one array: depths of 100 megapixels in 64 bits have 0.8 GB."""
 MAX_MEMBERS = 1000
@@ -45,10 +47,30 @@ def read_npy(path: Path, max_bytes: int = MAX_BYTES) -> np.ndarray:
         OSError: the file cannot be read.
         ValueError: it is no NPY file, is cut off, is too large, or holds objects.
     """
+    check_regular(path)
     with path.open("rb") as file:
         _check_claim(file, path.stat().st_size, max_bytes)
         file.seek(0)
         return np.load(file, allow_pickle=False)
+
+
+def shape_of(path: Path, max_bytes: int = MAX_BYTES) -> tuple[int, ...]:
+    """Return the shape of the array of an NPY file, or of the first array of an NPZ file.
+
+    Raises:
+        OSError, ValueError, zipfile.BadZipFile, zlib.error, EOFError: as for `read_npy` and
+            `read_npz`.
+    """
+    check_regular(path)
+    if path.suffix != ".npz":
+        with path.open("rb") as file:
+            return _check_claim(file, path.stat().st_size, max_bytes)
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if not members:
+            raise ValueError("it holds no array")
+        with archive.open(members[0]) as file:
+            return _check_claim(file, members[0].file_size, max_bytes)
 
 
 def read_npz(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
@@ -60,6 +82,7 @@ def read_npz(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
             large, or holds objects.
     """
     path.stat()
+    check_regular(path)
     if not zipfile.is_zipfile(path):
         raise ValueError("it is no NPZ file")
     with zipfile.ZipFile(path) as archive:
@@ -78,8 +101,8 @@ def read_npz(path: Path, max_bytes: int = MAX_BYTES) -> dict[str, np.ndarray]:
         return {name: data[name] for name in data.files}
 
 
-def _check_claim(file: IO[bytes], size: int, max_bytes: int) -> None:
-    """Check that the header at the beginning of a file claims no more than the file holds.
+def _check_claim(file: IO[bytes], size: int, max_bytes: int) -> tuple[int, ...]:
+    """Return the shape in the header at the beginning of a file, if the file holds as much.
 
     Args:
         file: at its beginning.
@@ -107,3 +130,4 @@ def _check_claim(file: IO[bytes], size: int, max_bytes: int) -> None:
         raise ValueError(f"its header claims {claimed / 1e9:.3g} GB")
     if claimed > size - file.tell():
         raise ValueError("it is cut off: its header claims more than the file holds")
+    return shape

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError, excerpt, explain, one_line
+from climatenerf.core.regular_files import check_regular, is_stream, read_stream
 from climatenerf.core.text import decode
 
 MAX_NESTING = 100
@@ -50,11 +51,15 @@ def read_bytes(path: Path | str, what: str = "file", max_bytes: int = MAX_JSON_B
         max_bytes: greatest size, bytes; no more than that is read.
 
     Raises:
-        UserError: absent, unreadable, or too large.
+        UserError: absent, unreadable, too large, or a pipe or device that no shell gave.
     """
     try:
-        with open(path, "rb") as file:
-            data = file.read(max_bytes + 1)
+        if is_stream(path):
+            data = read_stream(path, max_bytes + 1)
+        else:
+            check_regular(path, what)
+            with open(path, "rb") as file:
+                data = file.read(max_bytes + 1)
     except FileNotFoundError as error:
         raise UserError(f"{what}: {path} does not exist; check the path") from error
     except OSError as error:

@@ -25,6 +25,7 @@ from typing import Any
 
 from climatenerf.core.errors import UserError, excerpt, explain, one_line
 from climatenerf.core.parsing import read_json
+from climatenerf.core.regular_files import check_regular
 
 __all__ = [
     "atomic_path",
@@ -243,6 +244,7 @@ def read_safetensors(path: Path | str, what: str = "file") -> tuple[dict[str, An
     """
     from safetensors import SafetensorError, safe_open
 
+    check_regular(path, what)
     if not Path(path).is_file():
         raise UserError(f"{what}: {path} does not exist; check the path")
     try:

@@ -4,6 +4,7 @@ import codecs
 from pathlib import Path
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.regular_files import check_regular
 
 # Marks that other encodings begin with; the mark of UTF-32 begins with that of UTF-16.
 _MARKS = {
@@ -17,8 +18,10 @@ def read_text(path: Path) -> str:
 
     Raises:
         OSError: The file is absent or cannot be read.
-        UserError: Its encoding is not UTF-8; the message names the encoding where it is certain.
+        UserError: It is a pipe or a device, or its encoding is not UTF-8; the message names the
+            encoding where it is certain.
     """
+    check_regular(path)
     return decode(path.read_bytes(), str(path))
 
 

@@ -11,6 +11,7 @@ import torch
 from climatenerf.core import parsing
 from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.core.errors import UserError, one_line
+from climatenerf.core.regular_files import check_regular
 from climatenerf.core.samples import MIN_TAU
 from climatenerf.core.storage import (
     check_finite,
@@ -73,6 +74,7 @@ def load_field(run: Path, device: torch.device = CPU) -> Field:
     path = run / FILE_NAME
     if not run.exists():
         raise UserError(f"{run} does not exist; give a run folder made by `climatenerf fit`")
+    check_regular(path, "the field")
     if not path.is_file():
         raise UserError(
             f"{run} holds no {FILE_NAME}, so it is no finished run; make one with"

@@ -34,6 +34,11 @@ _FORMS: tuple[Callable[[str], str], ...] = (
 )
 
 
+def folded(name: str) -> str:
+    """Return a name in the form in which names that look the same are equal."""
+    return _FORMS[-1](normalised(name))
+
+
 class FileNames:
     """The files below a folder, found by exact name, else by a name that looks the same."""
 
@@ -43,6 +48,8 @@ class FileNames:
         """Files found under another spelling, by the name asked for."""
         self.ambiguous: dict[str, list[str]] = {}
         """Names that match several files, with the names of these."""
+        self.alternatives: dict[str, list[str]] = {}
+        """Names without a suffix that match several files, of which the first is used."""
 
     def find(self, name: str) -> Path | None:
         """Return the file of a name, relative to the folder; None if there is none.
@@ -83,6 +90,16 @@ class FileNames:
                 self.ambiguous = known
                 return found
         return None
+
+    def note_alternatives(self, name: str, suffixed: Iterable[str]) -> None:
+        """Note which of the names with a suffix have different files."""
+        found = {}
+        for each in suffixed:
+            with contextlib.suppress(OSError, ValueError):
+                status = os.stat(self.folder / each)
+                found.setdefault((status.st_dev, status.st_ino), each)
+        if len(found) > 1:
+            self.alternatives[name] = list(found.values())
 
     def _below(self, name: str, absolute: str) -> Path | None:
         """Return the file whose path ends as an absolute path of another machine does."""
@@ -128,6 +145,15 @@ class FileNames:
                 f" files, left out (first: {name!r} matches {examples(files)})"
             )
             remedy = "rename the files as the poses name them"
+            out.append(Finding("name-ambiguous", message, remedy, file=str(self.folder)))
+        if self.alternatives:
+            name, files = next(iter(self.alternatives.items()))
+            message = (
+                f"{counted(len(self.alternatives), 'name')} without a suffix in {self.folder} with"
+                f" several matching files (first: {name!r} matches {examples(files)}); of each the"
+                " first is used"
+            )
+            remedy = "remove the other files, or give the suffix"
             out.append(Finding("name-ambiguous", message, remedy, file=str(self.folder)))
         return out
 

@@ -36,17 +36,20 @@ CODES: dict[str, str] = {
     "focal-disagrees": "Matches between photos agree with another focal length.",
     "focal-exif": "The focal length disagrees with that in the photos' EXIF records.",
     "principal-point": "The principal point is far from the middle of the picture.",
+    "distortion-disagrees": "Photos show their points without the given lens distortion.",
     "distortion-fold": "The lens distortion cannot be inverted everywhere in the picture.",
     # Poses.
     "pose-outlier": "A camera is very far from the others; it is left out.",
     "pose-duplicate": "Several photos have the same pose.",
     "pose-no-baseline": "All cameras are at one position, so depth cannot be found.",
     "pose-axes": "The poses have the axes of another convention; converted.",
-    "pose-disagrees": "The pose of a photo contradicts the points that were seen in it.",
+    "pose-disagrees": "The pose of a photo contradicts its own points, or its matches with others.",
     "matches-few": "Too few matches between photos to check the poses.",
     "matches-disagree": "Matches between neighbouring photos contradict their poses.",
     # Points.
+    "points-missing": "Images of a COLMAP model show points that it lacks.",
     "points-outside": "Most sparse points lie in no picture.",
+    "points-disagree": "Photos do not look alike where the sparse points lie in them.",
     "points-frame": "The sparse points are in another frame than the poses; transformed.",
     # Depths, masks, labels.
     "depth-empty": "Depth files hold no known depth.",
@@ -58,8 +61,9 @@ CODES: dict[str, str] = {
     "mask-hides-all": "Masks hide all of their photos.",
     "mask-hides-nothing": "Masks hide nothing.",
     "mask-inverted": "Masks hide what the capture's points were found on.",
+    "labels-empty": "Label files hold no known class.",
     "labels-foreign": "Label files hold ids that their numbering does not define.",
-    "labels-disagree": "Labels contradict the sparse points: points lie on the sky.",
+    "labels-disagree": "Labels contradict the sparse points, up or each other.",
     # World frame and scale.
     "ground-missing": "No ground was found below the cameras; its height is assumed.",
     "origin-moved": "The world's origin is moved near the cameras.",

@@ -17,6 +17,7 @@ from PIL import Image, ImageCms
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.hdr import Transfer, image_to_sdr
+from climatenerf.core.regular_files import check_regular
 
 PHOTO_SUFFIXES = {
     ".jpg", ".jpeg", ".png", ".heic", ".heif", ".hif", ".tif", ".tiff", ".webp", ".bmp",
@@ -57,12 +58,13 @@ def open_image(path: Path, name: str | None = None) -> Iterator[Image.Image]:
         name: text that names the file in messages; None for the path.
 
     Raises:
-        UserError: the image has more than `MAX_PIXELS`.
+        UserError: the image has more than `MAX_PIXELS`, or is a pipe or a device.
         MissingDecoder: the file is HEIC and pi-heif is not installed.
         Exception: Pillow cannot identify the file.
     """
     name = str(path) if name is None else name
     # Open the file here: Pillow corrupts rotated TIFFs that it memory-maps by name.
+    check_regular(path)
     with path.open("rb") as file:
         _register_heif(file, name)
         with _without_pixel_limit():

@@ -327,7 +327,8 @@ def read_depth(path: Path, scale: float = MILLIMETRES) -> Float[np.ndarray, "h w
         raise _array_error("depth", path, error) from None
     if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[-1]):
         depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
-    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.number) or not depth.size:
+    real = np.issubdtype(depth.dtype, np.number) and not np.iscomplexobj(depth)
+    if depth.ndim != 2 or not real or not depth.size:
         raise UserError(
             f"The depth {path} is not an array of numbers of shape height x width; replace it."
         )
@@ -346,6 +347,28 @@ def _float_depth(image: Image.Image) -> np.ndarray:
     if not (np.isfinite(depth) & (depth >= 0) & (depth < MAX_FLOAT_DEPTH)).all():
         raise ValueError("its four channels are no depths in metres")
     return depth
+
+
+def check_sidecar(path: Path, camera: Camera) -> None:
+    """Check by its header that labels, a mask or depths have the shape of their photo.
+
+    Raises:
+        UserError: The file cannot be read, or its aspect ratio differs from the camera's.
+    """
+    if path.suffix in (".npy", ".npz"):
+        try:
+            shape = arrays.shape_of(path)
+        except arrays.ERRORS as error:
+            raise _array_error("depth", path, error) from None
+        # A leading or trailing axis of length one is dropped; loading refuses other shapes.
+        sides = [side for side in shape if side != 1] if len(shape) == 3 else list(shape)
+        if len(sides) != 2 or not all(sides):
+            return
+        height, width = sides
+    else:
+        header = read_header(path)
+        width, height = header.width, header.height
+    _check_shape(width, height, camera, path)
 
 
 def downscaled_camera(camera: Camera, downscale: int) -> Camera:
@@ -456,6 +479,10 @@ def _size_error(path: Path, width: int, height: int, camera: Camera) -> UserErro
 
 def _check_aspect(values: np.ndarray, camera: Camera, path: Path) -> None:
     height, width = values.shape
+    _check_shape(width, height, camera, path)
+
+
+def _check_shape(width: int, height: int, camera: Camera, path: Path) -> None:
     # 2 %: a reduced image rounds each side to a whole pixel.
     if abs(width * camera.height / (height * camera.width) - 1) >= 0.02:
         raise _size_error(path, width, height, camera)

@@ -12,6 +12,7 @@ import numpy as np
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.listing import visible
+from climatenerf.core.regular_files import check_regular, special_kind
 from climatenerf.scene.alignment.scale import rescale_by_camera_height
 from climatenerf.scene.alignment.world_frame import align_scene
 from climatenerf.scene.checks.check import corrected
@@ -27,7 +28,11 @@ from climatenerf.scene.readers.colmap import model_folders, read_colmap
 from climatenerf.scene.readers.kitti360 import kitti360_root, parse_frames, read_kitti360
 from climatenerf.scene.readers.mega_nerf import is_mega_nerf, read_mega_nerf
 from climatenerf.scene.readers.tanks_temples import is_tanks_temples, read_tanks_temples
-from climatenerf.scene.readers.transforms_json import read_transforms, transforms_files
+from climatenerf.scene.readers.transforms_json import (
+    SPLIT_FILES,
+    read_transforms,
+    transforms_files,
+)
 from climatenerf.scene.scene import (
     FILE_NAME,
     Scene,
@@ -205,6 +210,15 @@ def _read_capture(path: Path, frames: tuple[int, int] | None) -> Capture:
         return read_kitti360(path, frames)
     if is_mega_nerf(path):
         return read_mega_nerf(path)
+    if path.is_dir():
+        models = (
+            f"{folder}{stem}.{suffix}"
+            for folder in ("", "sparse/", "sparse/0/")
+            for stem in ("cameras", "images")
+            for suffix in ("bin", "txt")
+        )
+        for name in ("transforms.json", *SPLIT_FILES, *models):
+            check_regular(path / name)
     if not any(p.is_dir() and _has_images(p) for p in (path, path / "images")):
         raise UserError(
             f"{path} contains neither images nor poses; give a folder with images/ and sparse/0/ "
@@ -236,15 +250,18 @@ def _check_images(capture: Capture) -> Capture:
     if absent:
         message = (
             f"{len(absent)} of the {len(capture.views)} images with poses are not on disk "
-            f"(first: {absent[0].name}); they are left out"
+            f"(first: {absent[0].name}{_kind_note(absent[0].path)}); they are left out"
         )
         remedy = "restore them, or remove their poses"
         file = str(absent[0].path.parent)
         findings.append(Finding("photo-missing", message, remedy, file=file))
     present = sorted(_with_inner_names(present), key=lambda v: v.name)
-    for a, b in zip(present, present[1:], strict=False):
-        if a.name == b.name:
-            raise UserError(f"The image {a.name} has two poses; remove one of them.")
+    posed: set[str] = set()
+    for view in present:
+        if (file := os.path.normpath(view.path)) in posed:
+            name = os.path.normpath(view.name)
+            raise UserError(f"The image {name} has two poses; remove one of them.")
+        posed.add(file)
     cameras: dict[Camera, int] = {}
     views: list[View] = []
     scaled: list[Path] = []
@@ -281,6 +298,11 @@ def _check_images(capture: Capture) -> Capture:
             remedy = "undistort the images if the border matters"
             findings.append(Finding("distortion-fold", message, remedy))
     return replace(capture, cameras=tuple(cameras), views=tuple(views), findings=tuple(findings))
+
+
+def _kind_note(path: Path) -> str:
+    kind = special_kind(path)
+    return "" if kind is None else f", which is {kind} in place of a file"
 
 
 def _with_inner_names(views: Sequence[View]) -> list[View]:

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
 from climatenerf.core.parsing import parse_json
+from climatenerf.core.regular_files import check_regular
 from climatenerf.core.storage import explain, make_folder, read_json, write_bytes
 from climatenerf.scene.scene import FILE_NAME as SCENE
 from climatenerf.scene.scene import OBSERVATIONS_NAME, POINTS_NAME, Scene, save_scene
@@ -183,6 +184,7 @@ def _version(path: Path) -> tuple[int, int, int] | None:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """Return what a safetensors file states about itself, without reading its tensors."""
+    check_regular(path)
     with path.open("rb") as file:
         length = int.from_bytes(file.read(8), "little")
         header = parse_json(file.read(min(length, 2**24)), str(path))

@@ -293,3 +293,20 @@ def test_a_name_in_another_encoding_is_reported(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"001.png", b"\xfc01.png"))
     with pytest.raises(UserError, match="encoding other than UTF-8"):
         read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("absent", [False, True])
+def test_a_cut_off_file_of_points_is_told(tmp_path, absent):
+    """Every second image of the text model shows point 3."""
+    points = [(float(i), 0.0, 0.0) for i in range(6)]
+    model = tmp_path / "sparse/0"
+    write_colmap(model, ring(4), names_of(4), points=points, binary=False)
+    write_images(tmp_path / "images", names_of(4))
+    assert "points-missing" not in [each.code for each in read_colmap(tmp_path).findings]
+    path = model / "points3D.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:2]))
+    if absent:
+        path.unlink()
+    (finding,) = (f for f in read_colmap(tmp_path).findings if f.code == "points-missing")
+    assert "1 of the 1 points" in finding.message
+    assert ("no points3D file" in finding.message) == absent

@@ -287,3 +287,53 @@ def test_photos_outside_the_folder_have_names_below_one(tmp_path, named):
     scene = read_scene(tmp_path / "nerf")
     assert [view.path.resolve() for view in scene.views] == [photos / name for name in names_of(4)]
     assert [view.name for view in scene.views] == names_of(4)
+
+
+def test_lists_of_a_split_match_other_spellings_unless_a_frame_has_the_name(tmp_path):
+    names = ["images/A.png", "images/a.png", "images/b.png", "images/c.png"]
+    write_images(tmp_path, names)
+    split = {"train_filenames": [*names[:1], "images/B.PNG"], "test_filenames": names[1:2]}
+    split["train_filenames"].append("images/c.png")
+    write_transforms(tmp_path / "transforms.json", ring(4), names, **NERFSTUDIO, **split)
+    found = {view.name: view.split for view in read_transforms(tmp_path).views}
+    assert found == {"A.png": "train", "a.png": "heldout", "b.png": "train", "c.png": "train"}
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "value"), [("frame", "mask_path", 5), ("file", "ply_file_path", ["a.ply"])]
+)
+def test_paths_that_are_no_text_are_told(tmp_path, table, key, value):
+    write_images(tmp_path, images_of(3))
+    write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **NERFSTUDIO)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    (data["frames"][0] if table == "frame" else data)[key] = value
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    (finding,) = read_transforms(tmp_path).findings
+    assert finding.code == "file-unread" and f"{key} that is no text" in finding.message
+
+
+def test_a_truth_value_is_no_number(tmp_path):
+    write_images(tmp_path, images_of(3))
+    intrinsics = {**NERFSTUDIO, "fl_x": True}
+    write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **intrinsics)
+    with pytest.raises(UserError, match="fl_x in .* is not a number"):
+        read_transforms(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("of_file", "of_frames", "told"),
+    [
+        ({"depth_unit_scale_factor": 0.001, "integer_depth_scale": 0.001}, {}, None),
+        ({"depth_unit_scale_factor": 0.001, "integer_depth_scale": 0.01}, {}, "contradicts"),
+        ({}, {"depth_unit_scale_factor": 0.01}, "of single frames (3 times)"),
+        ({"depth_unit_scale_factor": 0.01}, {"depth_unit_scale_factor": 0.01}, None),
+    ],
+)
+def test_units_of_depth_that_are_not_used_are_told(tmp_path, of_file, of_frames, told):
+    write_images(tmp_path, images_of(3))
+    write_transforms(tmp_path / "transforms.json", ring(3), images_of(3), **NERFSTUDIO, **of_file)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    data["frames"] = [{**frame, **of_frames} for frame in data["frames"]]
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    found = read_transforms(tmp_path).findings
+    assert [told in each.message for each in found] == ([] if told is None else [True])

@@ -21,6 +21,7 @@ from climatenerf.scene.checks.poses import (
     duplicate_findings,
     without_outliers,
 )
+from climatenerf.scene.checks.visibility import with_visible_points
 from climatenerf.scene.findings import Finding, without_repeats
 from climatenerf.scene.images import focal_35mm
 from climatenerf.scene.scene import Scene
@@ -47,7 +48,7 @@ def corrected(scene: Scene, point_transforms: Sequence[Float[np.ndarray, "4 4"]]
     recorded = fractions is not None and fractions.recorded
     if not recorded and not any(f.code == "pose-axes" for f in findings):
         with contextlib.suppress(UserError):  # a photo that cannot be read: loading it reports that
-            scene, odd = matching_findings(scene)
+            scene, odd = _without_record(scene, findings)
             findings += odd
     total = len(scene.views)
     before = scene.views
@@ -76,8 +77,31 @@ def _photo_findings(scene: Scene) -> list[Finding]:
     if (odd := appearance_findings(scene)) is not None:
         return odd
     # Points that agree with the poses outweigh matches that would convert these.
-    _, odd = matching_findings(scene)
-    return [each for each in odd if each.code in ("focal-disagrees", "matches-disagree")]
+    codes = ("focal-disagrees", "matches-disagree")
+    return [each for each in matching_findings(scene).findings if each.code in codes]
+
+
+def _without_record(scene: Scene, earlier: Sequence[Finding]) -> tuple[Scene, list[Finding]]:
+    """Compare photos by matches, and around the points that are visible in them by their poses.
+
+    Both use the same photos.
+
+    Returns:
+        The scene, in the axes in which matches agree with its poses, and what is odd.
+
+    Raises:
+        UserError: A photo cannot be read.
+    """
+    found = matching_findings(scene)
+    odd = found.findings
+    certain = any(each.code not in ("matches-few", "pose-disagrees") for each in odd)
+    outside = any(each.code == "points-outside" for each in earlier)
+    if scene.points is None or not len(scene.points) or certain or outside:
+        return found.scene, odd
+    visible = with_visible_points(scene, found.photos)
+    if (unlike := appearance_findings(visible, found.photos, found.agreeing)) is None:
+        return scene, odd
+    return scene, [*(each for each in odd if each.code != "matches-few"), *unlike]
 
 
 def _with_corrected_cameras(scene: Scene) -> tuple[Scene, list[Finding]]:

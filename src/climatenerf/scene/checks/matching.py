@@ -8,17 +8,21 @@ rays must meet in front of the cameras. Wrong axes or intrinsics break that for 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.scene.checks.conventions import CONVENTIONS, Pose, with_poses
-from climatenerf.scene.findings import Finding, counted
+from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.images import load_grey
 from climatenerf.scene.scene import Scene, View
 
-PAIRS = 6
+PAIRS = 6  # by pose, and as many by name: 24 photos at most
+MAX_SUSPECTS = 3
+SUSPECT_PAIRS = 3  # in place of `PAIRS` if there are suspects, which take three photos each
+JUMP = 3.0  # of a suspect's pose, over the step of its neighbours and the median step
 SIDE = 640  # pixels of the longer side in which photos are matched
 CORNERS = 500
 PATCH = 4  # samples to each side of a corner, two pixels apart
@@ -30,6 +34,9 @@ LOOSE_TOLERANCE = 4.0  # pixels, of imprecise poses such as those of a phone
 AGREE = 0.7  # fraction of matches that agree; right poses have 0.9, wrong matches are the rest
 BETTER = 0.2  # fraction that another convention must gain
 DISAGREE = 0.4  # wrong poses have up to 0.6: neighbouring epipolar lines are nearly parallel
+MIN_NEAR = 3  # pairs of neighbouring cameras from which an exchanged order is judged
+FEW_EXACT = 0.35  # median fraction of their matches within `TOLERANCE`; right poses have 0.5
+FEW_LOOSE = 0.3  # least fraction within `LOOSE_TOLERANCE`; right poses have 0.48
 FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.71, 1.41, 2.0, 2.83, 4.0)
 MAX_ANGLE = 35.0  # degrees between the viewing directions of a pair
 
@@ -37,13 +44,92 @@ Match = tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"], float]
 """Directions of matched corners in the cameras' frames, and the radians of a pixel."""
 
 
-def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
-    """Return the scene in the axes in which matches agree with its poses, and what is odd.
+@dataclass(frozen=True)
+class Matching:
+    """What the matches between neighbouring photos tell.
+
+    Attributes:
+        scene: The scene, in the axes in which matches agree with its poses.
+        findings: What is odd.
+        agreeing: Median fraction of the matches of a pair that agree with the poses; None if too
+            few photos have matches.
+        photos: Indices of the views whose pixels were read, without those whose poses are wrong.
+    """
+
+    scene: Scene
+    findings: list[Finding]
+    agreeing: float | None = None
+    photos: tuple[int, ...] = ()
+
+
+def matching_findings(scene: Scene) -> Matching:
+    """Return what is odd about the poses, by matches between neighbouring photos.
+
+    The pixels of 24 photos at most are read.
 
     Raises:
         UserError: A photo cannot be read.
     """
-    pairs = neighbours(scene.views)
+    odd_ones = suspects(scene.views)
+    count = SUSPECT_PAIRS if odd_ones else PAIRS
+    found = _matching(scene, count)
+    names = {view.name for pair in neighbours(scene.views, count) for view in pair}
+    read = {i for i, view in enumerate(scene.views) if view.name in names}
+    if found.agreeing is None or found.agreeing < AGREE:
+        return replace(found, photos=tuple(sorted(read)))
+    read |= {j for i in odd_ones for j in (i - 1, i, i + 1)}
+    wrong = [i for i in odd_ones if _contradicts(scene, i)]
+    found = replace(found, photos=tuple(sorted(read.difference(wrong))))
+    if not wrong:
+        return found
+    message = (
+        f"The matches of {counted(len(wrong), 'photo')} contradict their poses, and those of the"
+        f" photos before and after agree ({examples([scene.views[i].name for i in wrong])})"
+    )
+    remedy = "remove these photos or compute their poses again"
+    finding = Finding("pose-disagrees", message, remedy, file=str(scene.root))
+    return replace(found, findings=[*found.findings, finding])
+
+
+def suspects(views: Sequence[View]) -> list[int]:
+    """Return indices of photos whose pose jumps away from both neighbours by name, most first.
+
+    The neighbours are near each other: a way that turns off, or a second camera, is no jump.
+    """
+    if len(views) < 3:
+        return []
+    position = np.stack([view.c2w[:3, 3] for view in views])
+    axes = np.stack([view.c2w[:3, :3].reshape(9) for view in views])
+    score = np.zeros(len(views) - 2)
+    for values in (position, axes):  # the distance of axes grows with the angle
+        step = np.linalg.norm(np.diff(values, axis=0), axis=1)
+        away = np.minimum(step[:-1], step[1:])
+        across = np.linalg.norm(values[2:] - values[:-2], axis=1)
+        usual = np.maximum(across, max(float(np.median(step)), 1e-9))
+        score = np.maximum(score, away / usual)
+    order = np.argsort(-score, kind="stable")[:MAX_SUSPECTS]
+    return [int(i) + 1 for i in order if score[i] > JUMP]
+
+
+def _contradicts(scene: Scene, i: int) -> bool:
+    """Return whether a photo's matches with the two around it contradict its pose."""
+    before, view, after = scene.views[i - 1 : i + 2]
+
+    def agreeing(a: View, b: View) -> float | None:
+        found = match(scene, a, b)
+        if len(found[0]) < MIN_MATCHES:
+            return None
+        return agreeing_fraction(a.c2w, b.c2w, found, LOOSE_TOLERANCE)
+
+    own = [agreeing(before, view), agreeing(view, after)]
+    around = agreeing(before, after)
+    wrong = all(value is not None and value < DISAGREE for value in own)
+    return wrong and around is not None and around >= AGREE
+
+
+def _matching(scene: Scene, count: int) -> Matching:
+    """Match photos in `count` pairs by pose and by name."""
+    pairs = neighbours(scene.views, count)
     matches = [match(scene, a, b) for a, b in pairs]
     usable = [i for i, (first, _, _) in enumerate(matches) if len(first) >= MIN_MATCHES]
     if len(usable) < 2:
@@ -52,7 +138,7 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
             f" ({counted(len(usable), 'pair')} of {len(pairs)} with {MIN_MATCHES} or more)"
         )
         remedy = "check that poses and photos belong together if photos overlap"
-        return scene, [Finding("matches-few", message, remedy, "note", str(scene.root))]
+        return Matching(scene, [Finding("matches-few", message, remedy, "note", str(scene.root))])
     pairs, matches = [pairs[i] for i in usable], [matches[i] for i in usable]
 
     def agreement(change: Callable[[Pose], Pose], tolerance: float = TOLERANCE) -> float:
@@ -64,7 +150,7 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
 
     given = agreement(lambda pose: pose)
     if given >= AGREE:
-        return scene, []
+        return Matching(scene, [], given)
     fractions = [agreement(change) for _, change in CONVENTIONS]
     best = int(np.argmax(fractions))
     if fractions[best] >= AGREE and fractions[best] > given + BETTER:
@@ -74,18 +160,43 @@ def matching_findings(scene: Scene) -> tuple[Scene, list[Finding]]:
             f" neighbouring photos then agree with them, {given:.0%} before)"
         )
         finding = Finding("pose-axes", message, "correct the file to keep it from being guessed")
-        return with_poses(scene, change), [finding]
+        return Matching(with_poses(scene, change), [finding], fractions[best])
     if (finding := _other_focal_length(scene, pairs, matches, given)) is not None:
-        return scene, [finding]
-    given = agreement(lambda pose: pose, LOOSE_TOLERANCE)
-    if given >= DISAGREE:
-        return scene, []
+        return Matching(scene, [finding], given)
+    loose = agreement(lambda pose: pose, LOOSE_TOLERANCE)
+    if loose >= DISAGREE:
+        return Matching(scene, _near_pairs_finding(scene, pairs, matches, count), given)
     message = (
-        f"Only {given:.0%} of the matches between neighbouring photos agree with the poses"
+        f"Only {loose:.0%} of the matches between neighbouring photos agree with the poses"
         f" ({len(pairs)} pairs)"
     )
     remedy = "check that intrinsics, poses and photos belong together; a fit will be blurred"
-    return scene, [Finding("matches-disagree", message, remedy)]
+    return Matching(scene, [Finding("matches-disagree", message, remedy)], given)
+
+
+def _near_pairs_finding(
+    scene: Scene, pairs: Sequence[tuple[View, View]], matches: Sequence[Match], count: int
+) -> list[Finding]:
+    """Return a finding if photos whose cameras are neighbours match elsewhere.
+
+    Along a way, epipolar lines of wrong poses are much like those of right ones, so most matches
+    agree loosely. In an exchanged order some pair disagrees wholly. Pairs by name prove nothing:
+    photos in no order need not overlap, and what matches is then wrong.
+    """
+    near = {(a.name, b.name) for a, b in near_by_pose(scene.views, count)}
+    exact, loose = [], []
+    for (a, b), found in zip(pairs, matches, strict=True):
+        if (a.name, b.name) in near:
+            exact.append(agreeing_fraction(a.c2w, b.c2w, found))
+            loose.append(agreeing_fraction(a.c2w, b.c2w, found, LOOSE_TOLERANCE))
+    if len(exact) < MIN_NEAR or np.median(exact) >= FEW_EXACT or min(loose) >= FEW_LOOSE:
+        return []
+    message = (
+        f"Only {np.median(exact):.0%} of the matches between photos with neighbouring cameras agree"
+        f" with the poses to a pixel, and as few as {min(loose):.0%} of a pair roughly"
+    )
+    remedy = "check that intrinsics, poses and photos belong together; a fit will be blurred"
+    return [Finding("matches-disagree", message, remedy)]
 
 
 def _other_focal_length(
@@ -118,15 +229,27 @@ def _other_focal_length(
     return Finding("focal-disagrees", message, remedy, file=str(scene.root))
 
 
-def neighbours(views: Sequence[View]) -> list[tuple[View, View]]:
-    """Return pairs of photos that probably show the same: up to `PAIRS` by pose, `PAIRS` by name.
+def neighbours(views: Sequence[View], count: int = PAIRS) -> list[tuple[View, View]]:
+    """Return pairs of photos that probably show the same: `count` by pose and by name at most.
 
     Wrong poses have wrong neighbours, but photos are mostly taken in the order of their names.
     """
     position = np.stack([view.c2w[:3, 3] for view in views])
+    pairs = near_by_pose(views, count)
+    named = {(a.name, b.name) for a, b in pairs}
+    for i in np.unique(np.linspace(0, len(views) - 2, count).astype(int)):
+        moved = np.linalg.norm(position[i] - position[i + 1]) > 0
+        if moved and (views[i].name, views[i + 1].name) not in named:
+            pairs.append((views[i], views[i + 1]))
+    return pairs
+
+
+def near_by_pose(views: Sequence[View], count: int = PAIRS) -> list[tuple[View, View]]:
+    """Return up to `count` pairs of photos with similar poses."""
+    position = np.stack([view.c2w[:3, 3] for view in views])
     axis = np.stack([view.c2w[:3, 2] for view in views])
     pairs = []
-    for i in np.unique(np.linspace(0, len(views) - 1, 2 * PAIRS).astype(int)):
+    for i in np.unique(np.linspace(0, len(views) - 1, 2 * count).astype(int)):
         distance = np.linalg.norm(position - position[i], axis=1)
         similar = axis @ axis[i] > np.cos(np.radians(MAX_ANGLE))
         near = np.where(similar & (distance > 0), distance, np.inf)
@@ -135,13 +258,7 @@ def neighbours(views: Sequence[View]) -> list[tuple[View, View]]:
         j = int(order[1] if len(order) > 1 and np.isfinite(near[order[1]]) else order[0])
         if np.isfinite(near[j]):
             pairs.append((views[i], views[j]))
-    pairs = pairs[:: max(1, -(-len(pairs) // PAIRS))]
-    named = {(a.name, b.name) for a, b in pairs}
-    for i in np.unique(np.linspace(0, len(views) - 2, PAIRS).astype(int)):
-        moved = np.linalg.norm(position[i] - position[i + 1]) > 0
-        if moved and (views[i].name, views[i + 1].name) not in named:
-            pairs.append((views[i], views[i + 1]))
-    return pairs
+    return pairs[:: max(1, -(-len(pairs) // count))]
 
 
 def match(scene: Scene, a: View, b: View) -> Match:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +12,35 @@ from jaxtyping import Float
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.listing import is_passed_over
+from climatenerf.scene.checks.labels import label_findings
+from climatenerf.scene.checks.sampling import MIN_POINTS, projected, sample, unreadable
 from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.image_files import PHOTO_SUFFIXES, open_image
-from climatenerf.scene.images import SATURATED, load_depth, load_labels, load_mask
+from climatenerf.scene.images import SATURATED, check_sidecar, load_depth, load_mask
 from climatenerf.scene.scene import Scene, View
 
-MAX_FILES = 24  # of each kind whose pixels are read
-MIN_POINTS = 20  # points of a view on known depths, usable pixels or labels
 MAX_DEPTH_SPREAD = 0.15  # of log depth over points; metric depth is mostly within a tenth
-UNIT_FACTORS = (1000.0, 100.0, 39.37, 3.281, 1 / 3.281, 1 / 39.37, 0.01, 0.001)
-UNIT_TOLERANCE = 1.25  # of the scale; that of an assumed camera height is known to 30 %
-MAX_SKY_POINTS = 0.5  # fraction of points on the sky; distant trees and wires make some
+SIMILAR_FOLDERS = {
+    "labels": ("label",),
+    "masks": ("mask",),
+    "depth": ("depths",),
+}
+"""Names of folders that other programs give to what is read from each folder."""
+UNITS = {
+    1.0: "metres",
+    1000.0: "millimetres",
+    100.0: "centimetres",
+    39.37: "inches",
+    3.281: "feet",
+    0.001: "kilometres",
+    256.0: "1/256 m, as in KITTI",
+    5000.0: "1/5000 m, as in TUM RGB-D",
+    10000.0: "tenths of a millimetre",
+}
+"""Names of the units of depth files, by their number in a metre."""
+MIN_UNIT_RATIO = 2.0  # between depths and points; metres of a network are up to 1.5 times wrong
 MIN_HIDDEN_POINTS = 0.8  # fraction of points hidden by masks that are inverted
-SKY = 10  # Cityscapes train id
+MAX_DENSER = 2.0  # density of points on what masks show, over the mean; an object has more
 
 
 def sidecar_findings(scene: Scene) -> list[Finding]:
@@ -33,59 +49,42 @@ def sidecar_findings(scene: Scene) -> list[Finding]:
     Args:
         scene: Scene aligned to the world frame.
     """
-    return [*depth_findings(scene), *mask_findings(scene), *label_findings(scene)]
+    found = [*depth_findings(scene), *mask_findings(scene), *label_findings(scene)]
+    # Of a kind whose pixels could not be read, the headers tell nothing more.
+    unread = {each.file for each in found if each.severity == "error"}
+    return [*found, *(odd for odd in header_findings(scene) if odd.file not in unread)]
 
 
-def _sample(views: Sequence[View], path_of: Callable[[View], Path | None]) -> list[View]:
-    """Return up to `MAX_FILES` views that have a file, evenly spread."""
-    having = [view for view in views if path_of(view) is not None]
-    if len(having) <= MAX_FILES:
-        return having
-    return [having[i * len(having) // MAX_FILES] for i in range(MAX_FILES)]
+def header_findings(scene: Scene) -> list[Finding]:
+    """Return which sidecars cannot be read or have another shape than their photo, by kind.
 
-
-@dataclass(frozen=True)
-class _Projected:
-    """Sparse points of a view.
-
-    Attributes:
-        row: Pixel rows.
-        column: Pixel columns.
-        z: Z-depths, m.
-        length: Distances from the camera, m.
+    Headers of all files are read.
     """
-
-    row: np.ndarray
-    column: np.ndarray
-    z: np.ndarray
-    length: np.ndarray
-
-
-def _projected(scene: Scene, view: View) -> _Projected:
-    """Return a view's own points where they are recorded, otherwise all that fall into it."""
-    points = scene.points_world()
-    if points is None:
-        points = np.empty((0, 3))
-    elif view.seen is not None and len(view.seen):
-        points = points[view.seen]
-    c2w = scene.c2w_world(view)
-    camera = scene.cameras[view.camera]
-    local = (points - c2w[:3, 3]) @ c2w[:3, :3]
-    with np.errstate(all="ignore"):  # points at infinity overflow, and are left out
-        x, y = camera.project(local).T
-    inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height) & (local[:, 2] > 0)
-    local = local[inside]
-    return _Projected(
-        y[inside].astype(np.int64),
-        x[inside].astype(np.int64),
-        local[:, 2],
-        np.linalg.norm(local, axis=1),
-    )
+    findings = []
+    for kind, paths in (
+        ("label", [view.label_path for view in scene.views]),
+        ("mask", [view.mask_path for view in scene.views]),
+        ("depth", [view.depth_path for view in scene.views]),
+    ):
+        errors = []
+        for view, path in zip(scene.views, paths, strict=True):
+            try:
+                if path is not None:
+                    check_sidecar(path, scene.cameras[view.camera])
+            except UserError as error:
+                errors.append((error, path))
+        if errors:
+            odd = unreadable(*errors[0])
+            if len(errors) > 1:
+                count = counted(len(errors), f"{kind} file")
+                odd = replace(odd, message=f"{count} cannot be used; {odd.message}")
+            findings.append(odd)
+    return findings
 
 
 def depth_findings(scene: Scene) -> list[Finding]:
     """Return what is odd about the depth files: saturation, unit, kind of depth."""
-    views = _sample(scene.views, lambda view: view.depth_path)
+    views = sample(scene.views, lambda view: view.depth_path)
     if not views:
         return []
     findings, saturated, empty = [], 0, 0
@@ -95,10 +94,10 @@ def depth_findings(scene: Scene) -> list[Finding]:
         try:
             depth = load_depth(view, scene)
         except UserError as error:
-            return [_unreadable(error, view.depth_path)]
+            return [unreadable(error, view.depth_path)]
         assert depth is not None
         empty += not np.isfinite(depth).any()
-        at = _projected(scene, view)
+        at = projected(scene, view)
         value = depth[at.row, at.column]
         known = np.isfinite(value)
         if known.sum() >= MIN_POINTS:
@@ -145,17 +144,22 @@ def _kind_of_depth(
         yield Finding("depth-disagrees", message, remedy)
         return
     times = float(np.exp(np.median(ratio)))
-    # A wrong scale of the scene differs less than two units of length do.
-    tolerance = UNIT_TOLERANCE if scene.scale_error < 0.1 else 2.0
-    for factor in UNIT_FACTORS:
-        if max(times / factor, factor / times) < tolerance and abs(np.log(factor)) > 3:
-            message = (
-                f"The depth files are {times:.4g} times the depths in metres"
-                f" (scale from {scene.scale_source}), as if in another unit"
-            )
-            remedy = "convert NPY and NPZ to metres; give the scale of PNG in transforms.json"
-            yield Finding("depth-unit", message, remedy)
-            return
+    # The error of the scale is one standard deviation.
+    if max(times, 1 / times) < max(MIN_UNIT_RATIO, (1 + scene.scale_error) ** 2):
+        return
+    path = next(view.depth_path for view in scene.views if view.depth_path is not None)
+    in_a_metre = times / (scene.depth_scale if path.suffix == ".png" else 1.0)
+    unit = min(UNITS, key=lambda number: abs(np.log(in_a_metre / number)))
+    message = (
+        f"The depth files are {times:.3g} times the depths of the sparse points in metres (scale"
+        f" from {scene.scale_source}, +-{scene.scale_error:.0%}), as if one metre had"
+        f" {in_a_metre:.4g} units of theirs (nearest: {UNITS[unit]})"
+    )
+    remedy = (
+        "convert NPY and NPZ to metres, give the scale of PNG in transforms.json, or give the scale"
+        " of the scene if that is wrong"
+    )
+    yield Finding("depth-unit", message, remedy)
 
 
 def _spread(values: Float[np.ndarray, " n"]) -> float:
@@ -175,21 +179,24 @@ def _saturated(path: Path | None) -> bool:
 
 def mask_findings(scene: Scene) -> list[Finding]:
     """Return which masks hide all of their photo, none of it, or what points were found on."""
-    views = _sample(scene.views, lambda view: view.mask_path)
-    full, hidden_by_any, hidden_points = [], False, []
+    views = sample(scene.views, lambda view: view.mask_path)
+    full, hidden_by_any = [], False
+    hidden_points, denser = [], []  # denser: fraction of the points over that of the area shown
     for view in views:
         try:
             usable = load_mask(view, scene)
         except UserError as error:
-            return [_unreadable(error, view.mask_path)]
+            return [unreadable(error, view.mask_path)]
         assert usable is not None
         hidden_by_any |= not usable.all()
         if not usable.any():
             full.append(view.name)
             continue
-        at = _projected(scene, view) if view.seen is not None else None
-        if at is not None and len(at.z) >= MIN_POINTS:
-            hidden_points.append(1 - float(usable[at.row, at.column].mean()))
+        at = projected(scene, view)
+        if len(at.z) >= MIN_POINTS:
+            shown = float(usable[at.row, at.column].mean())
+            hidden_points.append(1 - shown)
+            denser.append(shown / float(usable.mean()))
     findings, folder = [], str(views[0].mask_path.parent) if views and views[0].mask_path else ""
     if full:
         message = (
@@ -204,44 +211,13 @@ def mask_findings(scene: Scene) -> list[Finding]:
         message = f"None of {len(views)} masks that were looked at hides anything"
         remedy = "check that pixels to hide are black (0)"
         findings.append(Finding("mask-hides-nothing", message, remedy, "note", folder))
-    if hidden_points and np.median(hidden_points) > MIN_HIDDEN_POINTS:
-        message = (
-            f"The masks hide {np.median(hidden_points):.0%} of the points that the poses were"
-            " found with, as if they were inverted"
-        )
+    # Masks that show an object alone hide most points too, but show where they are dense.
+    hidden = float(np.median(hidden_points)) if hidden_points else 0.0
+    if hidden > MIN_HIDDEN_POINTS and np.median(denser) < MAX_DENSER:
+        message = f"The masks hide {hidden:.0%} of the sparse points, as if they were inverted"
         remedy = "black hides a pixel; invert the masks"
         findings.append(Finding("mask-inverted", message, remedy, file=folder))
     return findings
-
-
-def label_findings(scene: Scene) -> list[Finding]:
-    """Return whether labels have undefined ids, or show sky where there are points."""
-    on_sky = []
-    for view in _sample(scene.views, lambda view: view.label_path):
-        try:
-            labels = load_labels(view, scene)
-        except UserError as error:
-            code = "labels-foreign" if "does not define" in str(error) else "unreadable"
-            return [_unreadable(error, view.label_path, code)]
-        assert labels is not None
-        if view.seen is None or not (labels == SKY).any():
-            continue
-        at = _projected(scene, view)
-        if len(at.z) >= MIN_POINTS:
-            on_sky.append(float((labels[at.row, at.column] == SKY).mean()))
-    if not on_sky or np.median(on_sky) <= MAX_SKY_POINTS:
-        return []
-    message = (
-        f"{np.median(on_sky):.0%} of the sparse points lie on what the labels call sky, as if the"
-        " labels had another numbering"
-    )
-    remedy = "set --label-space, or leave labels out"
-    return [Finding("labels-disagree", message, remedy, file=str(scene.root / "labels"))]
-
-
-def _unreadable(error: UserError, path: Path | None, code: str = "unreadable") -> Finding:
-    cause, _, remedy = str(error).removesuffix(".").rpartition("; ")
-    return Finding(code, cause or remedy, remedy if cause else "", "error", str(path))
 
 
 def unused_findings(
@@ -254,12 +230,14 @@ def unused_findings(
         posed: All photos with poses, also those that are left out for another reason.
         reported: Files that another finding names.
     """
-    used = {str(view.path) for view in posed} | {str(path) for path in reported}
-    for view in posed:
-        used |= {str(p) for p in (view.label_path, view.mask_path, view.depth_path) if p}
+    files = [view.path for view in posed] + list(reported)
+    files += [view.label_path for view in posed if view.label_path]
+    files += [view.mask_path for view in posed if view.mask_path]
+    files += [view.depth_path for view in posed if view.depth_path]
+    used = {os.path.normpath(path) for path in files}
     findings = []
     left_out = []
-    for folder in sorted({view.path.parent for view in scene.views}):
+    for folder in sorted({Path(os.path.normpath(view.path.parent)) for view in scene.views}):
         left_out += [path for path in _photos(folder) if str(path) not in used]
     if left_out:
         message = (
@@ -270,7 +248,7 @@ def unused_findings(
             Finding("photo-without-pose", message, severity="note", file=str(left_out[0].parent))
         )
     for kind in ("labels", "masks", "depth"):
-        folder = scene.root / kind
+        folder = Path(os.path.normpath(scene.root / kind))
         files = [path for path in _photos(folder, {*PHOTO_SUFFIXES, ".npy", ".npz"})]
         extra = [path.name for path in files if str(path) not in used]
         if not extra or len(extra) == len(files):  # none used: `sidecar-partial` reports that
@@ -279,6 +257,26 @@ def unused_findings(
         findings.append(
             Finding("sidecar-unused", f"{message} ({examples(extra)})", "", "note", str(folder))
         )
+    return [*findings, *folder_findings(scene)]
+
+
+def folder_findings(scene: Scene) -> list[Finding]:
+    """Return folders that seem to hold sidecars but have a name that is not read."""
+    used = {
+        path.parent
+        for view in scene.views
+        for path in (view.path, view.label_path, view.mask_path, view.depth_path)
+        if path is not None
+    }
+    findings = []
+    for read, others in SIMILAR_FOLDERS.items():
+        for name in others:
+            folder = scene.root / name
+            files = _photos(folder, {*PHOTO_SUFFIXES, ".npy", ".npz"})
+            if files and folder not in used and not (scene.root / read).is_dir():
+                message = f"{counted(len(files), 'file')} in {name}/, which is not read"
+                remedy = f"name the folder {read} to use them"
+                findings.append(Finding("sidecar-unused", message, remedy, "note", str(folder)))
     return findings
 
 

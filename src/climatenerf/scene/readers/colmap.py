@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError, explain
 from climatenerf.core.listing import visible
+from climatenerf.core.regular_files import check_regular
 from climatenerf.core.rotations import rotation_matrices
 from climatenerf.core.text import decode, lines_of, read_text
 from climatenerf.scene.file_names import FileNames
@@ -48,6 +49,7 @@ _ONE_FOCAL = (
     "RADIAL_FISHEYE",
 )
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "input", "rgb", ".")
+MAX_LACKING = 0.05  # fraction of the points that images show and the model may lack
 _FEATURE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 
@@ -112,7 +114,12 @@ def read_colmap(root: Path) -> Capture:
         cameras=tuple(by_id[i] for i in ids),
         views=views,
         points=points if len(points) else None,
-        findings=(*findings, *_feature_lines(model, chosen), *files.findings()),
+        findings=(
+            *findings,
+            *_feature_lines(model, chosen),
+            *_lacking_points(model, chosen, point_ids),
+            *files.findings(),
+        ),
         ambiguous=files.ambiguous_paths(),
     )
 
@@ -128,6 +135,23 @@ def _feature_lines(model: Path, images: list[_Image]) -> list[Finding]:
     )
     remedy = "export the model with features if that is possible"
     return [Finding("model-lines", message, remedy, "note", str(model))]
+
+
+def _lacking_points(model: Path, images: list[_Image], ids: Int[np.ndarray, " n"]) -> list[Finding]:
+    """Return a finding if images show points that the model lacks, as after a file was cut off."""
+    observed = [image.points[image.points >= 0] for image in images if image.points is not None]
+    shown = np.unique(np.concatenate(observed)) if observed else np.empty(0, np.int64)
+    lacking = int((~np.isin(shown, ids)).sum())
+    if lacking <= MAX_LACKING * len(shown):
+        return []
+    message = (
+        f"{lacking} of the {len(shown)} points that the images of the COLMAP model {model} show are"
+        " not among its points"
+    )
+    if not any((model / f"points3D{suffix}").is_file() for suffix in (".bin", ".txt")):
+        message += ", since it has no points3D file"
+    remedy = "restore points3D.bin or points3D.txt, or export the model again"
+    return [Finding("points-missing", message, remedy, file=str(model))]
 
 
 def largest_model(root: Path) -> Path:
@@ -259,6 +283,7 @@ class _Cursor:
     def __init__(self, path: Path):
         self.path = path
         try:
+            check_regular(path)
             self.data = path.read_bytes()
         except OSError as error:
             raise explain(error, path) from None

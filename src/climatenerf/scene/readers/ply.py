@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core.errors import UserError, explain, one_line
+from climatenerf.core.regular_files import check_regular
 from climatenerf.core.storage import write_bytes
 
 MAX_POSITION = 1e9
@@ -42,6 +43,7 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
         UserError: The file is missing, damaged, or not a point cloud.
     """
     try:
+        check_regular(path)
         raw = path.read_bytes()
     except OSError as error:
         if not isinstance(error, FileNotFoundError):

@@ -22,7 +22,8 @@ from jaxtyping import Float
 from climatenerf.core import parsing
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
-from climatenerf.scene.file_names import FileNames, normalised
+from climatenerf.core.regular_files import check_regular
+from climatenerf.scene.file_names import FileNames, folded, normalised
 from climatenerf.scene.findings import Finding, counted, examples
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import read_header
@@ -79,12 +80,17 @@ def read_transforms(root: Path) -> Capture:
     for name, path in by_name.items():
         data = _load(path)
         train, heldout = _listed_split(data)
+        # A listed name that no frame has exactly may differ from that of a frame in its spelling.
+        exact = {normalised(frame["file_path"]) for frame in data["frames"]}
+        respelled = {folded(name): name for name in (train | heldout) - exact}
         predefined_split |= bool(train or heldout) or name in SPLIT_FILES
         for frame in data["frames"]:
             view = _view(frame, data, files_below, path, cameras)
             absent += _absent_depth(frame, view, files_below)
             absent += _count_unread(frame, files_below, unread)
+            _count_frame_scales(frame, data, unread)
             key = normalised(frame["file_path"])
+            key = respelled.get(folded(key), key)
             held_out = key in heldout or name in SPLIT_FILES[1:]
             if not train or key in train or held_out:
                 views.append(replace(view, split="heldout" if held_out else "train"))
@@ -92,11 +98,15 @@ def read_transforms(root: Path) -> Capture:
                 unlisted += 1
         absent += _count_unread(data, files_below, unread)
         depth_scale = _depth_scale(data, str(path)) or depth_scale
+        if len({data[key] for key in _DEPTH_SCALES if data.get(key) is not None}) > 1:
+            unread[f"{_DEPTH_SCALES[1]}, which contradicts {_DEPTH_SCALES[0]}"] = 1
         transforms += _point_transforms(data)
-        if isinstance(cloud := data.get("ply_file_path"), str):
+        cloud = data.get("ply_file_path")
+        if isinstance(cloud, str):
             if (file := files_below.find(cloud)) is not None:
                 points = read_points(file)
             elif cloud not in files_below.ambiguous:
+                check_regular(files_below.folder / normalised(cloud))
                 absent.append(cloud)
     if unlisted and not views:
         raise UserError(
@@ -162,13 +172,32 @@ def _count_unread(table: dict[str, Any], files: FileNames, unread: dict[str, int
     for key, value in table.items():
         if key in _UNREAD_NUMBERS:
             found = isinstance(value, int | float) and bool(value)
-        elif key in _READ_PATHS or not _names_a_file(key, value):
+        elif key in _READ_PATHS:
+            found = not isinstance(value, str | None)
+            key = f"{key} that is no text"
+        elif not _names_a_file(key, value):
             continue
         elif not (found := files.find(value) is not None) and value not in files.ambiguous:
             absent += [] if _is_folder(files.folder / normalised(value)) else [value]
         if found:
             unread[key] = unread.get(key, 0) + 1
     return absent
+
+
+def _count_frame_scales(
+    frame: dict[str, Any], data: dict[str, Any], unread: dict[str, int]
+) -> None:
+    """Count the units of depth files that a frame has for itself and that differ from the file's.
+
+    Args:
+        frame: A frame.
+        data: The whole file.
+        unread: Gets the counts.
+    """
+    for key in _DEPTH_SCALES:
+        if frame.get(key) is not None and frame[key] != data.get(key):
+            name = f"{key} of single frames"
+            unread[name] = unread.get(name, 0) + 1
 
 
 def _names_a_file(key: str, value: Any) -> bool:
@@ -262,6 +291,7 @@ def _view(
         names = [f"{relative}{suffix}" for suffix in _IMAGE_SUFFIXES]
         found = files.find_any(names)
         name = next((name for name in names if name in files.ambiguous), names[0])
+        files.note_alternatives(relative, names)
         path = found or files.folder / name
     name = relative.removeprefix("images/")
     name = name if Path(name).suffix == path.suffix else name + path.suffix
@@ -288,6 +318,8 @@ def _camera(frame: dict[str, Any], data: dict[str, Any], path: Path, where: str)
     def number(key: str, default: float | None = None) -> float | None:
         value = frame.get(key, data.get(key, default))
         try:
+            if isinstance(value, bool):
+                raise TypeError
             return None if value is None else float(value)
         except (TypeError, ValueError, OverflowError):
             raise UserError(f"{key} in {where} is not a number; correct the file.") from None
