@@ -32,10 +32,9 @@ FINE = 1.2  # m; cells from which on outliers cost their logarithm
 MAX_COUNT = 8.0  # heights in one of the finest cells that count as independent
 GROWTH = 0.04  # m of standard error a metre away from the nearest height, on level ground
 MIN_ERROR = 0.01  # m
-MIN_TRUST = 0.1  # of a height; below it, it is an outlier and shows nothing of the ground
-SPREAD = 1.6  # standard errors in the mean distance of trusted heights from the ground
+SPREAD = 1.25  # standard errors in the mean distance of heights from the ground
 MAX_RESIDUAL = 0.3  # m; larger ones are errors of the data, not of the ground
-DATA_AREA = 2e-3  # m^4; a height of standard error s weighs this over s^2 against the energies
+DATA_AREA = 1e-3  # m^4; a height of standard error s weighs this over s^2 against the energies
 DIRECT = 6000  # nodes up to which systems are solved directly
 
 
@@ -56,7 +55,11 @@ class Heights:
 
 
 def fit_heights(
-    heights: Heights, origin: tuple[float, float], cell: float, shape: tuple[int, int]
+    heights: Heights,
+    origin: tuple[float, float],
+    cell: float,
+    shape: tuple[int, int],
+    discard_outliers: bool = False,
 ) -> tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"]]:
     """Fit a ground to heights.
 
@@ -65,6 +68,8 @@ def fit_heights(
         origin: world x and y of the first node, m.
         cell: distance between nodes, m.
         shape: rows and columns of nodes.
+        discard_outliers: whether many heights may be wrong, most of them too high: points of leaves
+            and walls.
 
     Returns:
         Height and its standard error at each node, m.
@@ -78,7 +83,7 @@ def fit_heights(
         size = tuple(-(-(n - 1) // factor) + 1 for n in shape)
         start = np.zeros(size) if solution is None else _enlarged(solution, size)
         data = _binned(heights, origin, cell * factor, start, middle, MAX_COUNT * factor**2)
-        solution = _solve(data, start, cell * factor)
+        solution = _solve(data, start, cell * factor, discard_outliers)
         if factor == 1:
             break
         factor //= 2
@@ -141,27 +146,31 @@ def _enlarged(
     return ndimage.map_coordinates(coarse, at, order=1, mode="nearest")
 
 
-def _solve(data: _Cells, start: Float[np.ndarray, "r c"], cell: float) -> Float[np.ndarray, "r c"]:
+def _solve(
+    data: _Cells, start: Float[np.ndarray, "r c"], cell: float, discard_outliers: bool
+) -> Float[np.ndarray, "r c"]:
     """Minimise on one raster, from a start, by reweighted least squares.
 
-    Outliers cost linearly (Huber). On fine rasters they then cost only their logarithm (Cauchy),
-    and heights above the surface less than those below: leaves and walls labelled ground stand on
-    it, and would lift it.
+    Outliers cost linearly (Huber). Those that may be discarded cost only their logarithm (Cauchy)
+    on fine rasters, and heights above the surface less than those below.
     """
     bends, slopes = _differences(start.shape, cell)
     area = cell**2
     stretching = TENSION * area * (slopes.T @ slopes)
+    # Heights are few where outliers are many, and must still carry a bank.
+    area_of_data = 2 * DATA_AREA if discard_outliers else DATA_AREA
     h: Any = start.reshape(-1)
     for k in range(ROUNDS):
         residual = (data.z - h[data.row]) * np.sqrt(data.weight) / OUTLIER
         cauchy = 1 + np.where(residual > 0, 1, BELOW) * residual**2
-        trust = data.weight / (cauchy if k and cell < FINE else np.maximum(np.abs(residual), 1))
+        discard = discard_outliers and k > 0 and cell < FINE
+        trust = data.weight / (cauchy if discard else np.maximum(np.abs(residual), 1))
         curvature = np.abs(bends @ h)
         stiffness: Any = BENDING * area / np.maximum(curvature / BEND_LIMIT, 1)
         matrix: Matrix = (bends.T @ sparse.diags_array(stiffness) @ bends + stretching).tocsr()
         own, target = np.zeros(h.size), np.zeros(h.size)
-        own[data.row] = trust * DATA_AREA
-        target[data.row] = trust * DATA_AREA * data.z
+        own[data.row] = trust * area_of_data
+        target[data.row] = trust * area_of_data * data.z
         matrix = matrix + sparse.diags_array(own)
         if h.size <= DIRECT:
             h = linalg.spsolve(matrix.tocsc(), target)
@@ -205,27 +214,25 @@ def _standard_error(
 ) -> Float[np.ndarray, "r c"]:
     """Return the error of the heights: the data's spread near by, growing away from the data.
 
-    Outliers count as little as in the fit.
-
     On a slope it grows faster, since tension forgets the slope: at a distance x from the data,
     x^2 / 2 over the length of forgetting is missing for each unit of slope.
     """
-    off = np.abs(solution.reshape(-1)[data.row] - data.z)
-    trust, residual = np.zeros(solution.size), np.zeros(solution.size)
-    trust[data.row] = 1 / (1 + (off * np.sqrt(data.weight) / OUTLIER) ** 2)
-    residual[data.row] = trust[data.row] * np.minimum(off, MAX_RESIDUAL)
-    known = (trust >= min(MIN_TRUST, trust.max())).reshape(solution.shape)
+    known = np.zeros(solution.size, bool)
+    known[data.row] = True
+    known = known.reshape(solution.shape)
+    residual = np.zeros(solution.size)
+    residual[data.row] = np.minimum(np.abs(solution.reshape(-1)[data.row] - data.z), MAX_RESIDUAL)
     radius = max(round(1.0 / cell), 1)  # nodes; a metre
     share, mean, uphill, across = (
         ndimage.uniform_filter(each.astype(float), 2 * radius + 1, mode=mode)
         for each, mode in (
-            (trust.reshape(solution.shape), "constant"),
+            (known, "constant"),
             (residual.reshape(solution.shape), "constant"),
             *((slope, "nearest") for slope in np.gradient(solution, cell)),
         )
     )
     distance, nearest = nearest_known(known, cell)
-    spread = (mean / np.maximum(share, 1e-9))[nearest]  # at data the trust is above 0
+    spread = (mean / np.maximum(share, 1e-9))[nearest]  # at data the share is above 0
     growth = GROWTH * distance
     forgotten = np.hypot(uphill, across)[nearest] * distance**2 / (2 * np.sqrt(BENDING / TENSION))
     return np.sqrt(np.maximum(SPREAD * spread, MIN_ERROR) ** 2 + growth**2 + forgotten**2)

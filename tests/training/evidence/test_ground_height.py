@@ -43,7 +43,7 @@ def test_hills_are_fitted_despite_a_fifth_of_outliers():
     assert ground is not None
     queries = positions(2000, seed=2, half=3.0)
     height, valid = ground.height_above(points(queries, hills(queries)))
-    assert valid.float().mean() > 0.99
+    assert valid.float().mean() > 0.95
     assert height.abs().median() < 3e-3 and height.abs().quantile(0.95) < 0.015
     # A tenth of a unit above the ground is measured as such.
     above, _ = ground.height_above(points(queries, hills(queries) + 0.1))

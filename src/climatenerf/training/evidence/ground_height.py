@@ -27,6 +27,7 @@ MAX_ERROR = 0.03  # grid units; ground that is known worse is not valid
 CREST_RADIUS = 0.5  # grid units; a ball must be above all ground within this distance
 SUPPORT_CELLS = 64  # cells along a side of the grid that marks where points support the height
 MIN_TOLERANCE = 4e-3  # grid units; kerbs and tufts of grass that the raster cannot resolve
+TOLERANCE_FACTOR = 1.5  # smallest tolerance over the median residual of the measured heights
 
 
 @dataclass(frozen=True)
@@ -113,11 +114,12 @@ def fit_ground_height(
     x = heights.with_more(patches).x
     residual = np.abs(raster.sample(raster.height, x[:, :2]) - x[:, 2])
     q = (x - centre)[residual < raster.sample(raster.error, x[:, :2])] / unit
+    roughness = float(np.median(residual[: len(heights.x)])) / unit
     spread = to_device(raster.error / np.float32(unit), device)
     height = ((raster.height - centre[2]) / unit).astype(np.float32)
     return GroundHeight(
         height=to_device(height, device),
-        tolerance=spread.clamp_min(MIN_TOLERANCE),
+        tolerance=spread.clamp_min(max(MIN_TOLERANCE, TOLERANCE_FACTOR * roughness)),
         valid=spread < MAX_ERROR,
         supported=_supported_cells(to_device(q.astype(np.float32), device)),
     )
@@ -127,7 +129,7 @@ def _fitted(heights: Heights, centre: Float[np.ndarray, "3"], unit: float) -> He
     """Return the surface through heights, on the raster about the scene's centre."""
     origin = (float(centre[0]) - HALF_SIDE * unit, float(centre[1]) - HALF_SIDE * unit)
     cell = 2 * HALF_SIDE * unit / (NODES - 1)
-    return HeightRaster(origin, cell, *fit_heights(heights, origin, cell, (NODES, NODES)))
+    return HeightRaster(origin, cell, *fit_heights(heights, origin, cell, (NODES, NODES), True))
 
 
 def _interpolated(
