@@ -12,7 +12,6 @@ import itertools
 import os
 import signal
 import sys
-import threading
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import climatenerf
 from climatenerf.cli import streams
+from climatenerf.cli.interruption import stopped_like_ctrl_c
 from climatenerf.core.errors import UserError, explain, one_line
 
 # Set before torch and Numba are imported, unless the user has set them. Both load an OpenMP run
@@ -33,8 +33,6 @@ THREADING = {
     "KMP_BLOCKTIME": "0",
     "NUMBA_THREADING_LAYER_PRIORITY": "omp tbb workqueue",
 }
-SECONDS_TO_NEXT_SIGNAL = 0.05
-"""After which a signal is repeated whose exception Python has dropped."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     received: list[int] = []
     try:
         try:
-            with _stopped_like_ctrl_c(received), _without_warnings():
+            with stopped_like_ctrl_c(received), _without_warnings():
                 return _run(words)
         finally:
             streams.flush_output()
@@ -167,52 +165,6 @@ def _without_warnings() -> Iterator[None]:
         if not sys.warnoptions and not os.environ.get("CLIMATENERF_DEBUG"):
             warnings.simplefilter("ignore")
         yield
-
-
-@contextlib.contextmanager
-def _stopped_like_ctrl_c(received: list[int]) -> Iterator[None]:
-    """Let `kill` and a closed terminal end a verb as Ctrl-C does: with clean-up and a message.
-
-    Args:
-        received: gets the number of each signal.
-    """
-
-    def stop(number: int, frame: object) -> None:
-        received.append(number)
-        raise KeyboardInterrupt(number)
-
-    def stop_again(unraisable: "sys.UnraisableHookArgs") -> None:
-        # Python drops an exception that leaves a finaliser or a callback, of imports too.
-        if isinstance(unraisable.exc_value, KeyboardInterrupt) and received:
-            timer = threading.Timer(SECONDS_TO_NEXT_SIGNAL, _interrupt_main_thread, received[-1:])
-            timer.daemon = True
-            timer.start()
-        else:
-            hook(unraisable)
-
-    replaced = {}
-    hook, sys.unraisablehook = sys.unraisablehook, stop_again
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):  # Windows lacks the last
-            number = getattr(signal, name, None)
-            # Ignored signals (nohup) and foreign handlers stay as they are.
-            usual = (signal.SIG_DFL, signal.default_int_handler)
-            if number is not None and (handler := signal.getsignal(number)) in usual:
-                replaced[number] = handler
-                signal.signal(number, stop)
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        for number, handler in replaced.items():
-            signal.signal(number, handler)
-
-
-def _interrupt_main_thread(number: int) -> None:
-    if hasattr(signal, "pthread_kill"):  # it also ends a wait of the main thread
-        signal.pthread_kill(threading.main_thread().ident or 0, number)
-    else:
-        signal.raise_signal(number)
 
 
 def _run(words: list[str]) -> int:
