@@ -164,9 +164,9 @@ def test_the_error_covers_a_slope_that_goes_on(degrees):
     height, error = fit(x)
     u, v = nodes(height.shape)
     off = np.abs(height - steep(u, v))
-    assert off[u > 10].min() > 0.12, "it fades"
+    assert off[u > 10].min() > 0.14, "it fades"
     assert (off <= 2 * error)[u > 4.5].mean() > 0.9
-    assert np.median((off / error)[u > 6]) > 0.35, "and is no excuse"
+    assert np.median((off / error)[u > 6]) > 0.4, "and is no excuse"
 
 
 def test_heights_of_a_small_error_count_more():
@@ -180,7 +180,7 @@ def test_heights_of_a_small_error_count_more():
 def test_heights_beyond_the_raster_are_left_out():
     x = measured(sloped, noise=0.01)
     far = np.c_[np.full((50, 2), -40.0), np.full(50, 9e3)]
-    assert np.abs(fit(np.r_[x, far])[0] - fit(x)[0]).max() < 1e-3
+    assert np.array_equal(fit(np.r_[x, far])[0], fit(x)[0])
 
 
 def test_a_fit_is_deterministic_and_does_not_depend_on_the_order():

@@ -35,6 +35,7 @@ MIN_ERROR = 0.01  # m
 SPREAD = 1.25  # standard errors in the mean distance of heights from the ground
 MAX_RESIDUAL = 0.3  # m; larger ones are errors of the data, not of the ground
 DATA_AREA = 1e-3  # m^4; a height of standard error s weighs this over s^2 against the energies
+SPARSE_DATA_AREA = 2e-3  # m^4; with outliers the heights that are left must still carry a bank
 DIRECT = 6000  # nodes up to which systems are solved directly
 
 
@@ -74,6 +75,9 @@ def fit_heights(
     Returns:
         Height and its standard error at each node, m.
     """
+    end = np.array(origin) + cell * (np.array(shape[::-1]) - 1)
+    inside = ((heights.x[:, :2] >= origin) & (heights.x[:, :2] <= end)).all(-1)
+    heights = Heights(heights.x[inside], heights.error[inside])
     factor = 1
     while max(shape) / factor > 2 * COARSEST:
         factor *= 2
@@ -157,8 +161,7 @@ def _solve(
     bends, slopes = _differences(start.shape, cell)
     area = cell**2
     stretching = TENSION * area * (slopes.T @ slopes)
-    # Heights are few where outliers are many, and must still carry a bank.
-    area_of_data = 2 * DATA_AREA if discard_outliers else DATA_AREA
+    data_area = SPARSE_DATA_AREA if discard_outliers else DATA_AREA
     h: Any = start.reshape(-1)
     for k in range(ROUNDS):
         residual = (data.z - h[data.row]) * np.sqrt(data.weight) / OUTLIER
@@ -169,8 +172,8 @@ def _solve(
         stiffness: Any = BENDING * area / np.maximum(curvature / BEND_LIMIT, 1)
         matrix: Matrix = (bends.T @ sparse.diags_array(stiffness) @ bends + stretching).tocsr()
         own, target = np.zeros(h.size), np.zeros(h.size)
-        own[data.row] = trust * area_of_data
-        target[data.row] = trust * area_of_data * data.z
+        own[data.row] = trust * data_area
+        target[data.row] = trust * data_area * data.z
         matrix = matrix + sparse.diags_array(own)
         if h.size <= DIRECT:
             h = linalg.spsolve(matrix.tocsc(), target)

@@ -176,7 +176,7 @@ def test_balls_below_a_nearby_crest_are_not_above_crests():
     assert ground is not None
     q = torch.tensor([[0.0, 0.0, -0.15], [0.0, 0.0, 0.9], [2.5, 0.0, 0.9]])
     assert ground.is_above_crests(q, torch.full((3,), 0.02)).tolist() == [False, True, True]
-    assert not ground.is_above_crests(q, torch.full((3,), 1.2)).any()
+    assert not ground.is_above_crests(q, torch.full((3,), 0.9)).any()
 
 
 def test_balls_above_ground_without_points_are_not_above_crests():
@@ -283,7 +283,7 @@ def test_ground_points_off_the_fitted_height_are_steps_and_exempt(monkeypatch):
     assert found.ground is not None
     height, valid = found.ground.height_above(q)
     off = height.abs() > found.ground.tolerance_at(q)
-    assert valid.float().mean() > 0.8 and 0.02 < off.float().mean() < 0.2
+    assert valid.all() and 0.02 < off.float().mean() < 0.2
     cells, _ = found.field.occupancy.cell_index(q[off])
     assert found.obstacle.view(-1)[cells].all() and found.near_step.view(-1)[cells].all()
     assert not found.near_step.view(-1)[

@@ -43,8 +43,8 @@ def test_hills_are_fitted_despite_a_fifth_of_outliers():
     assert ground is not None
     queries = positions(2000, seed=2, half=3.0)
     height, valid = ground.height_above(points(queries, hills(queries)))
-    assert valid.float().mean() > 0.95
-    assert height.abs().median() < 3e-3 and height.abs().quantile(0.95) < 0.015
+    assert valid.float().mean() > 0.99
+    assert height.abs().median() < 3e-3 and height.abs().quantile(0.95) < 0.012
     # A tenth of a unit above the ground is measured as such.
     above, _ = ground.height_above(points(queries, hills(queries) + 0.1))
     assert torch.allclose(above - height, torch.full((2000,), 0.1), atol=1e-5)
@@ -64,6 +64,23 @@ def test_the_tolerance_covers_the_error_and_grows_where_points_are_missing():
     assert (off < tolerance).float().mean() > 0.95
 
 
+def test_rough_ground_is_valid_and_holds_nothing():
+    """Boulders of half a grid unit on one side; smooth ground on the other."""
+    xy = positions(4000)
+    z = torch.zeros(4000)
+    rough = xy[:, 0] > 0.5
+    z[rough] = 0.5 * torch.rand(int(rough.sum()), generator=torch.Generator().manual_seed(6))
+    ground = fitted(points(xy, z))
+    assert ground is not None
+    queries = points(positions(1000, seed=7, half=3.0), torch.zeros(1000))
+    far, holds = (queries[:, 0] - 0.5).abs() > 0.5, ground.holds(queries)
+    boulders = queries[:, 0] > 0.5
+    assert ground.height_above(queries)[1].all()
+    assert holds[far & ~boulders].all() and holds[far & boulders].float().mean() < 0.25
+    outside = torch.tensor([[-4.5, 0.0, 0.0]])
+    assert not ground.holds(outside).any()
+
+
 def test_a_plane_is_exact_near_points_and_valid_there_only():
     xy = positions(60, half=0.8)
     ground = fitted(points(xy, 0.02 * xy[:, 0] - 0.01 * xy[:, 1] + 0.7))
@@ -73,8 +90,10 @@ def test_a_plane_is_exact_near_points_and_valid_there_only():
         points(queries, 0.02 * queries[:, 0] - 0.01 * queries[:, 1] + 0.7)
     )
     near = torch.cdist(queries, xy).amin(-1)
-    assert height[near < 0.2].abs().max() < 4e-3
-    assert valid[near < 0.2].all() and not valid[near > 1.5].any()
+    # The membrane flattens the border; the least tolerance covers it.
+    assert height[near < 0.2].abs().max() < ground_height.MIN_TOLERANCE
+    assert height[near < 0.2].abs().median() < 1e-3
+    assert valid[near < 0.2].all() and not valid[near > 0.8].any()
     outside = torch.tensor([[4.5, 0.0, 0.0], [4.0, 0.0, 0.0]])  # continued from the raster's border
     above, valid = ground.height_above(outside)
     assert not valid.any() and torch.allclose(above[0], above[1], atol=1e-5)

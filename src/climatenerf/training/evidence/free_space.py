@@ -270,11 +270,12 @@ class FreeSpace:
         """
         if self.ground is None:
             return t.new_zeros(0, dtype=torch.long), t[:0], t[:0] > 0
-        height, valid = self.ground.height_above(q)
+        height, _ = self.ground.height_above(q)
         height_ahead, _ = self.ground.height_above(q + STEP * rays_d)
         approach = (height - height_ahead) / STEP
         excess = height.sign() * (height.abs() - self.ground.tolerance_at(q)).clamp_min(0.0)
-        off = buffers.indices("off ground", valid & (approach > MIN_APPROACH) & (excess != 0))
+        held = self.ground.holds(q) & (approach > MIN_APPROACH)
+        off = buffers.indices("off ground", held & (excess != 0))
         cells, _ = self.field.occupancy.cell_index(q[off])
         penalised = torch.zeros_like(off, dtype=torch.bool)
         if use_classes:

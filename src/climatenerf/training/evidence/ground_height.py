@@ -15,7 +15,7 @@ from torch import Tensor
 
 from climatenerf.core.device import CPU, to_device
 from climatenerf.ops.cpu.ground_sweep import GroundPictures
-from climatenerf.scene.terrain import HeightRaster
+from climatenerf.scene.terrain import HeightRaster, nearest_known
 from climatenerf.scene.terrain_fit import Heights, fit_heights
 from climatenerf.training.evidence.ground_sweep import sweep_patches
 
@@ -23,8 +23,9 @@ NODES = 193  # of the height raster along a side
 HALF_SIDE = 4.0  # grid units, from the scene's centre to the raster's border
 MIN_POINTS = 20  # for a fit
 PATCH_SIDES = (0.12, 0.07)  # grid units, of the patches that are swept, one after the other
-MAX_ERROR = 0.03  # grid units; ground that is known worse is not valid
-CREST_RADIUS = 0.5  # grid units; a ball must be above all ground within this distance
+VALID_RADIUS = 0.5  # grid units around a height within which the ground is valid
+MAX_ERROR = 0.03  # grid units; ground that is known worse holds nothing
+CREST_RADIUS = 0.625  # grid units; a ball must be above all ground within this distance
 SUPPORT_CELLS = 64  # cells along a side of the grid that marks where points support the height
 MIN_TOLERANCE = 4e-3  # grid units; kerbs and tufts of grass that the raster cannot resolve
 TOLERANCE_FACTOR = 1.5  # smallest tolerance over the median residual of the measured heights
@@ -39,7 +40,11 @@ class GroundHeight:
     tolerance: Float[Tensor, "nodes nodes"]
     """Largest difference between the ground and `height` that is not an error."""
     valid: Bool[Tensor, "nodes nodes"]
-    """Nodes at which the height is known well enough."""
+    """Nodes within `VALID_RADIUS` of a measured height."""
+    holding: Bool[Tensor, "nodes nodes"]
+    """Valid nodes whose height is known well enough to hold matter to it."""
+    highest: Float[Tensor, "nodes nodes"]
+    """Upper bound of `height` and of the heights measured at the node: a spline rounds crests."""
     supported: Bool[Tensor, "cells cells"]
     """Cells of a coarser grid that contain a point or adjoin a cell that does; rows along y."""
 
@@ -56,7 +61,7 @@ class GroundHeight:
         """
         reach = round(CREST_RADIUS * (NODES - 1) / (2 * HALF_SIDE))
         highest = torch.nn.functional.max_pool2d(
-            (self.height + self.tolerance)[None], 2 * reach + 1, stride=1, padding=reach
+            self.highest[None], 2 * reach + 1, stride=1, padding=reach
         )[0]
         x, y = _nearest_node(q)
         inside = (q[:, :2].abs() < HALF_SIDE).all(-1)
@@ -76,6 +81,11 @@ class GroundHeight:
         x, y = _nearest_node(q)
         inside = (q[:, :2].abs() < HALF_SIDE).all(-1)
         return q[:, 2] - _interpolated(self.height, q), inside & self.valid[y, x]
+
+    def holds(self, q: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Return at which positions (grid units) matter can be held to the ground."""
+        x, y = _nearest_node(q)
+        return (q[:, :2].abs() < HALF_SIDE).all(-1) & self.holding[y, x]
 
     def tolerance_at(self, q: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Return the tolerance below or above positions (grid units)."""
@@ -115,12 +125,19 @@ def fit_ground_height(
     residual = np.abs(raster.sample(raster.height, x[:, :2]) - x[:, 2])
     q = (x - centre)[residual < raster.sample(raster.error, x[:, :2])] / unit
     roughness = float(np.median(residual[: len(heights.x)])) / unit
+    valid = to_device(_nodes_near(x, raster, VALID_RADIUS * unit), device)
     spread = to_device(raster.error / np.float32(unit), device)
     height = ((raster.height - centre[2]) / unit).astype(np.float32)
+    tolerance = spread.clamp_min(max(MIN_TOLERANCE, TOLERANCE_FACTOR * roughness))
+    highest = np.full(height.shape, -np.inf, np.float32)
+    np.maximum.at(highest, _nodes_of(x, raster), ((x[:, 2] - centre[2]) / unit).astype(np.float32))
+    bound = to_device(np.maximum(highest, height), device) + tolerance
     return GroundHeight(
         height=to_device(height, device),
-        tolerance=spread.clamp_min(max(MIN_TOLERANCE, TOLERANCE_FACTOR * roughness)),
-        valid=spread < MAX_ERROR,
+        tolerance=tolerance,
+        valid=valid,
+        holding=valid & (spread < MAX_ERROR),
+        highest=bound,
         supported=_supported_cells(to_device(q.astype(np.float32), device)),
     )
 
@@ -130,6 +147,24 @@ def _fitted(heights: Heights, centre: Float[np.ndarray, "3"], unit: float) -> He
     origin = (float(centre[0]) - HALF_SIDE * unit, float(centre[1]) - HALF_SIDE * unit)
     cell = 2 * HALF_SIDE * unit / (NODES - 1)
     return HeightRaster(origin, cell, *fit_heights(heights, origin, cell, (NODES, NODES), True))
+
+
+def _nodes_of(
+    x: Float[np.ndarray, "n 3"], raster: HeightRaster
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Return row and column of the node nearest to each point (world m), clamped to the raster."""
+    at = np.rint((x[:, :2] - np.array(raster.origin)) / raster.cell).astype(int)
+    column, row = at.clip(0, NODES - 1).T
+    return row, column
+
+
+def _nodes_near(
+    x: Float[np.ndarray, "n 3"], raster: HeightRaster, radius: float
+) -> Bool[np.ndarray, "nodes nodes"]:
+    """Return which nodes have a point within a horizontal distance (m), to half a cell."""
+    known = np.zeros((NODES, NODES), bool)
+    known[_nodes_of(x, raster)] = True
+    return nearest_known(known, raster.cell)[0] < radius
 
 
 def _interpolated(

@@ -83,10 +83,11 @@ def sweep_patches(pictures: GroundPictures, ground: HeightRaster, side: float) -
         ground: the expected heights.
         side: of a patch, m.
     """
-    nodes = ground.nodes()
-    (x, y), (last_x, last_y) = nodes[0, 0, :2], nodes[-1, -1, :2]
-    step = SPACING * side
-    lattice = np.meshgrid(np.arange(x, last_x, step), np.arange(y, last_y, step))
+    axes = (
+        first + np.arange(0.0, (nodes - 1) * ground.cell, SPACING * side)
+        for first, nodes in zip(ground.origin, ground.height.shape[::-1], strict=True)
+    )
+    lattice = np.meshgrid(*axes)
     xy = np.stack(lattice, axis=-1).reshape(-1, 2)
     uphill: Any = np.gradient(ground.height.astype(np.float64), ground.cell)
     height, error, dy, dx = (
