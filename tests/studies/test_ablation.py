@@ -72,6 +72,7 @@ def test_each_row_leaves_out_one_part():
         "no distortion": {"distortion"},
         "no normals": {"normals"},
         "no planarity": {"planarity"},
+        "no occlusion": {"occlusion"},
         "no sky": {"sky_labels"},
         "no depth": {"sparse_depth", "ground_height", "monocular_depth"},
         "full": set(),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from support.toy_fit import begin
 
-from climatenerf.core.classes import ROAD, SKY, UNKNOWN
+from climatenerf.core.classes import ROAD, SKY, UNKNOWN, VEGETATION, VEHICLE
 from climatenerf.ops import compositing
 from climatenerf.training import losses
 from climatenerf.training.losses import scale_gradient
@@ -65,6 +65,16 @@ def test_sparse_depth_loss_is_the_mean_distance_of_the_weights_from_the_point():
     assert torch.allclose(gradient, torch.tensor([0.25, 0.25, 0.25]) / 2)
 
 
+def test_nearness_is_2_at_the_camera_and_0_at_infinity():
+    offsets = torch.tensor([0, 1, 3, 4, 4])
+    t = torch.tensor([0.0, 0.5, 4.0, 1e12])
+    weights = torch.tensor([1.0, 0.5, 0.25, 1.0], requires_grad=True)
+    near = losses.nearness(weights, t, offsets)
+    assert near.tolist() == pytest.approx([2.0, 0.5 * 1.5 + 0.25 * 0.25, 0.0, 0.0], abs=1e-6)
+    (gradient,) = torch.autograd.grad(near.sum(), weights)
+    assert gradient.tolist() == pytest.approx([2.0, 1.5, 0.25, 0.0], abs=1e-6)
+
+
 def test_opacity_entropy_vanishes_at_0_and_1_with_finite_gradients():
     transmittance = torch.tensor([0.0, 1.0], requires_grad=True)
     loss = losses.opacity_entropy_loss(transmittance)
@@ -109,6 +119,18 @@ def test_unlabelled_surfaces_have_a_smaller_planarity_weight(scene):
     factor = Schedule().unlabelled_planarity
     assert found[ROAD] > 0 and found[SKY] == 0
     assert found[UNKNOWN] == pytest.approx(factor * found[ROAD], rel=1e-4) and factor < 1
+
+
+def test_occlusion_applies_to_what_stands_on_the_ground_and_ends(scene):
+    trainer, batch, rays = only(scene, loss="occlusion", weight=3.0)
+    near = losses.nearness(rays.weights, rays.t, rays.samples.offsets)
+    factor = Schedule().occlusion_weight(0.5)
+    for kind, share in ((VEGETATION, 1.0), (VEHICLE, 1.0), (ROAD, 0.0), (SKY, 0.0), (UNKNOWN, 0.0)):
+        labelled = replace(batch, label=torch.full_like(batch.label, kind))
+        found = trainer.objective.geometry(trainer.field, labelled, rays, 0.5)
+        assert float(found) == pytest.approx(3.0 * share * factor * float(near.mean()))
+    assert 0 < factor < Schedule().occlusion_weight(0.0) == 1
+    assert Schedule().occlusion_weight(0.6) == Schedule().occlusion_weight(1.0) == 0
 
 
 def test_distortion_and_opacity_entropy_of_a_step_are_the_formulas_times_their_weights(scene):

@@ -56,7 +56,7 @@ class Fit:
     photo, and keeps snow away. Default: gpu with --device cuda, else cpu."""
     loss: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """Weight of a loss, such as sky=0, which switches it off. Repeat the flag for other losses:
-    distortion, opacity_entropy, below_horizon_opacity, sky, sky_prior, planarity,
+    distortion, opacity_entropy, below_horizon_opacity, sky, sky_prior, occlusion, planarity,
     sparse_depth, ground_height, monocular_depth, classes, normals, normal_consistency, transient
     (docs/physics.md)."""
     refine_poses: bool = False

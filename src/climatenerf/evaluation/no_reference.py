@@ -116,10 +116,14 @@ def _ground_present(
 def _roughness(
     photos: list[PhotoRays], labels: list[UInt8[np.ndarray, "h w"] | None]
 ) -> tuple[float | None, str]:
-    """Return the RMS distance (cm) of ends labelled ground from planes through patches of 2 m."""
+    """Return the RMS distance (cm) of ends on ground from planes through patches of 2 m.
+
+    Photo and field must both classify an end as ground: single photos label forests as ground.
+    """
     parts = [np.zeros((0, 3))]
     for photo, ground in _labelled_ground(photos, labels):
-        parts.append(photo.x[ground & (photo.t < NEAR_GROUND)])
+        agreed = ground & np.isin(photo.label, GROUND)
+        parts.append(photo.x[agreed & (photo.t < NEAR_GROUND)])
     x = np.concatenate(parts)
     if len(x) < MIN_ENDS:
         return None, "no photo has labels of ground that is near"

@@ -89,6 +89,7 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         "no distortion": without(distortion=0.0),
         "no normals": without(normals=0.0),
         "no planarity": without(planarity=0.0),
+        "no occlusion": without(occlusion=0.0),
         "no sky": dataclasses.replace(full, sky_labels=False),
         "no depth": without(sparse_depth=0.0, ground_height=0.0, monocular_depth=0.0),
         "full": full,

@@ -401,3 +401,8 @@ def sky_edge(label: UInt8[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def is_ground(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Return which merged classes are ground."""
     return torch.stack([label == kind for kind in GROUND]).any(0)
+
+
+def is_standing(label: Int[Tensor, "n"] | UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Return which merged classes stand on the ground."""
+    return torch.stack([label == kind for kind in STANDING]).any(0)

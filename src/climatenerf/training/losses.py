@@ -47,6 +47,24 @@ def distortion_loss(
     return compositing.distortion(weights, (start + end) / 2, end - start, offsets).mean()
 
 
+def nearness(
+    weights: Float[Tensor, "s"], t: Float[Tensor, "s"], offsets: Int[Tensor, "rays+1"]
+) -> Float[Tensor, "rays"]:
+    """Return how near the matter of each ray is: 2 for all at the camera, 0 for all at infinity.
+
+    It is the sum of weights times the distance to infinity in `distance_measure`. Transmitted light
+    counts as at infinity. As a loss it is an occlusion regularisation (Yang, Pavone & Wang 2023,
+    "FreeNeRF", Eq. 4) without a limit of the range.
+
+    Args:
+        weights: of the samples.
+        t: ray length of each sample, grid units.
+        offsets: samples of ray r are offsets[r]:offsets[r + 1].
+    """
+    beyond = (2.0 - distance_measure(t))[:, None]
+    return compositing.accumulate(weights, beyond, offsets)[:, 0]
+
+
 def sparse_depth_loss(
     weights: Float[Tensor, "s"],
     transmittance: Float[Tensor, "n"],

@@ -20,7 +20,7 @@ from climatenerf.field.density_slope import finite_difference_normal
 from climatenerf.field.hash_field import Field
 from climatenerf.ops import compositing
 from climatenerf.training import losses
-from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels, is_ground
+from climatenerf.training.dataset import HORIZON, Batch, TrainingPixels, is_ground, is_standing
 from climatenerf.training.evidence.gather import Evidence
 from climatenerf.training.evidence.monocular_depth import DepthAlignment
 from climatenerf.training.rendered_rays import RenderedRays, VisibleSamples
@@ -114,6 +114,10 @@ class Objective:
         mean_distance = distance / (1 - transmittance).clamp_min(1e-3)  # an empty ray: 0/0
         if weight.sky and self.evidence.knows_sky:
             loss = loss + self.sky(batch, rays, distance, progress)
+        occlusion = self.schedule.occlusion_weight(progress) * weight.occlusion
+        if occlusion > 0:
+            near = losses.nearness(rays.weights, rays.t, rays.samples.offsets)
+            loss = loss + occlusion * (near * is_standing(batch.label)).mean()
         if weight.ground_height and self.evidence.free_space.ground is not None:
             loss = loss + self.ground_height(field, batch, rays, progress)
         opaque = transmittance.detach() < 0.5

@@ -84,6 +84,9 @@ class Schedule:
     """Samples of a smaller weight are not compared with the ground height, [0,1]."""
 
     # Weights of losses, as factors on those in the settings.
+    occlusion_until: float = 0.6
+    """Progress at which the occlusion regularisation has fallen to 0, (0,1]: it decides where
+    matter begins to form, and would shift surfaces that are found."""
     first_sky_weight: float = 0.2
     """Sky loss until 0.35 of the fit, [0,1]; it is whole from 0.75. Leaves against the sky come
     first, clean edges last: earlier, tree crowns are lost."""
@@ -148,6 +151,10 @@ class Schedule:
     def sky_weight(self, progress: float) -> float:
         """Return the factor on the weight of the sky loss."""
         return min(1.0, max(self.first_sky_weight, 2 * progress - 0.5))
+
+    def occlusion_weight(self, progress: float) -> float:
+        """Return the factor on the weight of the occlusion regularisation."""
+        return max(0.0, 1 - progress / self.occlusion_until)
 
     def below_horizon_weight(self, progress: float) -> float:
         """Return the factor on the weight of the below-horizon opacity."""

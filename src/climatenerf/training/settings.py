@@ -24,6 +24,9 @@ class Losses:
     """Density on rays that the photos agree to end in the sky."""
     sky_prior: float = 1e-2
     """Difference of the sky from its surroundings in directions that no photo shows."""
+    occlusion: float = 1.5e-2
+    """Nearness of what stands on the ground, until `Schedule.occlusion_until`: what shows no
+    parallax is far away."""
     planarity: float = 1e-2
     """Curvature of surfaces between neighbouring pixels."""
     sparse_depth: float = 1e-1
@@ -100,6 +103,7 @@ PAPER = FitSettings(
         below_horizon_opacity=0.0,
         sky=1e-1,
         sky_prior=0.0,
+        occlusion=0.0,
         planarity=0.0,
         sparse_depth=0.0,
         ground_height=0.0,

@@ -116,6 +116,28 @@ def test_cells_of_sparse_points_are_protected_from_wrong_labels():
     assert forced[cells].float().mean() > 0.2, "without points the labels empty the tower"
 
 
+def test_an_obstacle_without_points_may_be_much_nearer_than_all_points():
+    """Points on a far wall say nothing about a plain car before it, which all photos show."""
+    found = free_space()
+    field, occupancy = found.field, found.field.occupancy
+    assert found.sparse is not None
+    ground = found.sparse.points[:, 2] < 0.01
+    far = found.sparse.select(ground & (found.sparse.depth > found.sparse.depth.median()))
+    found.sparse = SparseDepth(far.rays_o, far.rays_d, 3 * far.depth, far.image)
+    found.obstacle_points = found.obstacle_points[:0]
+    occupancy.forced_empty.zero_()
+    found.force_empty()
+    centre, _ = occupancy.cell_centres(torch.arange(occupancy.occupied.numel()))
+    x = centre * field.unit + field.centre
+    inner = in_matter(x) & (x[:, 2] > 0.3) & (x[:, 2] < 1.5) & (x[:, :2].abs() < 0.4).all(-1)
+    radius = torch.zeros_like(x[:, 0])
+    near = found.too_near_camera(x, radius)
+    assert inner.sum() > 5 and near[inner].any()
+    assert not occupancy.forced_empty.view(-1)[inner].any()
+    outside = near & ~found.obstacle.view(-1) & ~found.protected.view(-1)
+    assert occupancy.forced_empty.view(-1)[outside].float().mean() > 0.8, "points are dilated"
+
+
 def test_space_much_nearer_to_a_camera_than_its_points_is_empty():
     found = free_space(losses=type(FitSettings().losses)(ground_height=0.0))
     field, occupancy = found.field, found.field.occupancy

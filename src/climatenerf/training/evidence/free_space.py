@@ -137,7 +137,8 @@ class FreeSpace:
         empty = torch.zeros_like(cells, dtype=torch.bool)
         if not self.poses_move:  # poses still change: so do the frusta
             empty = ~intersects_frustum(x, radius, self.pixels.frusta)
-            empty |= self.too_near_camera(x, radius)
+            # The points may lie on what is behind a car, which many photos show.
+            empty |= self.too_near_camera(x, radius) & ~self.obstacle.view(-1)[cells]
         if hull is not None:
             empty |= hull.consensus(x, radius)
         forced = occupancy.forced_empty.view(-1)
