@@ -260,3 +260,20 @@ def test_only_the_appearance_grid_has_weight_decay(toy, tmp_path, monkeypatch):
     expected = (0.0, FitSettings().decay, 0.0, 0.0)
     assert seen[0] == [(grid.shape, decay) for grid, decay in zip(grids, expected, strict=True)]
     assert read_json(tmp_path / "run" / "metrics.json")["heldout_appearance"] == "nearby"
+
+
+@pytest.mark.parametrize("free_space", [True, False])
+def test_floaters_are_removed_before_the_field_is_saved(scene, tmp_path, monkeypatch, free_space):
+    """A finished fit empties cells, which the saved field then leaves empty."""
+    emptied = []
+
+    def empty_everything(field, photos, terrain):
+        assert len(photos) == len(scene.of_split("train"))
+        emptied.append(int(field.occupancy.occupied.sum()))
+        field.occupancy.occupied.zero_()
+        return 1
+
+    monkeypatch.setattr(run_module, "remove_floaters", empty_everything)
+    fitted(scene, tmp_path / "run", free_space=free_space)
+    saved = load_field(tmp_path / "run").occupancy.occupied
+    assert bool(saved.any()) != free_space and len(emptied) == free_space

@@ -35,6 +35,7 @@ from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
 from climatenerf.training.evidence.sparse_depth import unmasked_sparse_depth
+from climatenerf.training.floaters import remove_floaters
 from climatenerf.training.folder import (
     SCHEMA_VERSION,
     check_folder,
@@ -172,6 +173,8 @@ def _fit(
         raise
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     scene = with_corrections(scene, trainer)
+    if not interrupted and settings.free_space:
+        _remove_floaters(trainer.field, scene)
     checkpoint(trainer, run, scene, config)
     save_preview(trainer.field, scene, run, trainer.steps)
     metrics = {
@@ -192,6 +195,13 @@ def _fit(
     metrics |= _find_ground(trainer.field, scene, run)
     write_json(run / METRICS, metrics)
     return metrics
+
+
+def _remove_floaters(field: Field, scene: Scene) -> None:
+    """Empty the cells of pieces of density that few photos support."""
+    if field.capabilities & {NORMALS, CLASSES}:
+        photos = trace_photos(field, scene)
+        remove_floaters(field, photos, terrain_below(field, photos))
 
 
 def _find_ground(field: Field, scene: Scene, run: Path) -> dict:
