@@ -277,3 +277,16 @@ def test_floaters_are_removed_before_the_field_is_saved(scene, tmp_path, monkeyp
     fitted(scene, tmp_path / "run", free_space=free_space)
     saved = load_field(tmp_path / "run").occupancy.occupied
     assert bool(saved.any()) != free_space and len(emptied) == free_space
+
+
+def test_the_datum_that_the_fit_found_is_saved_and_reported(scene, tmp_path, monkeypatch):
+    def raised(fitted, terrain):
+        return dataclasses.replace(fitted, ground_z=fitted.ground_z + 0.25)
+
+    monkeypatch.setattr(run_module, "with_datum", raised)
+    metrics = fitted(scene, tmp_path / "run")
+    assert metrics["datum_moved_m"] == pytest.approx(0.25)
+    assert load_scene(tmp_path / "run").ground_z == pytest.approx(scene.ground_z + 0.25)
+    again = fitted(scene, tmp_path / "run", steps=8, resume=True)
+    assert again["datum_moved_m"] == pytest.approx(0.25), "from where it was"
+    assert load_scene(tmp_path / "run").ground_z == pytest.approx(scene.ground_z + 0.5)

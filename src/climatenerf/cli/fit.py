@@ -127,8 +127,9 @@ def run(options: Fit) -> int:
     if metrics["interrupted"]:
         progress.say(f"Stopped early; resume with: {resuming(options)}")
     progress.result(summary(metrics))
-    if geometry_line(metrics):
-        progress.say(geometry_line(metrics))
+    for line in (geometry_line(metrics), datum_line(metrics)):
+        if line:
+            progress.say(line)
     progress.result(f"run: {options.out}")
     return 0
 
@@ -343,6 +344,17 @@ def geometry_line(metrics: dict) -> str:
     known = {name: metrics[name] for name in forms if metrics.get(name) is not None}
     parts = [forms[name].format(value) for name, value in known.items()]
     return f"Geometry: {'; '.join(parts)}" if parts else ""
+
+
+def datum_line(metrics: dict) -> str:
+    """Return one line if the fit moved the ground datum; "" if not."""
+    moved = metrics.get("datum_moved_m")  # runs of earlier versions have none
+    if not moved:
+        return ""
+    return (
+        f"Datum: moved by {moved:+.2f} m to the ground that the fit found below the cameras; water"
+        " levels count from there. If the camera height was assumed, give --camera-height"
+    )
 
 
 def summary(metrics: dict) -> str:

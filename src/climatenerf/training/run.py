@@ -22,6 +22,7 @@ from climatenerf.field.normalisation import find_extent
 from climatenerf.render.ground_evidence import terrain_below
 from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.volume import render_view
+from climatenerf.scene.datum import with_datum
 from climatenerf.scene.images import (
     downscaled_camera,
     load_image,
@@ -173,8 +174,11 @@ def _fit(
         raise
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     scene = with_corrections(scene, trainer)
-    if not interrupted and settings.free_space:
-        _remove_floaters(trainer.field, scene)
+    moved = 0.0
+    if not interrupted and trainer.field.capabilities & {NORMALS, CLASSES}:
+        datum = scene.ground_z
+        scene = _finish_geometry(trainer.field, scene, settings.free_space)
+        moved = scene.ground_z - datum
     checkpoint(trainer, run, scene, config)
     save_preview(trainer.field, scene, run, trainer.steps)
     metrics = {
@@ -186,6 +190,7 @@ def _fit(
         "train_views": len(scene.of_split("train")),
         "masked_fraction": masked_fraction(trainer),
         "discarded_steps": trainer.discarded.total,
+        "datum_moved_m": moved,
     }
     write_json(run / METRICS, metrics)
     if interrupted and heldout_pixels(scene, downscale) > MAX_PIXELS_AFTER_STOP:
@@ -197,11 +202,13 @@ def _fit(
     return metrics
 
 
-def _remove_floaters(field: Field, scene: Scene) -> None:
-    """Empty the cells of pieces of density that few photos support."""
-    if field.capabilities & {NORMALS, CLASSES}:
-        photos = trace_photos(field, scene)
-        remove_floaters(field, photos, terrain_below(field, photos))
+def _finish_geometry(field: Field, scene: Scene, free_space: bool) -> Scene:
+    """Remove floaters from a fitted field, and return the scene with its ground as the datum."""
+    photos = trace_photos(field, scene)
+    terrain = terrain_below(field, photos)
+    if free_space:
+        remove_floaters(field, photos, terrain)
+    return with_datum(scene, terrain)
 
 
 def _find_ground(field: Field, scene: Scene, run: Path) -> dict:
