@@ -6,13 +6,15 @@ python benchmarks/gallery.py ditch RUN --level "-1.5 m" --visibility "60 m" --sn
 python benchmarks/gallery.py ditch RUN --surfaces
 python benchmarks/gallery.py street-busy RUN --passers-by
 python benchmarks/gallery.py ditch RUN --ground --level=-1.5m --columns 2
+python benchmarks/gallery.py street-hard RUN --before EARLIER --columns 2
 
 Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
 smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
 shows colours, depth, normals and classes of held-out views. With --passers-by, NAME-passers-by.jpg
 shows the most masked photos, the mask in red, and the field from the same cameras. With --ground,
 NAME-ground.jpg shows photos' cameras turned down by 15 degrees, clean and flooded, without and with
-completed ground.
+completed ground. With --before, NAME-before-after.jpg shows each weather in an earlier run and in
+this one.
 """
 
 import argparse
@@ -67,6 +69,14 @@ def weathers(run: Path, options: argparse.Namespace) -> Rows:
             common.command(*base, "--supersample", str(options.supersample), *args)
             frames = sorted((out / "frames").glob("*.png"))
             rows.append((label, [np.asarray(Image.open(path)) for path in frames]))
+    return rows
+
+
+def before_after(earlier: Path, run: Path, options: argparse.Namespace) -> Rows:
+    """Render the same frames of two runs of a capture in each weather, row below row."""
+    rows: Rows = []
+    for before, after in zip(weathers(earlier, options), weathers(run, options), strict=True):
+        rows += [(f"{before[0]}, before", before[1]), (f"{after[0]}, after", after[1])]
     return rows
 
 
@@ -158,6 +168,7 @@ def main() -> None:
     kinds.add_argument("--surfaces", action="store_true")
     kinds.add_argument("--passers-by", action="store_true")
     kinds.add_argument("--ground", action="store_true")
+    kinds.add_argument("--before", type=Path, metavar="RUN", help="an earlier run")
     options = parser.parse_args()
     name = options.name
     if options.surfaces:
@@ -166,9 +177,12 @@ def main() -> None:
         name, rows = f"{name}-passers-by", passers_by(options.run, options.columns)
     elif options.ground:
         name, rows = f"{name}-ground", ground(options.run, options)
+    elif options.before:
+        name += "-before-after"
+        rows = before_after(options.before, options.run, options)
     else:
         rows = weathers(options.run, options)
-    width = 480 if options.ground else 320
+    width = 480 if options.ground or options.before else 320
     sheet = contact_sheet(rows, options.columns, cell_width=width)
     path = options.out / f"{name}.jpg"
     size = write_jpeg(path, sheet, max_bytes=150_000)

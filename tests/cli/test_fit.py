@@ -11,7 +11,7 @@ from PIL import Image
 from support.command_line import FEW_ROWS, STREET, error_message
 
 from climatenerf import cli
-from climatenerf.cli.fit import Fit, fit_settings, resuming
+from climatenerf.cli.fit import Fit, datum_line, fit_settings, resuming
 from climatenerf.training.settings import PAPER, FitSettings, Losses
 
 
@@ -284,3 +284,9 @@ def test_unknown_held_out_photos_are_refused(tmp_path, capsys):
     capture(tmp_path / "scene")
     args = ["fit", tmp_path / "scene", "-o", tmp_path / "run", "--holdout", "nobody.png"]
     assert "nobody.png" in error_message(capsys, *args)
+
+
+def test_a_moved_datum_is_told():
+    assert datum_line({}) == datum_line({"datum_moved_m": 0.0}) == ""
+    line = datum_line({"datum_moved_m": 0.247})
+    assert "+0.25 m" in line and "--camera-height" in line
