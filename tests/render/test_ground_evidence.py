@@ -16,7 +16,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import CLASSES, DENSITY, NORMALS
 from climatenerf.render import ground_evidence, photo_rays, run_terrain
 from climatenerf.render.completed_ground import CompletedField
-from climatenerf.render.ground_evidence import find_terrain
+from climatenerf.render.ground_evidence import find_terrain, heights_below_cameras
 from climatenerf.render.integrator import trace
 from climatenerf.render.run_terrain import terrain_of_run
 from climatenerf.scene.scene import Scene, View
@@ -232,6 +232,35 @@ def test_the_hole_below_the_cameras_is_completed():
     assert torch.allclose(seen.depth, torch.tensor(1.6), atol=0.03)
     assert (seen.rgb - torch.tensor(GREY)).abs().max() < 1e-3
     assert (seen.layers["seen"] < 1e-3).all()
+
+
+def walk(carried, rise=0.05):
+    """Cameras every metre along a rising path, and ends on the ground below the first ten."""
+    along = np.arange(len(carried), dtype=float)
+    eyes = np.stack([along, 0 * along, rise * along + carried], axis=-1)
+    x, y = np.meshgrid(np.linspace(-1.0, 9.1, 60), np.linspace(-0.5, 0.5, 7))
+    return eyes, np.stack([x.ravel(), y.ravel(), rise * x.ravel()], axis=-1)
+
+
+def test_cameras_carried_at_one_height_tell_the_ground_below_them():
+    random = np.random.default_rng(0)
+    eyes, ground = walk(1.6 + random.normal(0.0, 0.03, 20))
+    found = heights_below_cameras(eyes, ground)
+    assert np.array_equal(found.x[:, 0], np.arange(10.0, 20.0)), "those without ground"
+    off = np.abs(found.x[:, 2] - 0.05 * found.x[:, 0])
+    assert off.max() < 0.1 and (off < found.error).mean() > 0.6
+    assert (found.error > 0.1).all() and (found.error < 0.12).all()
+
+
+def test_cameras_at_different_heights_tell_nothing_nor_do_few_or_all():
+    random = np.random.default_rng(0)
+    eyes, ground = walk(random.uniform(1.0, 3.0, 20))
+    assert not len(heights_below_cameras(eyes, ground).x)
+    eyes, ground = walk(np.full(20, 1.6))
+    assert not len(heights_below_cameras(eyes[6:], ground).x), "four cameras"
+    assert len(heights_below_cameras(eyes[5:], ground).x) == 10, "five"
+    assert not len(heights_below_cameras(eyes[:10], ground).x), "all have ground"
+    assert not len(heights_below_cameras(eyes, ground[:4]).x), "four ends"
 
 
 def test_the_error_grows_into_the_hole():

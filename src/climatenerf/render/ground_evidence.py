@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from scipy import ndimage
+from scipy import ndimage, spatial
 
 from climatenerf.core.classes import BUILDING, GROUND, PERSON, SKY, UNKNOWN, VEHICLE
 from climatenerf.core.device import to_device, to_numpy
@@ -40,7 +40,13 @@ BAND = 0.35  # m above the lower envelope in which ends count as ground
 STEEPEST = np.tan(np.radians(40.0))
 CLEARANCE = (0.2, 0.5)  # m above and below the terrain in which the field's ground is looked for
 LIFT = 0.05  # m; nodes are looked at so much above the ground
+THROUGH = 0.1  # m below the terrain, or two errors, from which a ray passed through it
 MAX_ANGLE = 0.2  # rad between a node that a pixel shows and the pixel's ray
+BELOW = 0.75  # m around the place below a camera, where ends are looked for,
+MIN_BELOW = 5  # of them
+MIN_CAMERAS = 5  # that have ground below them, for a height at which they are carried
+MAX_SPREAD = 0.2  # m, of that height
+CARRIED_ERROR = 0.1  # m; steps and hollows under a camera
 MAX_ERROR = 1.0  # m; where the ground is known worse it is not completed
 
 
@@ -86,14 +92,47 @@ def terrain_below(field: RadianceField, photos: list[PhotoRays]) -> Terrain | No
     x, t, label, slope = x[low], t[low], label[low], slope[low]
     origin, cell, shape = _raster(x, eyes)
     error = np.hypot(SURFACE_ERROR, DEPTH_ERROR * t * slope)
-    height, spread = fit_heights(Heights(x, error), origin, cell, shape)
+    below = heights_below_cameras(eyes, x)
+    heights = Heights(np.concatenate([x, below.x]), np.concatenate([error, below.error]))
+    height, spread = fit_heights(heights, origin, cell, shape)
     unknown, nothing = np.full(shape, UNKNOWN, np.uint8), np.zeros(shape, bool)
     terrain = Terrain(origin, cell, height, spread, unknown, nothing, nothing)
     seen = _holds_ground(field, terrain)
-    photographed = _photographed(terrain, photos)
+    through = _seen_through(terrain, photos)
     label = np.where(seen, _classes(terrain, x, label), UNKNOWN).astype(np.uint8)
-    opened = ~seen & (photographed | (spread > MAX_ERROR))
+    opened = ~seen & (through | (spread > MAX_ERROR))
     return replace(terrain, label=label, seen=seen, open=opened)
+
+
+def heights_below_cameras(
+    eyes: Float[np.ndarray, "m 3"], ground: Float[np.ndarray, "n 3"]
+) -> Heights:
+    """Return heights of the ground below cameras that no end is near, from the other cameras.
+
+    Cameras are carried at one height: on a pole, on a car, in a hand. Where many of them agree on
+    it, it tells the ground below the rest.
+
+    Args:
+        eyes: cameras, world m.
+        ground: ends on the ground, world m.
+
+    Returns:
+        One height for each such camera; none if too few cameras have ground below them, or if
+        their heights differ.
+    """
+    none = Heights(np.zeros((0, 3)), np.zeros(0))
+    near = spatial.cKDTree(ground[:, :2]).query_ball_point(eyes[:, :2], BELOW)
+    known = np.array([len(rows) >= MIN_BELOW for rows in near])
+    if known.sum() < MIN_CAMERAS or known.all():
+        return none
+    below = np.array([np.median(ground[near[i], 2]) for i in np.flatnonzero(known)])
+    carried = eyes[known, 2] - below
+    height = float(np.median(carried))
+    spread = 1.48 * float(np.median(np.abs(carried - height)))  # a standard deviation
+    if spread > MAX_SPREAD:
+        return none
+    x = eyes[~known] - (0.0, 0.0, height)
+    return Heights(x, np.full(len(x), np.hypot(spread, CARRIED_ERROR)))
 
 
 def _raster(
@@ -177,12 +216,12 @@ def _holds_ground(field: RadianceField, terrain: Terrain) -> Bool[np.ndarray, "r
     return ndimage.median_filter(held.astype(np.uint8), 3).astype(bool)
 
 
-def _photographed(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray, "rows columns"]:
-    """Return which nodes some photo shows: inside its frame, with nothing in front."""
+def _seen_through(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray, "rows columns"]:
+    """Return which nodes some photo's ray passes and ends clearly below the terrain."""
     nodes = terrain.nodes().reshape(-1, 3) + (0.0, 0.0, LIFT)
-    shown = np.zeros(len(nodes), bool)
+    through = np.zeros(len(nodes), bool)
     for photo in photos:
-        rest = np.flatnonzero(~shown)
+        rest = np.flatnonzero(~through)
         local = (nodes[rest] - photo.c2w[:3, 3]) @ photo.c2w[:3, :3]
         pixel = photo.camera.project(local)
         height, width = photo.t.shape
@@ -192,11 +231,21 @@ def _photographed(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray,
         column, row = pixel.T
         # A strong distortion folds what lies beside the frame into it.
         along = ((local @ photo.c2w[:3, :3].T) * photo.d[row, column]).sum(-1)
-        # The furthest of the neighbouring pixels: an edge hides nothing for certain.
-        furthest = ndimage.maximum_filter(photo.t, 3)[row, column]
-        clear = distance < furthest * (1 + DEPTH_ERROR) + LIFT
-        shown[rest] = clear & (along > np.cos(MAX_ANGLE) * distance)
-    return shown.reshape(terrain.height.shape)
+        beyond = photo.t[row, column] > distance * (1 + DEPTH_ERROR) + LIFT
+        through[rest] = beyond & (along > np.cos(MAX_ANGLE) * distance)
+        through[rest] &= _below(terrain, photo)[row, column]
+    return through.reshape(terrain.height.shape)
+
+
+def _below(terrain: Terrain, photo: PhotoRays) -> Bool[np.ndarray, "h w"]:
+    """Return which rays of a photo end clearly below the terrain, or below its border."""
+    below = np.zeros(photo.t.shape, bool)
+    ends = np.isfinite(photo.t)
+    x = photo.x[ends]
+    error = terrain.sample(terrain.error, x[:, :2])
+    depth = terrain.sample(terrain.height, x[:, :2]) - x[:, 2]
+    below[ends] = depth > np.maximum(THROUGH, 2 * error)
+    return below
 
 
 def _classes(
