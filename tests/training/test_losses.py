@@ -124,13 +124,13 @@ def test_unlabelled_surfaces_have_a_smaller_planarity_weight(scene):
 def test_occlusion_applies_to_what_stands_on_the_ground_and_ends(scene):
     trainer, batch, rays = only(scene, loss="occlusion", weight=3.0)
     near = losses.nearness(rays.weights, rays.t, rays.samples.offsets)
-    factor = Schedule().occlusion_weight(0.5)
+    factor = Schedule().occlusion_weight(0.1)
     for kind, share in ((VEGETATION, 1.0), (VEHICLE, 1.0), (ROAD, 0.0), (SKY, 0.0), (UNKNOWN, 0.0)):
         labelled = replace(batch, label=torch.full_like(batch.label, kind))
-        found = trainer.objective.geometry(trainer.field, labelled, rays, 0.5)
+        found = trainer.objective.geometry(trainer.field, labelled, rays, 0.1)
         assert float(found) == pytest.approx(3.0 * share * factor * float(near.mean()))
     assert 0 < factor < Schedule().occlusion_weight(0.0) == 1
-    assert Schedule().occlusion_weight(0.6) == Schedule().occlusion_weight(1.0) == 0
+    assert Schedule().occlusion_weight(0.25) == Schedule().occlusion_weight(1.0) == 0
 
 
 def test_distortion_and_opacity_entropy_of_a_step_are_the_formulas_times_their_weights(scene):

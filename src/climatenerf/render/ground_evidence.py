@@ -3,7 +3,7 @@
 Rays of the photos end on the fitted field. Ends that can be ground by normal and class, and that
 lie near the lower envelope of all ends, are heights with an error. A smooth surface is fitted to
 them (`scene.terrain_fit`). Then two things are found for each node: whether the field holds ground
-there, and whether any photo shows it.
+there, and whether rays of photos pass through it.
 """
 
 from collections.abc import Callable
@@ -121,7 +121,7 @@ def heights_below_cameras(
         their heights differ.
     """
     none = Heights(np.zeros((0, 3)), np.zeros(0))
-    near = spatial.cKDTree(ground[:, :2]).query_ball_point(eyes[:, :2], BELOW)
+    near = spatial.KDTree(ground[:, :2]).query_ball_point(eyes[:, :2], BELOW)
     known = np.array([len(rows) >= MIN_BELOW for rows in near])
     if known.sum() < MIN_CAMERAS or known.all():
         return none

@@ -84,7 +84,7 @@ class Schedule:
     """Samples of a smaller weight are not compared with the ground height, [0,1]."""
 
     # Weights of losses, as factors on those in the settings.
-    occlusion_until: float = 0.6
+    occlusion_until: float = 0.25
     """Progress at which the occlusion regularisation has fallen to 0, (0,1]: it decides where
     matter begins to form, and would shift surfaces that are found."""
     first_sky_weight: float = 0.2

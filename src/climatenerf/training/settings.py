@@ -25,8 +25,8 @@ class Losses:
     sky_prior: float = 1e-2
     """Difference of the sky from its surroundings in directions that no photo shows."""
     occlusion: float = 1.5e-2
-    """Nearness of what stands on the ground, until `Schedule.occlusion_until`: what shows no
-    parallax is far away."""
+    """Nearness of what stands on the ground, until surfaces are found: what shows no parallax is
+    far away."""
     planarity: float = 1e-2
     """Curvature of surfaces between neighbouring pixels."""
     sparse_depth: float = 1e-1
