@@ -21,11 +21,13 @@ from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.compositing import chunks
 from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.ops import compositing
+from climatenerf.render.completed_ground import OVERLAP, CompletedField
 from climatenerf.render.photo_rays import PhotoRays, trace_photos
 from climatenerf.scene.scene import Scene
 from climatenerf.scene.terrain import Terrain, nearest_known
 from climatenerf.scene.terrain_fit import Heights, fit_heights
 
+MAX_LENGTH = 1e4  # m, of rays to the terrain
 MIN_GROUND = 200  # ends on the ground, for a terrain
 MAX_NODES = 512  # along the raster's longer side
 MIN_CELL = 0.05  # m
@@ -40,7 +42,8 @@ BAND = 0.35  # m above the lower envelope in which ends count as ground
 STEEPEST = np.tan(np.radians(40.0))
 CLEARANCE = (0.2, 0.5)  # m above and below the terrain in which the field's ground is looked for
 LIFT = 0.05  # m; nodes are looked at so much above the ground
-THROUGH = 0.1  # m below the terrain, or two errors, from which a ray passed through it
+MIN_DESCENT = 0.1  # m from a camera down to a node; above the camera, 1/0
+MAX_PIXEL_LENGTH = 2.0  # m along the ground, up to which a pixel tells ground from a hole
 MAX_ANGLE = 0.2  # rad between a node that a pixel shows and the pixel's ray
 BELOW = 0.75  # m around the place below a camera, where ends are looked for,
 MIN_BELOW = 5  # of them
@@ -101,7 +104,7 @@ def terrain_below(field: RadianceField, photos: list[PhotoRays]) -> Terrain | No
     through = _seen_through(terrain, photos)
     label = np.where(seen, _classes(terrain, x, label), UNKNOWN).astype(np.uint8)
     opened = ~seen & (through | (spread > MAX_ERROR))
-    return replace(terrain, label=label, seen=seen, open=opened)
+    return _not_before_photos(field, replace(terrain, label=label, seen=seen, open=opened), photos)
 
 
 def heights_below_cameras(
@@ -217,7 +220,12 @@ def _holds_ground(field: RadianceField, terrain: Terrain) -> Bool[np.ndarray, "r
 
 
 def _seen_through(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray, "rows columns"]:
-    """Return which nodes some photo's ray passes and ends clearly below the terrain."""
+    """Return which nodes some photo looks through: inside its frame, and its ray ends behind.
+
+    Along the ground a pixel covers `length`. Where that is short, a ray that ends within two pixels
+    of the node shows ground there, which the field holds a little further on. Where it is long,
+    nothing tells the two apart, and every node that nothing hides counts.
+    """
     nodes = terrain.nodes().reshape(-1, 3) + (0.0, 0.0, LIFT)
     through = np.zeros(len(nodes), bool)
     for photo in photos:
@@ -231,21 +239,40 @@ def _seen_through(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray,
         column, row = pixel.T
         # A strong distortion folds what lies beside the frame into it.
         along = ((local @ photo.c2w[:3, :3].T) * photo.d[row, column]).sum(-1)
-        beyond = photo.t[row, column] > distance * (1 + DEPTH_ERROR) + LIFT
-        through[rest] = beyond & (along > np.cos(MAX_ANGLE) * distance)
-        through[rest] &= _below(terrain, photo)[row, column]
+        descent = np.maximum(photo.c2w[2, 3] - nodes[rest, 2], MIN_DESCENT)
+        length = distance**2 / (photo.camera.fx * descent)
+        # The furthest of the neighbouring pixels: an edge hides nothing for certain.
+        furthest = ndimage.maximum_filter(photo.t, 3)[row, column]
+        clear = distance < furthest * (1 + DEPTH_ERROR) + LIFT
+        behind = photo.t[row, column] > distance + 2 * length
+        far = length > MAX_PIXEL_LENGTH
+        through[rest] = clear & (far | behind) & (along > np.cos(MAX_ANGLE) * distance)
     return through.reshape(terrain.height.shape)
 
 
-def _below(terrain: Terrain, photo: PhotoRays) -> Bool[np.ndarray, "h w"]:
-    """Return which rays of a photo end clearly below the terrain, or below its border."""
-    below = np.zeros(photo.t.shape, bool)
-    ends = np.isfinite(photo.t)
-    x = photo.x[ends]
-    error = terrain.sample(terrain.error, x[:, :2])
-    depth = terrain.sample(terrain.height, x[:, :2]) - x[:, 2]
-    below[ends] = depth > np.maximum(THROUGH, 2 * error)
-    return below
+@torch.no_grad()
+def _not_before_photos(field: RadianceField, terrain: Terrain, photos: list[PhotoRays]) -> Terrain:
+    """Return the terrain without completed nodes that would hide what photos show behind them."""
+    completed = CompletedField(field, terrain)
+    device, hits = device_of(field), [np.zeros((0, 2))]
+    for photo in photos:
+        d = photo.d.reshape(-1, 3)
+        eye = photo.c2w[:3, 3]
+        rays_d = to_device(d.astype(np.float32), device)
+        rays_o = to_device(eye.astype(np.float32), device).expand_as(rays_d).contiguous()
+        near = torch.full_like(rays_d[:, 0], field.near)
+        t = to_numpy(completed.crossing(rays_o, rays_d, near, torch.full_like(near, MAX_LENGTH)))
+        met = np.flatnonzero(np.isfinite(t))
+        x = eye + t[met, None] * d[met]
+        length = t[met] ** 2 / (photo.camera.fx * np.maximum(eye[2] - x[:, 2], MIN_DESCENT))
+        hits.append(x[t[met] + 2 * length < photo.t.reshape(-1)[met], :2])
+    xy = np.concatenate(hits)
+    column, row = np.rint((xy - np.array(terrain.origin)) / terrain.cell).astype(int).T
+    rows, columns = terrain.height.shape
+    hiding = np.zeros((rows, columns), bool)
+    hiding[row.clip(0, rows - 1), column.clip(0, columns - 1)] = True
+    hiding = ndimage.binary_dilation(hiding, iterations=OVERLAP)
+    return replace(terrain, open=terrain.open | (hiding & ~terrain.seen))
 
 
 def _classes(

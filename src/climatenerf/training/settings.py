@@ -24,7 +24,7 @@ class Losses:
     """Density on rays that the photos agree to end in the sky."""
     sky_prior: float = 1e-2
     """Difference of the sky from its surroundings in directions that no photo shows."""
-    occlusion: float = 1.5e-2
+    occlusion: float = 5e-3
     """Nearness of what stands on the ground, until surfaces are found: what shows no parallax is
     far away."""
     planarity: float = 1e-2
