@@ -14,7 +14,7 @@ shows colours, depth, normals and classes of held-out views. With --passers-by, 
 shows the most masked photos, the mask in red, and the field from the same cameras. With --ground,
 NAME-ground.jpg shows photos' cameras turned down by 15 degrees, clean and flooded, without and with
 completed ground. With --before, NAME-before-after.jpg shows each weather in an earlier run and in
-this one.
+this one; levels count from the datum of each.
 """
 
 import argparse

@@ -5,8 +5,9 @@ python benchmarks/variants.py street-hard --minutes 4 --keep RUNS
 
 Each capture is fitted for the same time by the default method and by "plain NGP", which has
 photometric losses alone. `scores` come from the truth, `without_truth` from the run alone. `ranks`
-has Spearman's rank correlation over all fits between the scores that need no reference and the true
-ones that they stand for. A row of a run that --keep holds already is only scored.
+has Spearman's rank correlation between the scores that need no reference and the true ones that
+they stand for, over the default fits: plain NGP has no terrain. A row of a run that --keep holds
+already is only scored.
 """
 
 import argparse

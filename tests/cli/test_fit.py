@@ -286,7 +286,7 @@ def test_unknown_held_out_photos_are_refused(tmp_path, capsys):
     assert "nobody.png" in error_message(capsys, *args)
 
 
-def test_a_moved_datum_is_told():
+def test_a_moved_datum_is_reported():
     assert datum_line({}) == datum_line({"datum_moved_m": 0.0}) == ""
     line = datum_line({"datum_moved_m": 0.247})
     assert "+0.25 m" in line and "--camera-height" in line

@@ -242,7 +242,7 @@ def walk(carried, rise=0.05):
     return eyes, np.stack([x.ravel(), y.ravel(), rise * x.ravel()], axis=-1)
 
 
-def test_cameras_carried_at_one_height_tell_the_ground_below_them():
+def test_cameras_carried_at_one_height_give_the_ground_below_them():
     random = np.random.default_rng(0)
     eyes, ground = walk(1.6 + random.normal(0.0, 0.03, 20))
     found = heights_below_cameras(eyes, ground)
@@ -252,7 +252,7 @@ def test_cameras_carried_at_one_height_tell_the_ground_below_them():
     assert (found.error > 0.1).all() and (found.error < 0.12).all()
 
 
-def test_cameras_at_different_heights_tell_nothing_nor_do_few_or_all():
+def test_no_height_comes_from_differing_cameras_or_few_or_if_all_have_ground():
     random = np.random.default_rng(0)
     eyes, ground = walk(random.uniform(1.0, 3.0, 20))
     assert not len(heights_below_cameras(eyes, ground).x)
@@ -261,6 +261,14 @@ def test_cameras_at_different_heights_tell_nothing_nor_do_few_or_all():
     assert len(heights_below_cameras(eyes[5:], ground).x) == 10, "five"
     assert not len(heights_below_cameras(eyes[:10], ground).x), "all have ground"
     assert not len(heights_below_cameras(eyes, ground[:4]).x), "four ends"
+
+
+def test_a_camera_that_leaves_the_ground_is_not_carried():
+    """A drone climbs straight up from the end of the path."""
+    eyes, ground = walk(np.full(12, 1.6))
+    climb = np.stack([np.full(6, 10.5), np.zeros(6), 4.0 + 3.0 * np.arange(6)], axis=-1)
+    found = heights_below_cameras(np.concatenate([eyes, climb]), ground)
+    assert np.allclose(found.x, [(10.0, 0.0, 0.5), (11.0, 0.0, 0.55)], atol=1e-2)
 
 
 def test_the_error_grows_into_the_hole():

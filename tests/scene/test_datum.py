@@ -24,14 +24,15 @@ def walk(ground_z=0.0, shift=0.0):
     return Scene(Path(), "test", (camera,), tuple(views), ground_z=ground_z, lowest_ground_z=-0.1)
 
 
-def slope(height=0.0, error=0.02, rise=0.1):
+def slope(height=0.0, error=0.02, rise=0.1, seen=5):
     """Terrain that rises along +x: `height` below the middle camera."""
     x = np.arange(-2.0, 7.0)
     z = np.broadcast_to((height + rise * (x - 2.0)).astype(np.float32), (5, len(x))).copy()
     flags = np.ones(z.shape, bool)
     label = np.full(z.shape, ROAD, np.uint8)
     spread = np.full(z.shape, error, np.float32)
-    return Terrain((-2.0, -2.0), 1.0, z, spread, label, flags, ~flags)
+    flags[:, 2 + seen :] = False  # below the first cameras alone
+    return Terrain((-2.0, -2.0), 1.0, z, spread, label, flags, np.zeros_like(flags))
 
 
 @pytest.mark.parametrize("height", [0.3, -0.3])
@@ -50,7 +51,8 @@ def test_the_datum_stays_where_the_terrain_agrees_or_is_badly_known(height, erro
     assert with_datum(walk(), slope(height, error)).ground_z == 0.0
 
 
-def test_cameras_beyond_the_terrain_do_not_count():
-    assert with_datum(walk(shift=3.0), slope(0.3)).ground_z == pytest.approx(0.3 + 0.1 * 2.5)
+def test_only_cameras_above_ground_that_the_field_holds_count():
+    assert with_datum(walk(), slope(0.3, seen=3)).ground_z == pytest.approx(0.3 - 0.1)
+    assert with_datum(walk(), slope(0.3, seen=2)).ground_z == 0.0, "two of five are too few"
     assert with_datum(walk(shift=50.0), slope(0.3)).ground_z == 0.0
     assert with_datum(walk(ground_z=0.7), None).ground_z == 0.7

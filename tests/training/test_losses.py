@@ -125,10 +125,16 @@ def test_occlusion_applies_to_what_stands_on_the_ground_and_ends(scene):
     trainer, batch, rays = only(scene, loss="occlusion", weight=3.0)
     near = losses.nearness(rays.weights, rays.t, rays.samples.offsets)
     factor = Schedule().occlusion_weight(0.1)
-    for kind, share in ((VEGETATION, 1.0), (VEHICLE, 1.0), (ROAD, 0.0), (SKY, 0.0), (UNKNOWN, 0.0)):
+    for kind, factor_of_class in (
+        (VEGETATION, 1.0),
+        (VEHICLE, 1.0),
+        (ROAD, 0.0),
+        (SKY, 0.0),
+        (UNKNOWN, 0.0),
+    ):
         labelled = replace(batch, label=torch.full_like(batch.label, kind))
         found = trainer.objective.geometry(trainer.field, labelled, rays, 0.1)
-        assert float(found) == pytest.approx(3.0 * share * factor * float(near.mean()))
+        assert float(found) == pytest.approx(3.0 * factor_of_class * factor * float(near.mean()))
     assert 0 < factor < Schedule().occlusion_weight(0.0) == 1
     assert Schedule().occlusion_weight(0.25) == Schedule().occlusion_weight(1.0) == 0
 

@@ -3,7 +3,7 @@
 Rays of the photos end on the fitted field. Ends that can be ground by normal and class, and that
 lie near the lower envelope of all ends, are heights with an error. A smooth surface is fitted to
 them (`scene.terrain_fit`). Then two things are found for each node: whether the field holds ground
-there, and whether rays of photos pass through it.
+there, and whether any photo shows it.
 """
 
 from collections.abc import Callable
@@ -21,13 +21,11 @@ from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.compositing import chunks
 from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.ops import compositing
-from climatenerf.render.completed_ground import OVERLAP, CompletedField
 from climatenerf.render.photo_rays import PhotoRays, trace_photos
 from climatenerf.scene.scene import Scene
 from climatenerf.scene.terrain import Terrain, nearest_known
 from climatenerf.scene.terrain_fit import Heights, fit_heights
 
-MAX_LENGTH = 1e4  # m, of rays to the terrain
 MIN_GROUND = 200  # ends on the ground, for a terrain
 MAX_NODES = 512  # along the raster's longer side
 MIN_CELL = 0.05  # m
@@ -42,12 +40,10 @@ BAND = 0.35  # m above the lower envelope in which ends count as ground
 STEEPEST = np.tan(np.radians(40.0))
 CLEARANCE = (0.2, 0.5)  # m above and below the terrain in which the field's ground is looked for
 LIFT = 0.05  # m; nodes are looked at so much above the ground
-MIN_DESCENT = 0.1  # m from a camera down to a node; above the camera, 1/0
-MAX_PIXEL_LENGTH = 2.0  # m along the ground, up to which a pixel tells ground from a hole
 MAX_ANGLE = 0.2  # rad between a node that a pixel shows and the pixel's ray
-BELOW = 0.75  # m around the place below a camera, where ends are looked for,
-MIN_BELOW = 5  # of them
-MIN_CAMERAS = 5  # that have ground below them, for a height at which they are carried
+BELOW_RADIUS = 0.75  # m around the place below a camera, where ends are looked for
+MIN_BELOW = 5  # ends there, for ground below a camera
+MIN_CAMERAS = 5  # with ground below them, for a height at which cameras are carried
 MAX_SPREAD = 0.2  # m, of that height
 CARRIED_ERROR = 0.1  # m; steps and hollows under a camera
 MAX_ERROR = 1.0  # m; where the ground is known worse it is not completed
@@ -101,19 +97,20 @@ def terrain_below(field: RadianceField, photos: list[PhotoRays]) -> Terrain | No
     unknown, nothing = np.full(shape, UNKNOWN, np.uint8), np.zeros(shape, bool)
     terrain = Terrain(origin, cell, height, spread, unknown, nothing, nothing)
     seen = _holds_ground(field, terrain)
-    through = _seen_through(terrain, photos)
+    photographed = _photographed(terrain, photos)
     label = np.where(seen, _classes(terrain, x, label), UNKNOWN).astype(np.uint8)
-    opened = ~seen & (through | (spread > MAX_ERROR))
-    return _not_before_photos(field, replace(terrain, label=label, seen=seen, open=opened), photos)
+    opened = ~seen & (photographed | (spread > MAX_ERROR))
+    return replace(terrain, label=label, seen=seen, open=opened)
 
 
 def heights_below_cameras(
     eyes: Float[np.ndarray, "m 3"], ground: Float[np.ndarray, "n 3"]
 ) -> Heights:
-    """Return heights of the ground below cameras that no end is near, from the other cameras.
+    """Return heights of the ground below cameras that have few ends near, from the other cameras.
 
-    Cameras are carried at one height: on a pole, on a car, in a hand. Where many of them agree on
-    it, it tells the ground below the rest.
+    Cameras are often carried at one height: on a car, on a pole, by hand. If those with ground
+    below them agree on it, the ground below the rest is as far down, unless it would be steeper
+    than ground can be.
 
     Args:
         eyes: cameras, world m.
@@ -124,7 +121,8 @@ def heights_below_cameras(
         their heights differ.
     """
     none = Heights(np.zeros((0, 3)), np.zeros(0))
-    near = spatial.KDTree(ground[:, :2]).query_ball_point(eyes[:, :2], BELOW)
+    tree = spatial.KDTree(ground[:, :2])
+    near = tree.query_ball_point(eyes[:, :2], BELOW_RADIUS)
     known = np.array([len(rows) >= MIN_BELOW for rows in near])
     if known.sum() < MIN_CAMERAS or known.all():
         return none
@@ -135,6 +133,9 @@ def heights_below_cameras(
     if spread > MAX_SPREAD:
         return none
     x = eyes[~known] - (0.0, 0.0, height)
+    # A camera on a balcony or a drone is not carried at that height.
+    distance, nearest = tree.query(x[:, :2])
+    x = x[np.abs(x[:, 2] - ground[nearest, 2]) < BAND + STEEPEST * distance]
     return Heights(x, np.full(len(x), np.hypot(spread, CARRIED_ERROR)))
 
 
@@ -219,17 +220,12 @@ def _holds_ground(field: RadianceField, terrain: Terrain) -> Bool[np.ndarray, "r
     return ndimage.median_filter(held.astype(np.uint8), 3).astype(bool)
 
 
-def _seen_through(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray, "rows columns"]:
-    """Return which nodes some photo looks through: inside its frame, and its ray ends behind.
-
-    Along the ground a pixel covers `length`. Where that is short, a ray that ends within two pixels
-    of the node shows ground there, which the field holds a little further on. Where it is long,
-    nothing tells the two apart, and every node that nothing hides counts.
-    """
+def _photographed(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray, "rows columns"]:
+    """Return which nodes some photo shows: inside its frame, with nothing in front."""
     nodes = terrain.nodes().reshape(-1, 3) + (0.0, 0.0, LIFT)
-    through = np.zeros(len(nodes), bool)
+    shown = np.zeros(len(nodes), bool)
     for photo in photos:
-        rest = np.flatnonzero(~through)
+        rest = np.flatnonzero(~shown)
         local = (nodes[rest] - photo.c2w[:3, 3]) @ photo.c2w[:3, :3]
         pixel = photo.camera.project(local)
         height, width = photo.t.shape
@@ -239,40 +235,11 @@ def _seen_through(terrain: Terrain, photos: list[PhotoRays]) -> Bool[np.ndarray,
         column, row = pixel.T
         # A strong distortion folds what lies beside the frame into it.
         along = ((local @ photo.c2w[:3, :3].T) * photo.d[row, column]).sum(-1)
-        descent = np.maximum(photo.c2w[2, 3] - nodes[rest, 2], MIN_DESCENT)
-        length = distance**2 / (photo.camera.fx * descent)
         # The furthest of the neighbouring pixels: an edge hides nothing for certain.
         furthest = ndimage.maximum_filter(photo.t, 3)[row, column]
         clear = distance < furthest * (1 + DEPTH_ERROR) + LIFT
-        behind = photo.t[row, column] > distance + 2 * length
-        far = length > MAX_PIXEL_LENGTH
-        through[rest] = clear & (far | behind) & (along > np.cos(MAX_ANGLE) * distance)
-    return through.reshape(terrain.height.shape)
-
-
-@torch.no_grad()
-def _not_before_photos(field: RadianceField, terrain: Terrain, photos: list[PhotoRays]) -> Terrain:
-    """Return the terrain without completed nodes that would hide what photos show behind them."""
-    completed = CompletedField(field, terrain)
-    device, hits = device_of(field), [np.zeros((0, 2))]
-    for photo in photos:
-        d = photo.d.reshape(-1, 3)
-        eye = photo.c2w[:3, 3]
-        rays_d = to_device(d.astype(np.float32), device)
-        rays_o = to_device(eye.astype(np.float32), device).expand_as(rays_d).contiguous()
-        near = torch.full_like(rays_d[:, 0], field.near)
-        t = to_numpy(completed.crossing(rays_o, rays_d, near, torch.full_like(near, MAX_LENGTH)))
-        met = np.flatnonzero(np.isfinite(t))
-        x = eye + t[met, None] * d[met]
-        length = t[met] ** 2 / (photo.camera.fx * np.maximum(eye[2] - x[:, 2], MIN_DESCENT))
-        hits.append(x[t[met] + 2 * length < photo.t.reshape(-1)[met], :2])
-    xy = np.concatenate(hits)
-    column, row = np.rint((xy - np.array(terrain.origin)) / terrain.cell).astype(int).T
-    rows, columns = terrain.height.shape
-    hiding = np.zeros((rows, columns), bool)
-    hiding[row.clip(0, rows - 1), column.clip(0, columns - 1)] = True
-    hiding = ndimage.binary_dilation(hiding, iterations=OVERLAP)
-    return replace(terrain, open=terrain.open | (hiding & ~terrain.seen))
+        shown[rest] = clear & (along > np.cos(MAX_ANGLE) * distance)
+    return shown.reshape(terrain.height.shape)
 
 
 def _classes(

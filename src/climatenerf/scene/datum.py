@@ -18,6 +18,8 @@ DISAGREEMENT = 0.1  # m, besides two errors of the terrain, from which the datum
 def with_datum(scene: Scene, terrain: Terrain | None) -> Scene:
     """Return the scene with the median terrain height below its cameras as datum, if that differs.
 
+    Only cameras above ground that the field holds count, and only if they are half of all.
+
     Args:
         scene: the fitted capture.
         terrain: its ground; None keeps the datum.
@@ -27,7 +29,9 @@ def with_datum(scene: Scene, terrain: Terrain | None) -> Scene:
         return scene
     below = np.stack([scene.c2w_world(view)[:2, 3] for view in views])
     below = below[terrain.contains(below)]
-    if not len(below):
+    column, row = np.rint((below - np.array(terrain.origin)) / terrain.cell).astype(int).T
+    below = below[terrain.seen[row, column]]
+    if 2 * len(below) < len(views):
         return scene
     height = float(np.median(terrain.sample(terrain.height, below)))
     error = float(np.median(terrain.sample(terrain.error, below)))

@@ -80,7 +80,7 @@ class Terrain(HeightRaster):
     seen: Bool[np.ndarray, "rows columns"]
     """Whether the field holds the ground."""
     open: Bool[np.ndarray, "rows columns"]
-    """Where the field holds no ground and rays end below it, or the error is too large."""
+    """Where the field holds no ground although photos show the place, or the error is too large."""
 
     @property
     def completed(self) -> Bool[np.ndarray, "rows columns"]:

@@ -53,8 +53,9 @@ def nearness(
     """Return how near the matter of each ray is: 2 for all at the camera, 0 for all at infinity.
 
     It is the sum of weights times the distance to infinity in `distance_measure`. Transmitted light
-    counts as at infinity. As a loss it is an occlusion regularisation (Yang, Pavone & Wang 2023,
-    "FreeNeRF", Eq. 4) without a limit of the range.
+    counts as at infinity. Beyond one grid unit it is the expected inverse distance. As a loss it is
+    an occlusion regularisation, as FreeNeRF's on the density near cameras (Yang, Pavone & Wang
+    2023, Eq. 4).
 
     Args:
         weights: of the samples.

@@ -174,12 +174,13 @@ def _fit(
         raise
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     scene = with_corrections(scene, trainer)
+    checkpoint(trainer, run, scene, config)  # what follows takes seconds, and may be interrupted
     moved = 0.0
     if not interrupted and trainer.field.capabilities & {NORMALS, CLASSES}:
         datum = scene.ground_z
         scene = _finish_geometry(trainer.field, scene, settings.free_space)
         moved = scene.ground_z - datum
-    checkpoint(trainer, run, scene, config)
+        checkpoint(trainer, run, scene, config)
     save_preview(trainer.field, scene, run, trainer.steps)
     metrics = {
         "seconds": round(trainer.seconds, 3),
@@ -204,10 +205,9 @@ def _fit(
 
 def _finish_geometry(field: Field, scene: Scene, free_space: bool) -> Scene:
     """Remove floaters from a fitted field, and return the scene with its ground as the datum."""
-    photos = trace_photos(field, scene)
-    terrain = terrain_below(field, photos)
+    terrain = terrain_below(field, trace_photos(field.observed_only(), scene))
     if free_space:
-        remove_floaters(field, photos, terrain)
+        remove_floaters(field, trace_photos(field, scene), terrain)
     return with_datum(scene, terrain)
 
 

@@ -64,6 +64,16 @@ def test_the_tolerance_covers_the_error_and_grows_where_points_are_missing():
     assert (off < tolerance).float().mean() > 0.95
 
 
+def test_single_outliers_above_the_ground_are_no_crests():
+    xy = positions(3000)
+    z = torch.zeros(3000)
+    z[::100] = 1.0
+    ground = fitted(points(xy, z))
+    assert ground is not None
+    queries = points(positions(500, seed=9, half=3.0), torch.full((500,), 0.3))
+    assert ground.is_above_crests(queries, torch.full((500,), 0.02)).float().mean() > 0.95
+
+
 def test_rough_ground_is_valid_and_holds_nothing():
     """Boulders of half a grid unit on one side; smooth ground on the other."""
     xy = positions(4000)

@@ -7,7 +7,8 @@ A cell of the occupancy grid is forced empty in four cases:
 3. The views agree that only sky is behind it.
 4. It is above the ground, and most views see ground behind it.
 
-Cells near sparse points are protected from the first three.
+Cells near sparse points are protected from the first three, and cells in which most views see an
+obstacle from the second.
 
 Elsewhere, density above the ground is penalised but allowed: a crest may hide a ditch and what is
 in it, and the ground height does not resolve every step. Obstacles on the ground are exempt, with a

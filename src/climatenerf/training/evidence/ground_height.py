@@ -25,6 +25,7 @@ MIN_POINTS = 20  # for a fit
 PATCH_SIDES = (0.12, 0.07)  # grid units, of the patches that are swept, one after the other
 VALID_RADIUS = 0.5  # grid units around a height within which the ground is valid
 MAX_ERROR = 0.03  # grid units; ground that is known worse holds nothing
+CREST_ERRORS = 4.0  # of the spline, up to which a measured height can be a crest
 CREST_RADIUS = 0.625  # grid units; a ball must be above all ground within this distance
 SUPPORT_CELLS = 64  # cells along a side of the grid that marks where points support the height
 MIN_TOLERANCE = 4e-3  # grid units; kerbs and tufts of grass that the raster cannot resolve
@@ -44,7 +45,8 @@ class GroundHeight:
     holding: Bool[Tensor, "nodes nodes"]
     """Valid nodes whose height is known well enough to hold matter to it."""
     highest: Float[Tensor, "nodes nodes"]
-    """Upper bound of `height` and of the heights measured at the node: a spline rounds crests."""
+    """Upper bound of `height` and of heights measured there, without outliers: a spline rounds
+    crests."""
     supported: Bool[Tensor, "cells cells"]
     """Cells of a coarser grid that contain a point or adjoin a cell that does; rows along y."""
 
@@ -123,6 +125,7 @@ def fit_ground_height(
         raster = _fitted(heights.with_more(patches), centre, unit)
     x = heights.with_more(patches).x
     residual = np.abs(raster.sample(raster.height, x[:, :2]) - x[:, 2])
+    accepted = x[residual < CREST_ERRORS * raster.sample(raster.error, x[:, :2])]
     q = (x - centre)[residual < raster.sample(raster.error, x[:, :2])] / unit
     roughness = float(np.median(residual[: len(heights.x)])) / unit
     valid = to_device(_nodes_near(x, raster, VALID_RADIUS * unit), device)
@@ -130,7 +133,8 @@ def fit_ground_height(
     height = ((raster.height - centre[2]) / unit).astype(np.float32)
     tolerance = spread.clamp_min(max(MIN_TOLERANCE, TOLERANCE_FACTOR * roughness))
     highest = np.full(height.shape, -np.inf, np.float32)
-    np.maximum.at(highest, _nodes_of(x, raster), ((x[:, 2] - centre[2]) / unit).astype(np.float32))
+    crests = ((accepted[:, 2] - centre[2]) / unit).astype(np.float32)
+    np.maximum.at(highest, _nodes_of(accepted, raster), crests)
     bound = to_device(np.maximum(highest, height), device) + tolerance
     return GroundHeight(
         height=to_device(height, device),
