@@ -7,8 +7,10 @@ import time
 
 import pytest
 
+# A shell lets jobs in the background ignore SIGINT, and their children inherit that.
 BUSY = """
-import hashlib, sys, time
+import hashlib, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from climatenerf.cli import interruption
 interruption.SECONDS_TO_REACT = 0.5
 received = []
@@ -50,6 +52,7 @@ def test_other_signals_and_the_end_of_the_block_leave_the_process_alone():
             sys.executable,
             "-c",
             "import signal, time\n"
+            "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
             "from climatenerf.cli import interruption\n"
             "interruption.SECONDS_TO_REACT = 0.2\n"
             "signal.signal(signal.SIGUSR1, lambda *_: print('own handler'))\n"
