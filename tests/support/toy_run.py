@@ -6,6 +6,7 @@ import os
 import numpy as np
 
 from climatenerf.field.sampler import Sampler
+from climatenerf.render import photo_rays
 from climatenerf.training import run as run_module
 from climatenerf.training.run import fit_scene, load_pixels
 from climatenerf.training.settings import FitSettings
@@ -14,7 +15,8 @@ from support.toy_scene import TINY
 
 
 def limit_cost(monkeypatch):
-    """Reduce the preview and the rays of `mark_seen`: haze after a few steps renders slowly."""
+    """Reduce the preview and the rays that are traced: haze after a few steps renders slowly."""
+    monkeypatch.setattr(photo_rays, "MAX_RAYS", 4000)
     monkeypatch.setattr(run_module, "PREVIEW_WIDTH", 32)
     mark_seen = Sampler.mark_seen
     monkeypatch.setattr(Sampler, "mark_seen", lambda self, o, d: mark_seen(self, o[:50], d[:50]))

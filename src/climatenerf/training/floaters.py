@@ -31,7 +31,7 @@ def remove_floaters(field: Field, photos: list[PhotoRays], terrain: Terrain | No
 
     Args:
         field: a fitted field; its occupancy is changed in place.
-        photos: rays of all photos on it, with unobserved density.
+        photos: rays of all photos on it.
         terrain: its ground; None: nothing is removed, since lumps could be ground.
     """
     if terrain is None or len(photos) < MIN_CAPTURE:

@@ -20,7 +20,7 @@ from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
 from climatenerf.render.ground_evidence import terrain_below
-from climatenerf.render.photo_rays import trace_photos
+from climatenerf.render.photo_rays import PhotoRays, trace_photos
 from climatenerf.render.volume import render_view
 from climatenerf.scene.datum import with_datum
 from climatenerf.scene.images import (
@@ -31,7 +31,7 @@ from climatenerf.scene.images import (
     load_relative_depth,
 )
 from climatenerf.scene.scene import Scene
-from climatenerf.scene.terrain import save_terrain
+from climatenerf.scene.terrain import Terrain, save_terrain
 from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore
 from climatenerf.training.dataset import TrainingPixels
 from climatenerf.training.evidence.multiview_stereo import plane_sweep_depth
@@ -175,12 +175,12 @@ def _fit(
     trainer.field.occupancy.update(trainer.field.grid_density, 1.0, 0.8, trainer.generator)
     scene = with_corrections(scene, trainer)
     checkpoint(trainer, run, scene, config)  # what follows takes seconds, and may be interrupted
-    moved = 0.0
+    datum, traced = scene.ground_z, None
     if not interrupted and trainer.field.capabilities & {NORMALS, CLASSES}:
-        datum = scene.ground_z
-        scene = _finish_geometry(trainer.field, scene, settings.free_space)
-        moved = scene.ground_z - datum
-        checkpoint(trainer, run, scene, config)
+        removed, traced = _finish_geometry(trainer.field, scene, settings.free_space)
+        scene = with_datum(scene, traced[1])
+        if removed or scene.ground_z != datum:
+            checkpoint(trainer, run, scene, config)
     save_preview(trainer.field, scene, run, trainer.steps)
     metrics = {
         "seconds": round(trainer.seconds, 3),
@@ -191,34 +191,44 @@ def _fit(
         "train_views": len(scene.of_split("train")),
         "masked_fraction": masked_fraction(trainer),
         "discarded_steps": trainer.discarded.total,
-        "datum_moved_m": moved,
+        "datum_moved_m": scene.ground_z - datum,
     }
     write_json(run / METRICS, metrics)
     if interrupted and heldout_pixels(scene, downscale) > MAX_PIXELS_AFTER_STOP:
         # The user waits for the end, and a resumed fit will be measured.
         return metrics | {"psnr": None, "ssim": None, "psnr_cc": None}
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
-    metrics |= _find_ground(trainer.field, scene, run)
+    metrics |= _score_ground(trainer.field, scene, run, traced)
     write_json(run / METRICS, metrics)
     return metrics
 
 
-def _finish_geometry(field: Field, scene: Scene, free_space: bool) -> Scene:
-    """Remove floaters from a fitted field, and return the scene with its ground as the datum."""
-    terrain = terrain_below(field, trace_photos(field.observed_only(), scene))
-    if free_space:
-        remove_floaters(field, trace_photos(field, scene), terrain)
-    return with_datum(scene, terrain)
+def _finish_geometry(
+    field: Field, scene: Scene, free_space: bool
+) -> tuple[int, tuple[list[PhotoRays], Terrain | None]]:
+    """Remove floaters from a fitted field.
+
+    Returns:
+        How many; and the rays of the photos on the field that is left, with its terrain.
+    """
+    photos = trace_photos(field.observed_only(), scene)
+    terrain = terrain_below(field, photos)
+    removed = remove_floaters(field, photos, terrain) if free_space else 0
+    if removed:
+        photos = trace_photos(field.observed_only(), scene)
+        terrain = terrain_below(field, photos)
+    return removed, (photos, terrain)
 
 
-def _find_ground(field: Field, scene: Scene, run: Path) -> dict:
+def _score_ground(
+    field: Field, scene: Scene, run: Path, traced: tuple[list[PhotoRays], Terrain | None] | None
+) -> dict:
     """Save the terrain of a finished fit, and return the scores that need no reference."""
     identity = identity_of(run / FIELD) or ""
     if not field.capabilities & {NORMALS, CLASSES}:
         save_terrain(None, run, identity)
         return {}
-    photos = trace_photos(field.observed_only(), scene)
-    terrain = terrain_below(field, photos)
+    photos, terrain = traced or _finish_geometry(field, scene, free_space=False)[1]
     save_terrain(terrain, run, identity)
     return no_reference_scores(field, scene, photos, terrain)
 
