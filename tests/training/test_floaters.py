@@ -99,6 +99,16 @@ def test_a_lump_in_the_air_that_few_photos_see_is_removed(seeing, stays):
     assert remove_floaters(field, photos([], 0), terrain()) == 0, "nothing more"
 
 
+def test_what_stands_on_ground_that_holds_no_density_stays():
+    """A component of its own, less than `STANDING_HEIGHT` above the terrain."""
+    low, high = (18, 18, 16), (18, 18, 17)
+    for lump, removed in ((low, 0), (high, 1)):
+        field = ground_below([lump])
+        field.occupancy.occupied[0, 14:23, 14:23, SIDE // 2 - 1] = 0
+        assert remove_floaters(field, photos([lump], 1), terrain()) == removed
+        assert is_occupied(field, lump) != removed
+
+
 def test_a_photo_that_has_the_lump_in_its_frame_sees_it_though_no_ray_meets_it():
     """Of a thousand photos each has few rays."""
     field = ground_below()

@@ -1,5 +1,7 @@
 """Free-space constraint: empties the air above the ground, keeps the obstacles on it."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from support.tower import CAMERA, TOWER, in_matter, labels, poses
@@ -325,6 +327,10 @@ def test_samples_off_the_ground_get_the_depth_of_the_ground():
     off, target, penalised = found.ground_offsets(q, d, t / found.field.unit, EXACT)
     assert off[penalised].tolist() == [0, 2]
     assert torch.allclose(target[penalised] * found.field.unit, length[[0, 2]], atol=0.15)
+    # Ground that is known too badly holds nothing.
+    assert found.ground is not None
+    found.ground = replace(found.ground, holding=torch.zeros_like(found.ground.holding))
+    assert not len(found.ground_offsets(q, d, t / found.field.unit, EXACT)[0])
 
 
 def test_obstacles_from_labels_are_exempt_with_a_margin():
