@@ -332,7 +332,7 @@ def render_movie(
 
     def prepare() -> "jobs.FrameSource":
         field = run.completed(progress) if complete_ground else run.field
-        return jobs.frame_source(job, field, run.scene, progress)
+        return jobs.frame_source(job, field, run.scene, progress, run.folder)
 
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)

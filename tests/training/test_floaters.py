@@ -10,7 +10,7 @@ from support.toy_scene import TINY
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import BUILDING, ROAD
 from climatenerf.field.hash_field import Field
-from climatenerf.render.photo_rays import PhotoRays
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import View
 from climatenerf.scene.terrain import Terrain
 from climatenerf.training import floaters

@@ -119,7 +119,10 @@ def test_every_parameter_has_a_range_and_no_section_is_too_long():
         parameters = effect.fields()
         assert 0 < len(parameters) <= 12
         for parameter in parameters.values():
-            assert math.isfinite(parameter.low) and parameter.low < parameter.high
+            if isinstance(parameter, units.Choice):
+                assert len(set(parameter.words)) == len(parameter.words) > 1
+            else:
+                assert math.isfinite(parameter.low) and parameter.low < parameter.high
 
 
 def test_help_shows_unit_and_range(capsys):

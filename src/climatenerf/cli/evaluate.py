@@ -59,8 +59,10 @@ def run(options: Evaluate) -> int:
     from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views
     from climatenerf.evaluation.reference import read_reference
     from climatenerf.evaluation.scores import evaluate
+    from climatenerf.output.job import hash_of_run
     from climatenerf.output.score_report import check_folder, table_text, write_report
     from climatenerf.training.folder import check_config, checked_metrics
+    from climatenerf.weather.world import Kept
 
     fitted = load_run(options.run)
     field, scene = fitted.field, fitted.scene
@@ -83,9 +85,11 @@ def run(options: Evaluate) -> int:
     check_folder(options.out, names)
     with only_writer(options.out):
         old = check_folder(options.out, names)
-        with progress.Bar("evaluate", len(names) + 7) as bar:
+        kept = Kept(options.run, hash_of_run(options.run))
+        with progress.Bar("evaluate", len(names) + 8) as bar:
             scores = evaluate(
-                EvaluatedRun(field, scene, reference), lambda step: bar.advance(1, {"now": step})
+                EvaluatedRun(field, scene, reference, kept),
+                lambda step: bar.advance(1, {"now": step}),
             )
         write_report(scores, description, options.out, old)
     progress.result(table_text(scores.table))

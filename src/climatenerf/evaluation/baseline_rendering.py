@@ -94,7 +94,7 @@ def render_baseline(
                 return baselines.frame_noise(picture, seed)
         return None
     if name == "depth-fog" and constants.sigma is not None:
-        colour = np.array(linear_colour(weather.smog.colour))
+        colour = np.array(linear_colour(weather.smog.colour or smog.PAPER_COLOUR))
         return to_display(baselines.depth_fog(view, constants.sigma, colour))
     if name == "white-paint" and constants.snow is not None:
         coverage = baselines.snow_coverage(view)

@@ -1,5 +1,6 @@
 """A fitted run together with its ground truth, and the renders that scores are computed from."""
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from climatenerf.render.volume import camera_rays
 from climatenerf.scene import Camera, Scene, View
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.registry import EFFECTS
-from climatenerf.weather.world import World
+from climatenerf.weather.world import Kept, World
 
 Picture = UInt8[np.ndarray, "h w 3"]
 ENDLESS = 1e9  # m, ray length without a bound
@@ -33,6 +34,10 @@ class EvaluatedRun:
     field: RadianceField
     scene: Scene
     reference: Reference
+    kept: Kept | None = None
+    """The run folder, where light that was found is kept."""
+    sessions: dict[bytes, RenderSession] = dataclasses.field(default_factory=dict, repr=False)
+    """One for each set of cameras; light is gathered once for all weathers."""
 
     def camera(self, truth: Truth) -> tuple[Camera, Float[np.ndarray, "4 4"]]:
         """Return the camera of a test view and its pose in the run's own world, m."""
@@ -95,8 +100,15 @@ def prepare_weather(
 ) -> RenderSession:
     """Prepare a weather at one time (s) for cameras at some poses (world m)."""
     positions = np.stack([pose[:3, 3] for pose in poses])
-    moment = np.array([time])
-    return RenderSession(run.field, run.scene, weather, positions, moment, effects=EFFECTS)
+    key = positions.tobytes() + np.float64(time).tobytes()
+    if key in run.sessions:
+        run.sessions[key].change(weather)
+    else:
+        moment = np.array([time])
+        run.sessions[key] = RenderSession(
+            run.field, run.scene, weather, positions, moment, effects=EFFECTS, kept=run.kept
+        )
+    return run.sessions[key]
 
 
 def render_weather(

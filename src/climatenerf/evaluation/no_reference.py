@@ -18,8 +18,8 @@ from climatenerf.core.classes import GROUND, MERGED, SKY
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.protocol import RadianceField, device_of
-from climatenerf.render.photo_rays import PhotoRays
 from climatenerf.scene.images import load_image, load_labels
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
 from climatenerf.scene.terrain import Terrain
 from climatenerf.scene.withheld import is_withheld

@@ -4,7 +4,7 @@ docs/reference-scene.md describes the files of its folder.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from climatenerf.scene.images import load_labels, read_rgb
 from climatenerf.weather.description import KeyframedWeather, read_weather
 
 FILE_NAME = "reference.json"
-SCHEMA_VERSION = 2  # 2: `clean`, and no mirror
+SCHEMA_VERSION = 3  # 2: `clean`, and no mirror; 3: light, `relight`, mirror in linear radiance
 SKY = 10  # Cityscapes train id
 
 
@@ -66,13 +66,15 @@ class WeatherTruth:
         name: such as "flood-low".
         weather: the weather to render.
         time: time of the picture, s.
-        folder: folder of its true pictures and layers.
+        folder: folder of its true pictures.
+        layer_folder: folder of its true layers.
     """
 
     name: str
     weather: KeyframedWeather
     time: float
     folder: Path
+    layer_folder: Path
 
     def picture(self, view: str) -> UInt8[np.ndarray, "h w 3"]:
         """Read the path-traced display picture of a view."""
@@ -82,12 +84,41 @@ class WeatherTruth:
         """Read the true layers of a view.
 
         Returns:
-            For smog `transmittance`; for snow `depth` along the ray and vertical `thickness`, m.
+            For smog that absorbs `transmittance`; for snow `depth` along the ray and vertical
+            `thickness`, m.
 
         Raises:
             UserError: the file is missing (floods have no layers) or damaged.
         """
-        return _arrays((self.folder / view).with_suffix(".npz"))
+        return _arrays((self.layer_folder / view).with_suffix(".npz"))
+
+
+@dataclass(frozen=True)
+class TrueLight:
+    """The light of a capture.
+
+    Attributes:
+        sheet: radiance of a white sheet on open level ground.
+        sun: elevation and azimuth of a hard sun, rad; None under a sky without one.
+    """
+
+    sheet: Float[np.ndarray, "3"]
+    sun: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Relight:
+    """The same place under another sky.
+
+    Attributes:
+        name: of the sky, such as "overcast".
+        weather: what turns the capture's light into it.
+        truths: the test views under it.
+    """
+
+    name: str
+    weather: KeyframedWeather
+    truths: tuple[Truth, ...]
 
 
 @dataclass(frozen=True)
@@ -101,6 +132,8 @@ class Reference:
         weathers: all weathers to measure.
         mirror_level: height of the mirror in the pictures of `mirror/`, m above the ground datum;
             None without such pictures.
+        light: the light of the photos; None where the set does not tell.
+        relight: the test views under another sky; None without them.
     """
 
     folder: Path
@@ -108,10 +141,12 @@ class Reference:
     truths: tuple[Truth, ...]
     weathers: tuple[WeatherTruth, ...]
     mirror_level: float | None
+    light: TrueLight | None = None
+    relight: Relight | None = None
 
-    def mirrored(self, view: str) -> UInt8[np.ndarray, "h w 3"]:
-        """Read the true picture of a view with a perfect mirror at `mirror_level`."""
-        return read_rgb((self.folder / "mirror" / view).with_suffix(".png"))
+    def mirrored(self, view: str) -> Float[np.ndarray, "h w 3"]:
+        """Read the linear radiance of a view with a perfect mirror at `mirror_level`."""
+        return _arrays((self.folder / "mirror" / view).with_suffix(".npz"))["linear"].astype(float)
 
 
 def read_reference(
@@ -139,6 +174,14 @@ def read_reference(
         folder = (capture / data["truth"]).resolve()
         listed, entries = [str(v) for v in data["views"]], dict(data["weather"])
         times = {name: float(entry["time_s"]) for name, entry in entries.items()}
+        # Pictures and requests lie with the truth unless a folder is named.
+        places = {
+            name: (capture / entry["folder"]).resolve() if "folder" in entry else folder
+            for name, entry in entries.items()
+        }
+        layers = {name: str(entry.get("layers", name)) for name, entry in entries.items()}
+        light = _true_light(data.get("light"))
+        others = {str(k): (capture / v).resolve() for k, v in data.get("relight", {}).items()}
         mirror = data["mirror_level_m"]
         level = None if mirror is None else float(mirror)
         # The folder of clean pictures in a light or with materials of their own.
@@ -151,22 +194,40 @@ def read_reference(
     selected = [v for v in listed if not views or Path(v).stem in views]
     _check_names(views, [Path(v).stem for v in listed], "view")
     _check_names(weathers, list(times), "weather")
+    truths = tuple(_read_truth(folder, scene, name, own) for name in selected)
+    relight = None
+    for name, place in others.items():
+        weather = read_weather(capture / "relight" / f"{name}.toml")
+        clean = (_arrays((place / "truth" / t.name).with_suffix(".npz"))["clean"] for t in truths)
+        pairs = zip(truths, clean, strict=True)
+        relight = Relight(name, weather, tuple(replace(t, clean=c.astype(float)) for t, c in pairs))
     return Reference(
         folder,
         scene,
-        tuple(_read_truth(folder, scene, name, own) for name in selected),
+        truths,
         tuple(
             WeatherTruth(
                 name,
-                read_weather(folder / "weather" / f"{name}.toml"),
+                read_weather(places[name] / "weather" / f"{name}.toml"),
                 time,
-                folder / "weather" / name,
+                places[name] / "weather" / name,
+                folder / "weather" / layers[name],
             )
             for name, time in times.items()
             if not weathers or name in weathers
         ),
         level,
+        light,
+        relight,
     )
+
+
+def _true_light(data: Mapping[str, Any] | None) -> TrueLight | None:
+    if data is None:
+        return None
+    sun = data["sun_deg"]
+    angles = None if sun is None else (np.radians(float(sun[0])), np.radians(float(sun[1])))
+    return TrueLight(np.array(data["sheet"], float), angles)
 
 
 def _check_names(names: tuple[str, ...], existing: list[str], what: str) -> None:

@@ -34,17 +34,23 @@ from climatenerf.evaluation.evaluated_run import (
 )
 from climatenerf.evaluation.metrics import psnr, ssim
 from climatenerf.evaluation.reference import Truth, WeatherTruth
-from climatenerf.field.capabilities import CLASSES
+from climatenerf.evaluation.relight_scores import relight_scores
+from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.compositing import RENDER_STEP
-from climatenerf.field.protocol import device_of
+from climatenerf.field.protocol import device_of, observed
 from climatenerf.ops import compositing
 from climatenerf.paths.camera_path import camera_path
 from climatenerf.render.frame import see_frame
 from climatenerf.render.heads import see_surface
+from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.volume import camera_rays
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.surface import Water
+from climatenerf.weather.light.captured import open_sheet
+from climatenerf.weather.light.file import light_of_photos_in
+from climatenerf.weather.light.parameters import Sun
+from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.smog.parameters import SMOG
 from climatenerf.weather.weather import Weather
 
@@ -94,11 +100,14 @@ def evaluate(run: EvaluatedRun, progress: Progress) -> Scores:
     scores.table["labels"] = label_scores(run)
     progress("mirrored cameras")
     scores.table["completeness"] = mirror_scores(run)
-    scores.table["weather"], scores.table["baselines"] = {}, {}
+    scores.table |= {"weather": {}, "walls": {}, "baselines": {}}
     constants: dict[str, Constants] = {}
     for case in run.reference.weathers:
         progress(case.name)
         constants[case.name] = score_weather(run, case, views, scores)
+    progress("light")
+    scores.table["light"] = light_scores(run)
+    scores.table["relight"] = relight_all(run)
     progress("consistency")
     scores.table["consistency"] = consistency(run, constants, progress)
     return scores
@@ -204,10 +213,45 @@ def mirror_scores(run: EvaluatedRun) -> dict[str, float]:
     for truth in reference.truths:
         linear, _ = see_frame(world, *run.camera(truth))
         visible = weather_scores.water_visible(truth, level)
-        rendered = display_8bit(linear.double().numpy())[visible] / 255.0
-        errors.append(((rendered - reference.mirrored(truth.name)[visible] / 255.0) ** 2).ravel())
+        rendered = to_display(linear.double().numpy())[visible]
+        true = to_display(reference.mirrored(truth.name))[visible]
+        errors.append(((rendered - true) ** 2).ravel())
     mse = float(np.concatenate(errors).mean()) if sum(map(len, errors)) else float("nan")
     return {"mirror_psnr": float(-10 * np.log10(max(mse, 1e-12)))}  # 1e-12: equal pictures, log 0
+
+
+def light_scores(run: EvaluatedRun) -> dict[str, float]:
+    """Score the light that is found in the photos.
+
+    Returns:
+        `sheet_error`: relative error of a white sheet on open level ground, the largest of three
+        channels; `sun_deg`: angle between the found sun and the true one. NaN where there is none.
+    """
+    true, nothing = run.reference.light, float("nan")
+    if true is None or NORMALS not in run.field.capabilities:
+        return {"sheet_error": nothing, "sun_deg": nothing}
+    light = light_of_photos_in(
+        run.kept, run.field, lambda: trace_photos(observed(run.field), run.scene)
+    )
+    if light is None:
+        return {"sheet_error": nothing, "sun_deg": nothing}
+    sheet = open_sheet(light, run.field)
+    angle = nothing
+    if true.sun is not None and light.sun is not None:
+        given = sun_direction(Sun(*true.sun))
+        angle = float(np.degrees(np.arccos(np.clip(light.sun @ given, -1, 1))))
+    return {"sheet_error": float(np.abs(sheet / true.sheet - 1).max()), "sun_deg": angle}
+
+
+def relight_all(run: EvaluatedRun) -> dict[str, Any]:
+    """Render the test views under another sky and compare; empty without its truth."""
+    other = run.reference.relight
+    if other is None or NORMALS not in run.field.capabilities:
+        return {}
+    cameras = [run.camera(truth) for truth in other.truths]
+    world = prepare_weather(run, other.weather, 0.0, [c2w for _, c2w in cameras]).world(0.0)
+    pictures = [see_frame(world, *each)[0].double().numpy() for each in cameras]
+    return {other.name: relight_scores(pictures, other.truths, run.reference.truths)}
 
 
 def frame_scores(run: EvaluatedRun) -> dict[str, float]:
@@ -280,7 +324,12 @@ def score_weather(
     if weather.snow.depth is not None:
         snow = [case.layers(truth.name) for truth in truths]
         found |= weather_scores.snow_scores(layers, truths, snow, 1.0 / cameras[0][0].fx)
-    if SMOG.present(weather.smog):
+    found |= weather_scores.by_view(truths, rendered, true)
+    if weather.snow.depth is not None:
+        ours = [linear for linear, _ in renders]
+        dry = [view.linear for view in views]
+        scores.table["walls"][case.name] = weather_scores.wall_scores(ours, dry, true, truths)
+    if SMOG.present(weather.smog) and weather.smog.light == "paper":
         found |= weather_scores.transmittance_scores(
             [each["transmittance"] for each in layers],
             [case.layers(truth.name)["transmittance"] for truth in truths],

@@ -1,8 +1,13 @@
 """Geometric scores of a rendered weather: waterline, snow surface, transmittance of the smog."""
 
-import numpy as np
-from jaxtyping import Bool, Float, Int
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from climatenerf.core.classes import BUILDING, MERGED, VEGETATION
+from climatenerf.core.srgb import to_linear
 from climatenerf.evaluation.geometry import ground_or_roof
 from climatenerf.evaluation.reference import Truth
 from climatenerf.render.depth_normals import plane_normals
@@ -145,6 +150,52 @@ def transmittance_scores(
     pairs = zip(rendered, true, strict=True)
     errors = [np.abs(a - b.astype(np.float64)).ravel() for a, b in pairs]
     return {"transmittance_error": float(np.concatenate(errors).mean())}
+
+
+def by_view(
+    truths: tuple[Truth, ...],
+    rendered: list[UInt8[np.ndarray, "h w 3"]],
+    true: list[UInt8[np.ndarray, "h w 3"]],
+) -> dict[str, Any]:
+    """Return `views`, the PSNR (dB) of each view, and `psnr_no_vegetation`, their mean without it.
+
+    Snow and light in leaves are finer than a pixel, and no two simulations of them agree.
+    """
+    views, rest = {}, []
+    for truth, ours, other in zip(truths, rendered, true, strict=True):
+        squared = ((ours.astype(float) - other.astype(float)) / 255.0) ** 2
+        views[Path(truth.name).stem] = float(-10 * np.log10(max(squared.mean(), 1e-12)))
+        plain = MERGED[truth.label] != VEGETATION
+        if plain.any():
+            rest.append(-10 * np.log10(max(squared[plain].mean(), 1e-12)))  # 1e-12: equal pictures
+    return {"views": views, "psnr_no_vegetation": float(np.mean(rest)) if rest else float("nan")}
+
+
+def wall_scores(
+    snowy: list[Float[np.ndarray, "h w 3"]],
+    dry: list[Float[np.ndarray, "h w 3"]],
+    true: list[UInt8[np.ndarray, "h w 3"]],
+    truths: tuple[Truth, ...],
+) -> dict[str, float]:
+    """Score how much snow on the ground brightens walls.
+
+    Returns:
+        `ratio`: mean radiance of walls under snow over dry; `true_ratio`; and `ratio_error`, the
+        relative error of the first. NaN without walls in view.
+    """
+    sums = np.zeros(4)
+    for ours, clean, picture, truth in zip(snowy, dry, true, truths, strict=True):
+        up = np.abs(truth.normal @ truth.c2w[2, :3])
+        display = picture / 255.0
+        wall = (MERGED[truth.label] == BUILDING) & (up < 0.3) & (truth.depth < MAX_SNOW_DISTANCE)
+        wall &= display.max(-1) < 0.99
+        linear = to_linear(display)
+        sums += [each[wall].sum() for each in (ours, clean, linear, truth.clean)]
+    if not sums[1] or not sums[3]:
+        nothing = float("nan")
+        return {"ratio": nothing, "true_ratio": nothing, "ratio_error": nothing}
+    ratio, other = float(sums[0] / sums[1]), float(sums[2] / sums[3])
+    return {"ratio": ratio, "true_ratio": other, "ratio_error": abs(ratio / other - 1)}
 
 
 def water_visible(truth: Truth, level: float) -> Bool[np.ndarray, "h w"]:

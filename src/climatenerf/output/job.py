@@ -446,7 +446,11 @@ def render_movie(
 
 
 def frame_source(
-    job: RenderJob, field: "RadianceField", scene: Scene, progress: Progress | None = None
+    job: RenderJob,
+    field: "RadianceField",
+    scene: Scene,
+    progress: Progress | None = None,
+    folder: Path | None = None,
 ) -> FrameSource:
     """Prepare light, waves and snow for a job, and return what renders its frames.
 
@@ -455,13 +459,16 @@ def frame_source(
         field: the fitted field of its run.
         scene: the capture of its run.
         progress: called with what is being prepared and the fraction that is done.
+        folder: the run folder, where what is found in the field is kept; None: nowhere.
 
     Raises:
         UserError: the weather does not fit the scene.
     """
     from climatenerf.field.protocol import require
     from climatenerf.render.session import RenderSession
+    from climatenerf.weather.world import Kept
 
+    kept = None if folder is None else Kept(folder, job.run)
     appearance = None
     if job.appearance is not None:
         require(field, frozenset({APPEARANCE}), "the appearance of a photo")
@@ -469,7 +476,7 @@ def frame_source(
     times = np.array([job.time(index) for index in range(len(job))])
     positions = job.path.c2w[:, :3, 3]
     session = RenderSession(
-        field, scene, job.weather, positions, times, appearance, progress, job.effects
+        field, scene, job.weather, positions, times, appearance, progress, job.effects, kept
     )
 
     def render(index: int, preview: Preview | None) -> RenderedFrame:

@@ -114,6 +114,9 @@ def table_text(table: dict[str, Any]) -> str:
     lines.append("")
     for name, scores in table["weather"].items():
         lines.append(_line(name, {k: v for k, v in scores.items() if k not in ("psnr", "ssim")}))
+    lines += [_line(f"walls, {name}", walls) for name, walls in table.get("walls", {}).items()]
+    lines.append(_line("light", table.get("light", {})))
+    lines += [_line(f"relit, {name}", scores) for name, scores in table.get("relight", {}).items()]
     consistency = table["consistency"]
     lines += ["", f"{'warp error, next / far':<24}" + "".join(f"{k:>15}" for k in WARPED)]
     for name in ("ours", *BASELINES):
@@ -135,9 +138,14 @@ def _db(value: float) -> str:
     return f"{value:.2f}"
 
 
-def _line(title: str, values: dict[str, float]) -> str:
-    cells = "  ".join(f"{key.replace('_', ' ')} {value:.3g}" for key, value in values.items())
-    return f"{title:<16} {cells}"
+def _line(title: str, values: dict[str, Any]) -> str:
+    """Return a line of scores; those in groups have the group's name before theirs."""
+    cells = []
+    for key, value in values.items():
+        inner = value.items() if isinstance(value, dict) else [("", value)]
+        for name, number in inner:
+            cells.append(f"{f'{key} {name}'.strip().replace('_', ' ')} {number:.3g}")
+    return f"{title:<16} {'  '.join(cells)}"
 
 
 def _without_nan(value: Any) -> Any:

@@ -38,6 +38,8 @@ def trace_field(
     )
     skyward = (transmittance > MIN_WEIGHT).nonzero()[:, 0]
     sky = world.field.sky(rays_d[skyward], world.appearance)
+    if not measured and world.light is not None:
+        sky = world.light.reflected_sky(rays_d[skyward], sky)
     rgb = rgb.index_add(0, skyward, transmittance[skyward, None] * sky)
     if not measured:
         return radiance_alone(rgb)

@@ -21,7 +21,8 @@ from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.compositing import chunks
 from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.ops import compositing
-from climatenerf.render.photo_rays import PhotoRays, trace_photos
+from climatenerf.render.photo_rays import trace_photos
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
 from climatenerf.scene.terrain import Terrain, nearest_known
 from climatenerf.scene.terrain_fit import Heights, fit_heights

@@ -138,6 +138,8 @@ def _trace(
     endless = torch.full((n,), torch.inf, device=device)
     skyward = (sky_weight > MIN_WEIGHT).nonzero()[:, 0]
     sky = world.field.sky(rays_d[skyward], world.appearance)
+    if not measured and world.light is not None:
+        sky = world.light.reflected_sky(rays_d[skyward], sky)
     sky = arrive(sky, skyward, endless[skyward])
     rgb = rgb.index_add(0, skyward, sky_weight[skyward, None] * sky)
 

@@ -1,45 +1,21 @@
 """Where the rays of the photos end on the fitted field; terrain and scores start from this."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
 
-from climatenerf.core.cameras import Camera
 from climatenerf.core.device import to_numpy
 from climatenerf.field.compositing import chunks
 from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.render.heads import ray_ends
 from climatenerf.render.volume import camera_rays
-from climatenerf.scene.scene import Scene, View
+from climatenerf.scene.photo_rays import PhotoRays
+from climatenerf.scene.scene import Scene
 
 MAX_RAYS = 150_000  # of all photos together
 END_STEP = 2.0  # marching step of those rays; see `RENDER_STEP`
 END_WEIGHT = 0.01  # of samples whose normal and class are evaluated
-
-
-@dataclass(frozen=True)
-class PhotoRays:
-    """Where the rays of a photo end on the field, at a reduced size."""
-
-    view: View
-    camera: Camera
-    """Its camera at the reduced size."""
-    c2w: Float[np.ndarray, "4 4"]
-    x: Float[np.ndarray, "h w 3"]
-    """Ends, world m; infinite in the sky."""
-    t: Float[np.ndarray, "h w"]
-    """Ray lengths, m; +inf in the sky."""
-    d: Float[np.ndarray, "h w 3"]
-    """Unit directions."""
-    normal: Float[np.ndarray, "h w 3"]
-    """Unit normals, world axes; 0 in the sky."""
-    label: UInt8[np.ndarray, "h w"]
-    """Classes of the field."""
-    transmittance: Float[np.ndarray, "h w"]
-    """Fraction of the light that passes everything."""
 
 
 @torch.no_grad()

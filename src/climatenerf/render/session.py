@@ -13,15 +13,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.cameras import Camera
-from climatenerf.field.protocol import RadianceField, require
+from climatenerf.field.capabilities import CLASSES, NORMALS
+from climatenerf.field.protocol import RadianceField, observed, require
 from climatenerf.render.frame import FrameOptions, Picture, encoded_8bit, see_frame
 from climatenerf.render.irradiance import scene_irradiance
+from climatenerf.render.photo_rays import trace_photos
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, for_effects
 from climatenerf.weather.effect import Effect, Entity
 from climatenerf.weather.registry import check_effects, in_order, installed_effects, layer_table
 from climatenerf.weather.weather import Weather, check
-from climatenerf.weather.world import Preparation, World
+from climatenerf.weather.world import Kept, Preparation, World
 
 Key = tuple[tuple[object, ...], ...]
 
@@ -57,6 +60,7 @@ class RenderSession:
         appearance: Float[Tensor, "1 e"] | None = None,
         progress: Callable[[str, float], None] | None = None,
         effects: Sequence[Effect] | None = None,
+        kept: Kept | None = None,
     ):
         """Prepare everything that is computed once: light, waves, snowfall.
 
@@ -71,6 +75,7 @@ class RenderSession:
             progress: called with what is being done and the fraction that is done, [0, 1].
             effects: the effects to render with; None takes the installed ones. A section of the
                 weather that has values of its own needs its effect among them.
+            kept: the run folder, where what is found in the field is kept; None: nowhere.
 
         Raises:
             UserError: a value out of its range, a level above the whole scene, effects that clash,
@@ -88,6 +93,8 @@ class RenderSession:
         self._times = np.zeros(1) if times is None else times
         self._appearance = appearance
         self._progress = progress or (lambda what, fraction: None)
+        self._kept = kept
+        self._photos: list[PhotoRays] | None = None
         self._light: Float[Tensor, 3] | None = None
         self._keys: dict[str, Key] = {}
         self._entities: dict[str, Entity] = {}
@@ -106,7 +113,9 @@ class RenderSession:
         moments = [check(weather.at(float(t)), self.effects) for t in self._times]
         prepared = {}
         for effect in self.effects:
-            own = tuple(m for m in moments if effect.present(m.sections[effect.name]))
+            own = tuple(
+                m for m in moments if effect.always or effect.present(m.sections[effect.name])
+            )
             function = effect.load() if own else None
             if function is None:
                 continue
@@ -138,7 +147,8 @@ class RenderSession:
         weather = self.weather.at(time)
         world = World(self.field, self._appearance)
         for effect in self.effects:
-            if effect.name in self._entities and effect.present(weather.sections[effect.name]):
+            here = effect.always or effect.present(weather.sections[effect.name])
+            if here and effect.name in self._entities:
                 world = self._entities[effect.name].place(world, weather, time)
         return world
 
@@ -190,7 +200,17 @@ class RenderSession:
             self._appearance,
             self._irradiance,
             self._progress,
+            self._photo_rays if self.field.capabilities & {NORMALS, CLASSES} else None,
+            self._kept,
         )
+
+    def _photo_rays(self) -> list[PhotoRays]:
+        def report(fraction: float) -> None:
+            self._progress("photos", fraction)
+
+        if self._photos is None:
+            self._photos = trace_photos(observed(self.field), self.scene, report)
+        return self._photos
 
     def _irradiance(self) -> Float[Tensor, "3"]:
         if self._light is None:

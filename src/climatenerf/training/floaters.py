@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.hash_field import Field
-from climatenerf.render.photo_rays import PhotoRays
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.terrain import Terrain
 
 MIN_PHOTOS = 3  # that see a component

@@ -20,7 +20,7 @@ from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
 from climatenerf.render.ground_evidence import terrain_below
-from climatenerf.render.photo_rays import PhotoRays, trace_photos
+from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.volume import render_view
 from climatenerf.scene.datum import with_datum
 from climatenerf.scene.images import (
@@ -30,6 +30,7 @@ from climatenerf.scene.images import (
     load_mask,
     load_relative_depth,
 )
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
 from climatenerf.scene.terrain import Terrain, save_terrain
 from climatenerf.training.checkpoint import checkpoint, in_frame_of, restore

@@ -43,7 +43,7 @@ STORMY: dict[str, Any] = {
 }
 NOTHING: dict[str, Any] = {"smog": Smog(sigma=0.0), "snow": Snow(depth=0.0)}
 FAINT_COLOUR = (1.0, 1.0, 0.0)
-FAINT: dict[str, Any] = {"smog": Smog(visibility=1e7, colour=FAINT_COLOUR)}
+FAINT: dict[str, Any] = {"smog": Smog(visibility=1e7, light="paper", colour=FAINT_COLOUR)}
 OPAQUE = 1e-3  # fraction of the sky's light below which a pixel counts as opaque
 DEFINITION = "definition"
 

@@ -27,6 +27,7 @@ from climatenerf.verification.closed_forms import linear_from_display
 from climatenerf.verification.setting import Viewpoint, clear_fraction, radiance, sky_of
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.registry import EFFECTS
+from climatenerf.weather.smog.medium import PAPER_COLOUR
 from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
@@ -50,19 +51,21 @@ def checks(field: Field, scene: Scene, viewpoint: Viewpoint) -> Iterator[Check]:
     """
     yield stored_numbers(field.state_dict())
 
+    session = RenderSession(field, scene, Weather(), viewpoint.eye[None], effects=EFFECTS)
+
     def seen(weather: Weather, layers: tuple[str, ...] = ()) -> Frame:
-        session = RenderSession(field, scene, weather, viewpoint.eye[None], effects=EFFECTS)
+        session.change(weather)
         return session.frame(viewpoint.camera, viewpoint.c2w, layers=layers)
 
     clean = seen(Weather())
     yield finite(clean)
     solid = np.isfinite(clean.layers["depth"])
     distance = float(np.median(clean.layers["depth"][solid])) if solid.any() else 1.0
-    smog = Smog(sigma=OPTICAL_DEPTH / distance)
+    smog = Smog(sigma=OPTICAL_DEPTH / distance, light="paper", colour=PAPER_COLOUR)
     hazy = seen(Weather(smog=smog))
     yield transmittance(hazy, OPTICAL_DEPTH / distance)
     single = single_surface(field, viewpoint, MAX_SPREAD * distance)
-    yield airlight(clean, hazy, OPTICAL_DEPTH / distance, smog.colour, single)
+    yield airlight(clean, hazy, OPTICAL_DEPTH / distance, PAPER_COLOUR, single)
 
     height = float(viewpoint.eye[2]) - scene.ground_z
     reach = max(height, 1.0)

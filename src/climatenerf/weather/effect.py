@@ -83,6 +83,7 @@ class Effect:
         prepared_from: Parameters ("snow.fall_tilt", "seed") whose change prepares the entity again.
             A change of any other parameter only places it anew.
         version: Version of the effect's code. A new one renders finished frames again.
+        always: Whether it is placed in every frame, whatever its parameters are.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Effect:
     after: tuple[str, ...] = ()
     prepared_from: tuple[str, ...] = ()
     version: str = ""
+    always: bool = False
 
     def present(self, section: Any) -> bool:
         """Whether parameters put this effect into the scene."""

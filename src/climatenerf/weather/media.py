@@ -17,6 +17,7 @@ from climatenerf.weather.world import Medium
 
 PIECES = 16  # cuts of a ray beside those that media ask for
 FAR = 1e6  # m; where media overlap, infinite rays are cut up to here
+_OPAQUE = 1e4  # optical depth behind which nothing is seen
 _TINY = 1e-30  # optical depth that keeps the mean colour of an empty stretch finite: 0/0
 
 
@@ -40,9 +41,9 @@ def attenuate(
 ) -> Float[Tensor, "n 3"]:
     """Linear radiance at ray length t (m; may be +inf) as it arrives at the origin."""
     if len(media) == 1:
-        weight = transmittance(media, rays_o, rays_d, t)[:, None]
+        weight = _by_channel(media[0], media[0].optical_depth(rays_o, rays_d, t)).neg().exp()
         return weight * radiance + (1 - weight) * media[0].source(rays_o, rays_d)
-    arriving, passed = torch.zeros_like(radiance), torch.ones_like(t)
+    arriving, passed = torch.zeros_like(radiance), torch.ones_like(radiance)
     start = torch.zeros_like(t)
     before = [torch.zeros_like(t) for _ in media]
     sources = [medium.source(rays_o, rays_d) for medium in media]
@@ -50,16 +51,25 @@ def attenuate(
         after = [medium.optical_depth(rays_o, rays_d, end) for medium in media]
         # A stretch of no length adds nothing, whatever roundings say.
         depths = [
-            torch.where(end > start, (b - a).clamp_min(0), 0.0)
-            for a, b in zip(before, after, strict=True)
+            _by_channel(medium, torch.where(end > start, (b - a).clamp_min(0), 0.0))
+            for medium, a, b in zip(media, before, after, strict=True)
         ]
         total = torch.stack(depths).sum(0)
-        own = sum(d[:, None] * c for d, c in zip(depths, sources, strict=True))
-        own = own / total[:, None].clamp_min(_TINY)
+        own = sum(d * c for d, c in zip(depths, sources, strict=True))
+        own = own / total.clamp_min(_TINY)
         transmitted = torch.exp(-total)
-        arriving = arriving + (passed * (1 - transmitted))[:, None] * own
+        arriving = arriving + passed * (1 - transmitted) * own
         passed, start, before = passed * transmitted, end, after
-    return arriving + passed[:, None] * radiance
+    return arriving + passed * radiance
+
+
+def _by_channel(medium: Medium, depth: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+    """Optical depth of each colour channel."""
+    exponent = getattr(medium, "exponent", None)
+    if exponent is None:
+        return depth[:, None].expand(-1, 3)
+    # 0 times the infinite depth of an endless ray would be NaN.
+    return depth.clamp_max(_OPAQUE)[:, None] * exponent
 
 
 def _cuts(

@@ -243,6 +243,67 @@ class Parameter(PrimitiveConstructorSpec[Any]):
         return [str(x) for x in (value if self.count > 1 else (value,))]
 
 
+class Choice(Parameter):
+    """One of several words, as metadata of a dataclass field's annotation.
+
+    Attributes:
+        words: the valid ones.
+    """
+
+    words: tuple[str, ...]
+
+    def __init__(self, *words: str):
+        self.words = words
+        super().__init__(None, -math.inf, math.inf)
+        object.__setattr__(self, "metavar", "{" + ",".join(words) + "}")
+
+    def check(self, value: Any, name: str) -> None:
+        """Check that a value is one of the words; see `Parameter.check`.
+
+        Raises:
+            UserError: it is another one.
+        """
+        if value not in self.words:
+            raise UserError(
+                f"--{name.replace('_', '-')} must be one of {', '.join(self.words)}; got"
+                f" {excerpt(value)}"
+            )
+
+    def read(self, raw: Any, where: str) -> str:
+        """A value of a weather file.
+
+        Raises:
+            UserError: none of the words.
+        """
+        if raw not in self.words:
+            raise UserError(f"{where} must be one of {', '.join(self.words)}; got {excerpt(raw)}")
+        return raw
+
+    def write(self, value: str) -> str:
+        """The word itself."""
+        return value
+
+    def text(self, value: Any) -> str:
+        """The word itself."""
+        return str(value)
+
+    def _from_words(self, words: list[str]) -> str:
+        if words[0] not in self.words:
+            raise ValueError(f"must be one of {', '.join(self.words)}; got {excerpt(words[0])}")
+        return words[0]
+
+    def _is_instance(self, value: Any) -> bool:
+        return value in self.words
+
+    def _to_words(self, value: Any) -> list[str]:
+        return [value]
+
+
+def choice(*words: str) -> Choice:
+    """One of several words."""
+    return Choice(*words)
+
+
 def quantity(
     kind: Kind, low: float = -math.inf, high: float = math.inf, optional: bool = False
 ) -> Parameter:
@@ -250,9 +311,9 @@ def quantity(
     return Parameter(kind, low, high, 1, optional)
 
 
-def number(low: float, high: float) -> Parameter:
+def number(low: float, high: float, optional: bool = False) -> Parameter:
     """A plain number from `low` to `high`."""
-    return Parameter(None, low, high)
+    return Parameter(None, low, high, 1, optional)
 
 
 def triple(low: float, high: float, optional: bool = False) -> Parameter:

@@ -8,6 +8,7 @@ tracing further ones. The field is the scene itself. Lengths are metres, z is up
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import RadianceField
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.weather import Weather
 
@@ -25,7 +27,11 @@ TINY = math.exp(-12)  # keeps means over nothing finite: 0/0
 
 
 class Medium(Protocol):
-    """A participating medium that absorbs, and has a radiance of its own."""
+    """A participating medium that absorbs, and has a radiance of its own.
+
+    Its attribute `exponent`, if it has one, is the optical depth of red, green and blue over
+    `optical_depth`.
+    """
 
     @property
     def mask(self) -> str:
@@ -189,6 +195,41 @@ class Surface(Protocol):
         ...
 
 
+class Light(Protocol):
+    """The light of the place at one moment."""
+
+    def irradiance(
+        self, x: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n 3"]:
+        """Irradiance of surfaces at positions x (m) with unit normals, linear."""
+        ...
+
+    def open_irradiance(self) -> Float[Tensor, "3"]:
+        """Irradiance of level ground in the open."""
+        ...
+
+    def reflected_sky(
+        self, d: Float[Tensor, "n 3"], sky: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n 3"]:
+        """Sky as surfaces reflect it, in unit directions d where the field's sky is `sky`.
+
+        Photos clip a bright sky at white; what reflects it receives it all.
+        """
+        ...
+
+    def sun_elevation(self) -> float | None:
+        """Elevation of a sun that casts shadows, rad; None without one."""
+        ...
+
+    def mean_radiance(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Mean over all directions of the radiance that arrives at x (m), without a hard sun."""
+        ...
+
+    def beam(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]] | None:
+        """Unit vector towards a hard sun and its irradiance across its rays; None without one."""
+        ...
+
+
 @dataclass(frozen=True)
 class World:
     """Everything that a ray can meet at one moment.
@@ -199,6 +240,7 @@ class World:
         media: what fills the air.
         matters: what lies on the scene.
         surfaces: what cuts rays off.
+        light: what falls on snow, water and air; None where nothing asks for it.
     """
 
     field: RadianceField
@@ -206,6 +248,7 @@ class World:
     media: tuple[Medium, ...] = ()
     matters: tuple[Matter, ...] = ()
     surfaces: tuple[Surface, ...] = ()
+    light: Light | None = None
 
     @property
     def layer_names(self) -> tuple[str, ...]:
@@ -249,6 +292,19 @@ def concatenate(parts: Sequence[RenderOutput], order: Int[Tensor, "n"] | slice) 
 
 
 @dataclass(frozen=True)
+class Kept:
+    """Where effects keep what they found in a field, for the next render.
+
+    Attributes:
+        folder: the run folder.
+        checkpoint: identity of the field.
+    """
+
+    folder: Path
+    checkpoint: str
+
+
+@dataclass(frozen=True)
 class Preparation:
     """What an effect is prepared from.
 
@@ -260,6 +316,9 @@ class Preparation:
         appearance: exposure and light of the field's colours; None: the mean of all photos.
         irradiance: gives the linear irradiance on open level ground; computed at its first call.
         progress: called with what is being done and the fraction that is done, [0, 1].
+        photo_rays: gives where the rays of the photos end on the field; None for a field that has
+            neither normals nor classes.
+        kept: where to keep what was found; None: nowhere.
     """
 
     field: RadianceField
@@ -269,3 +328,5 @@ class Preparation:
     appearance: Float[Tensor, "1 e"] | None
     irradiance: Callable[[], Float[Tensor, "3"]]
     progress: Callable[[str, float], None]
+    photo_rays: Callable[[], list[PhotoRays]] | None = None
+    kept: Kept | None = None

@@ -283,11 +283,11 @@ def water_transmittance(
 
 
 def bottom_radiance(
-    dry: Float[Tensor, "n 3"],
-    irradiance: Float[Tensor, "3"],
+    dry: Float[Tensor, "*n 3"],
+    irradiance: Float[Tensor, "*#n 3"],
     ior: float,
     entering: float | None = None,
-) -> Float[Tensor, "n 3"]:
+) -> Float[Tensor, "*n 3"]:
     """Return the radiance of the bottom under clear water from the radiance of the dry ground.
 
     L_bottom = L_t (1 - r_e)/(n^2 (1 - rho r_i)): 1 - r_e of the light enters, the surface reflects
@@ -308,7 +308,7 @@ def bottom_radiance(
     return dry * entering / (ior**2 * (1 - albedo * r_i))
 
 
-def body_colour(flood: Flood, irradiance: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+def body_colour(flood: Flood, irradiance: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
     """Return the radiance c_w of deep water: its colour times that of a lit white diffuser.
 
     Args:
@@ -319,12 +319,12 @@ def body_colour(flood: Flood, irradiance: Float[Tensor, "3"]) -> Float[Tensor, "
 
 
 def shade(
-    reflected: Float[Tensor, "n 3"],
-    reflectance: Float[Tensor, "n"],
-    background: Float[Tensor, "n 3"],
-    transmittance: Float[Tensor, "n 3"],
-    body: Float[Tensor, "3"],
-) -> Float[Tensor, "n 3"]:
+    reflected: Float[Tensor, "*n 3"],
+    reflectance: Float[Tensor, "*n"],
+    background: Float[Tensor, "*n 3"],
+    transmittance: Float[Tensor, "*n 3"],
+    body: Float[Tensor, "*#n 3"],
+) -> Float[Tensor, "*n 3"]:
     """Return c = R L_r + (1 - R)(L_b t_c + (1 - t_c) c_w), linear radiance.
 
     Args:

@@ -55,6 +55,7 @@ FLOOD = Effect(
     ),
     alternatives=(("clarity", "attenuation"),),
     needs=frozenset({DENSITY}),
+    after=("sky",),
     prepared_from=(
         "flood.wind_speed",
         "flood.wind_direction",

@@ -156,9 +156,18 @@ class Water:
         # From below, the mean over slopes lets a little light through even where the visible facet
         # reflects all of it.
         reflectance = torch.where(total, torch.ones_like(reflectance), reflectance)
-        body = optics.body_colour(self.flood, self.irradiance)
+        irradiance = self._irradiance_at(world, x)
+        body = optics.body_colour(self.flood, irradiance)
         shaded = optics.shade(reflected, reflectance, background, passed, body)
         return shaded, normal, {"water_depth": depth}
+
+    def _irradiance_at(self, world: World, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Irradiance of the level water at positions x (m)."""
+        if world.light is None:
+            return self.irradiance.expand(x.shape[0], 3)
+        up = torch.zeros_like(x)
+        up[:, 2] = 1.0
+        return world.light.irradiance(x, up)
 
     def _other_side(
         self,
@@ -196,7 +205,8 @@ class Water:
             dry, path = matter / opacity[:, None], length / opacity
             light = optics.light_cosine(self.flood, self.sun_elevation)
             through = optics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
-            background[down] = optics.bottom_radiance(dry, self.irradiance, self.flood.ior)
+            irradiance = self._irradiance_at(world, o)
+            background[down] = optics.bottom_radiance(dry, irradiance, self.flood.ior)
             passed[down] = through * (1 - transmittance)[:, None]
         passed[below] = 1.0
         up = (below & (direction[:, 2] > 0)).nonzero()[:, 0]
@@ -227,12 +237,15 @@ class FloodEntity:
         if level is None:
             return world
         check_level(level, self.top)
+        light, elevation = world.light, weather.sun.elevation
+        if light is not None and elevation is None:
+            elevation = light.sun_elevation()
         water = Water(
             weather.flood,
             self.ground_z + level,
             at_time(self.waves, time),
-            self.irradiance,
-            weather.sun.elevation,
+            self.irradiance if light is None else light.open_irradiance(),
+            elevation,
         )
         return replace(world, surfaces=(*world.surfaces, water))
 

@@ -1,18 +1,35 @@
-"""Where the sun stands."""
+"""Under which sky the place lies, and where the sun stands."""
 
 import math
 from dataclasses import dataclass
 from typing import Annotated
 
 from climatenerf.weather.effect import Effect
-from climatenerf.weather.units import ANGLE, quantity
+from climatenerf.weather.units import ANGLE, choice, number, quantity
 
 _TURN = 2 * math.pi
 
 
 @dataclass(frozen=True)
+class Sky:
+    """The sky, whose light falls on the place, on snow, water and smog alike."""
+
+    kind: Annotated[str, choice("captured", "overcast", "clear", "storm", "dusk")] = "captured"
+    """captured: the light of the photos. Others replace it, with its sun and shadows."""
+    cover: Annotated[float, number(0.0, 1.0)] = 0.0
+    """Fraction of a clear sky that cloud hides; 1 is overcast."""
+    exposure: Annotated[str, choice("kept", "fixed")] = "kept"
+    """kept: surfaces stay as bright on average as in the photos. fixed: the camera's stays."""
+    ev: Annotated[float, number(-10.0, 10.0)] = 0.0
+    """Exposure on top, in stops (EV): +1 is twice as bright. Only for skies other than captured."""
+
+
+@dataclass(frozen=True)
 class Sun:
-    """Position of the sun. none: no shadows, light from above."""
+    """Position of the sun: in the photos under the captured sky, else in the new one.
+
+    none: as found from the photos.
+    """
 
     elevation: Annotated[
         float | None, quantity(ANGLE, -math.pi / 2, math.pi / 2, optional=True)
@@ -22,4 +39,11 @@ class Sun:
     """Direction of the sun, clockwise from +y."""
 
 
+SKY = Effect(
+    name="sky",
+    parameters=Sky,
+    enabled_by=(),
+    prepare="climatenerf.weather.light.entity:prepare",
+    always=True,
+)
 SUN = Effect(name="sun", parameters=Sun, enabled_by=(), prepare=None)

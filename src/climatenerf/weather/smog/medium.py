@@ -19,6 +19,7 @@ from climatenerf.weather.smog.parameters import Smog
 # Rays with a smaller |dz| count as horizontal. The gradient of a division by dz contains 1/dz^2,
 # which still fits float32 at this bound.
 _HORIZONTAL = 1e-12
+PAPER_COLOUR = (0.925, 0.906, 0.758)  # of thick smog in the paper's figures, display sRGB
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,15 @@ class Medium:
         return torch.where(crossed, t, torch.full_like(t, torch.inf))[:, None]
 
 
+def sigma_of(smog: Smog) -> float | None:
+    """Extinction on the ground, 1/m; None without smog."""
+    if smog.sigma is not None:
+        return smog.sigma
+    if smog.visibility is not None:
+        return sigma_from_visibility(smog.visibility, smog.contrast)
+    return None
+
+
 def sigma_from_visibility(visibility: float, contrast: float = 0.05) -> float:
     """Return the extinction in 1/m at which contrast falls to `contrast` over `visibility` metres.
 
@@ -80,13 +90,11 @@ def medium(smog: Smog, ground_z: float) -> Medium | None:
         smog: parameters, with heights relative to the ground datum.
         ground_z: world height of the ground datum, m.
     """
-    if smog.sigma is not None:
-        sigma = smog.sigma
-    elif smog.visibility is not None:
-        sigma = sigma_from_visibility(smog.visibility, smog.contrast)
-    else:
+    sigma = sigma_of(smog)
+    if sigma is None:
         return None
-    return Medium(sigma, smog.height_falloff, ground_z + smog.base, linear_colour(smog.colour))
+    colour = PAPER_COLOUR if smog.colour is None else smog.colour
+    return Medium(sigma, smog.height_falloff, ground_z + smog.base, linear_colour(colour))
 
 
 def optical_depth(

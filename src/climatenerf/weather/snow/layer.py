@@ -25,6 +25,7 @@ from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid, choose_grid, grow
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import Light as PlaceLight
 from climatenerf.weather.world import Preparation, World
 
 
@@ -38,6 +39,7 @@ class BakedSnow:
         snow: its parameters.
         light: light of the scene.
         floor_z: height below which there is no snow (a water level), m.
+        place_light: light at each place; None: that of the open everywhere.
     """
 
     lattice: Lattice
@@ -45,6 +47,7 @@ class BakedSnow:
     snow: Snow
     light: Light
     floor_z: float | None = None
+    place_light: PlaceLight | None = None
     mask = "mask_snow"
     thickness_layer = "snow_thickness"
 
@@ -100,10 +103,16 @@ class BakedSnow:
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Linear radiance of the snow at points (m), the same in all directions.
 
-        White diffuse snow in the open under the scene's own light, darkened a little over dark
-        ground and more in the sun's shadow, with wrap lighting (n.l + gamma)/(1 + gamma).
+        Diffuse snow in the light that its place and its slope receive, a little darker over dark
+        ground. The paper's way (`Snow.light`) lights all snow as in the open, darkens it in the
+        sun's shadow, and shades it by wrap lighting (n.l + gamma)/(1 + gamma).
         """
         _, gradient, rest = metaballs.evaluate(_array(x), self.lattice)
+        if self.snow.light == "scene" and self.place_light is not None:
+            reflectance = to_device(rest[:, 1], x.device)[:, None] / math.pi
+            return reflectance * self.place_light.irradiance(
+                x, _normal(to_device(gradient, x.device))
+            )
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
         towards = torch.tensor(towards, dtype=torch.float32, device=x.device)
@@ -178,7 +187,7 @@ class SnowEntity:
             weather.snow,
             given.camera_positions,
             to_numpy(given.irradiance() / math.pi),
-            sun_direction(weather.sun),
+            sun_direction(weather.sun) if weather.snow.light == "paper" else None,
             weather.seed,
             progress=lambda fraction: given.progress("snowfall", fraction),
             appearance=given.appearance,
@@ -197,7 +206,7 @@ class SnowEntity:
             self._grown = self._baked if same else self._baked.with_depth(depth)
         look = replace(self._grown.snow, wrap=weather.snow.wrap)
         floor = max((surface.level for surface in world.surfaces), default=None)
-        snow = replace(self._grown, snow=look, floor_z=floor)
+        snow = replace(self._grown, snow=look, floor_z=floor, place_light=world.light)
         return replace(world, matters=(*world.matters, snow))
 
     def check(self, moments: tuple[Weather, ...]) -> None:

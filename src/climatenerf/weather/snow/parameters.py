@@ -6,7 +6,7 @@ from typing import Annotated
 
 from climatenerf.core.layer_table import Layer
 from climatenerf.weather.effect import Effect, Measure
-from climatenerf.weather.units import ANGLE, LENGTH, number, quantity
+from climatenerf.weather.units import ANGLE, LENGTH, choice, number, quantity
 
 _TURN = 2 * math.pi
 
@@ -21,6 +21,8 @@ class Snow:
     """Angle between the fall direction and the vertical."""
     wind_direction: Annotated[float, quantity(ANGLE, -_TURN, _TURN)] = 0.0
     """Where tilted snow comes from, clockwise from +y."""
+    light: Annotated[str, choice("scene", "paper")] = "scene"
+    """scene: the light that falls on each place. paper: that of the open, with wrap lighting."""
     slope: Annotated[float, quantity(ANGLE, 0.0, math.pi / 2)] = math.radians(37.0)
     """Slope on which half of the snow stays."""
     slope_sharpness: Annotated[float, number(1.0, 1000.0)] = 50.0
@@ -48,10 +50,11 @@ SNOW = Effect(
         Measure("snow_share", "mask_snow"),
         Measure("mean_snow_thickness_m", "snow_thickness", "mask_snow"),
     ),
-    after=("flood",),
+    after=("sky", "flood"),
     prepared_from=(
         "snow.fall_tilt",
         "snow.wind_direction",
+        "snow.light",
         "snow.slope",
         "snow.slope_sharpness",
         "snow.albedo_offset",

@@ -1,0 +1,291 @@
+"""The light of a scene: found from its photos, then replaced or changed by the weather.
+
+Nothing is done for a frame whose light stays that of the photos. Snow on the ground lights what
+stands around it; another sky replaces sky, sun and shadows. Both need the probes of `probes`.
+"""
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from climatenerf.core.colour import luma
+from climatenerf.core.device import to_device
+from climatenerf.core.errors import UserError
+from climatenerf.field.capabilities import NORMALS
+from climatenerf.field.protocol import device_of, observed
+from climatenerf.weather.light import skies
+from climatenerf.weather.light.captured import CapturedLight, elevation_azimuth
+from climatenerf.weather.light.file import light_of_photos_in
+from climatenerf.weather.light.normals import normals_at
+from climatenerf.weather.light.probes import GatheredLight, gather
+from climatenerf.weather.light.reference_albedo import ReferenceAlbedo, estimate
+from climatenerf.weather.light.relit_field import RelitField
+from climatenerf.weather.light.scene_light import (
+    SceneLight,
+    Surfaces,
+    light_of_photos,
+    relit,
+)
+from climatenerf.weather.light.sun import sun_direction
+from climatenerf.weather.light.sun_map import SunMap, sun_map
+from climatenerf.weather.smog.medium import sigma_of
+from climatenerf.weather.smog.scattering import sun_transmittance
+from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import Preparation, World
+
+SNOW_ALBEDO = 0.87  # of fresh snow in the mean over visible light
+COVERING = 0.02  # m of snow that hide what lies below by 1 - 1/e
+STEEPEST, LEVEL = math.radians(60), math.radians(30)  # slopes that keep no snow, and all of it
+DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
+COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
+
+
+class LightEntity:
+    """Prepares light when a frame first needs it, and keeps it for the next."""
+
+    def __init__(self, preparation: Preparation):
+        """Take the preparation; nothing is computed yet."""
+        self._given = preparation
+        self._reference: ReferenceAlbedo | None = None
+        self._maps: list[SunMap] = []
+        self._last: tuple[object, SceneLight] | None = None
+        self._lights: dict[tuple[float, ...], SceneLight] = {}
+
+    # --- what the scene gives -----------------------------------------------------------------
+
+    @functools.cached_property
+    def captured(self) -> CapturedLight | None:
+        """The light of the photos; None if they show too little to find it."""
+        given = self._given
+        if NORMALS not in given.field.capabilities or given.photo_rays is None:
+            return None
+        return light_of_photos_in(given.kept, given.field, given.photo_rays)
+
+    @functools.cached_property
+    def _gathered(self) -> GatheredLight:
+        given = self._given
+        views = given.scene.of_split("train")
+        eyes = np.stack([given.scene.c2w_world(view)[:3, 3] for view in views])
+        middle = to_device(np.median(eyes, axis=0).astype(np.float32), device_of(given.field))
+        extent = float(np.abs(eyes[:, :2] - np.median(eyes[:, :2], axis=0)).max())
+        return gather(
+            observed(given.field),
+            middle,
+            extent,
+            given.scene.lowest_ground_z,
+            given.appearance,
+            lambda fraction: given.progress("light probes", fraction),
+        )
+
+    def _sun_map(self, direction: Float[np.ndarray, "3"]) -> SunMap:
+        """Map of a sun; the last two are kept: that of the photos and the new one."""
+        for kept in self._maps:
+            if np.allclose(kept.direction, direction, atol=1e-9):
+                return kept
+        given = self._given
+        given.progress("shadows", 0.0)
+        views = given.scene.of_split("train")
+        eyes = np.stack([given.scene.c2w_world(view)[:3, 3] for view in views])
+        made = sun_map(observed(given.field), direction, np.median(eyes, axis=0))
+        self._maps = [*self._maps, made][-2:]
+        return made
+
+    def _photographed(self, sun: Float[np.ndarray, "3"] | None) -> SceneLight:
+        """Light of the photos, with the sun of the parameters in place of the found one."""
+        captured = self.captured
+        assert captured is not None
+        if sun is not None and captured.sun is not None:
+            captured = replace(captured, sun=sun)
+        key = () if captured.sun is None else tuple(captured.sun.tolist())
+        if key not in self._lights:
+            field, appearance = self._given.field, self._given.appearance
+
+            def radiance(d: Tensor) -> Tensor:
+                return captured.sky(d, field.sky(d, appearance))
+
+            device = device_of(field)
+            shadow, strength = None, torch.zeros(3, device=device)
+            if captured.hard and captured.sun is not None:
+                shadow = self._sun_map(captured.sun)
+                strength = to_device(captured.lobe.astype(np.float32), device)
+            light = light_of_photos(self._gathered, radiance, strength, shadow)
+            self._lights = {key: replace(light, captured=captured)}
+        return self._lights[key]
+
+    def _albedo(self, old: SceneLight) -> ReferenceAlbedo | None:
+        """The usual albedo of surfaces, where photos have a sun that casts shadows."""
+        if old.sun is None or self._given.photo_rays is None:
+            return None
+        if self._reference is None:
+            field, photos = self._given.field, self._given.photo_rays()
+            parts = []
+            for photo in photos:
+                ends = np.isfinite(photo.t)
+                parts.append([photo.x[ends], photo.d[ends]])
+            x, d = (
+                to_device(np.concatenate(each).astype(np.float32), device_of(field))
+                for each in zip(*parts, strict=True)
+            )
+            radiance = field.colour(x, d, appearance=self._given.appearance)
+            normal, kind = normals_at(field, x, d)
+            (shaded,) = SceneLight.shaded((old,), x, normal)
+            sunny = shaded + old.full_sun(normal)
+            lit = old.visibility(x, normal)
+            self._reference = estimate(radiance, x, kind, shaded, sunny, lit)
+        return self._reference
+
+    # --- one moment ---------------------------------------------------------------------------
+
+    def place(self, world: World, weather: Weather, time: float) -> World:
+        """The world in the light of the moment."""
+        new_sky = weather.sky.kind != "captured"
+        snow = weather.snow.depth or 0.0
+        if not (new_sky or snow > 0 or weather.flood.level is not None or _lit_smog(weather)):
+            return world
+        if self.captured is None:
+            if new_sky:
+                raise UserError(
+                    f"--sky.kind {weather.sky.kind} needs the light of the photos, which these show"
+                    " too little of (some sky, and surfaces with normals); use --sky.kind captured"
+                )
+            return world  # snow, water and smog are lit as in the open
+        override = None if new_sky else sun_direction(weather.sun)
+        old = self._photographed(override)
+        cover = round((1 - math.exp(-snow / COVERING)) * COVER_STEPS) / COVER_STEPS
+        if not new_sky and cover == 0 and not (old.sun is not None and _lit_smog(weather)):
+            return replace(world, light=old)
+        key = (weather.sky, weather.sun, cover, weather.smog if _lit_smog(weather) else None)
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._new_light(weather, old, cover)
+        new = self._last[1]
+        field = RelitField(world.field, old, new, new_sky, self._albedo(old))
+        return replace(world, field=field, light=new)
+
+    def _new_light(self, weather: Weather, old: SceneLight, cover: float) -> SceneLight:
+        surfaces = Surfaces(functools.partial(snow_cover, cover), SNOW_ALBEDO) if cover else None
+        if weather.sky.kind == "captured":
+            return relit(self._gathered, old, below_smog(weather, old), surfaces)
+        sky = self._sky(weather)
+        direct = torch.tensor(sky.sun_irradiance, device=device_of(self._given.field))
+        shadow = self._sun_map(np.array(sky.sun)) if bool((direct > 0).any()) else None
+        unit = replace(old, radiance=sky.radiance, sun_irradiance=direct, sun=shadow, captured=None)
+        bare = relit(self._gathered, old, unit)
+        gain = self._gain(weather, old, bare) * 2.0**weather.sky.ev
+
+        def radiance(d: Tensor) -> Tensor:
+            return gain * sky.radiance(d)
+
+        scaled = replace(
+            bare,
+            coefficients=gain * bare.coefficients,
+            radiance=radiance,
+            sun_irradiance=gain * direct,
+        )
+        hazy = below_smog(weather, scaled)
+        if surfaces is None and hazy is scaled:
+            return scaled
+        return relit(self._gathered, old, hazy, surfaces)
+
+    def _sky(self, weather: Weather) -> skies.NewSky:
+        elevation, azimuth = weather.sun.elevation, weather.sun.azimuth
+        captured = self.captured
+        if captured is not None and captured.sun is not None:
+            found = elevation_azimuth(captured.sun)
+            elevation = found[0] if elevation is None else elevation
+            azimuth = found[1] if azimuth is None else azimuth
+        dusk = weather.sky.kind == "dusk"
+        default = skies.DUSK_ELEVATION if dusk else DEFAULT_ELEVATION
+        elevation = default if elevation is None or (dusk and elevation > 0) else elevation
+        azimuth = 0.0 if azimuth is None else azimuth
+        flat = math.cos(elevation)
+        sun = (flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(elevation))
+        return skies.NewSky(weather.sky.kind, sun, weather.sky.cover)
+
+    def _gain(self, weather: Weather, old: SceneLight, new: SceneLight) -> float:
+        """Factor from klx to the units of the photos."""
+        if weather.sky.exposure == "fixed":
+            captured = self.captured
+            assert captured is not None
+            elevation = DEFAULT_ELEVATION
+            if captured.sun is not None:
+                elevation = elevation_azimuth(captured.sun)[0]
+            klx = skies.daylight(elevation, captured.hard)
+            return float(luma(old.open_irradiance())) / klx
+        # Surfaces stay as bright as photos show them: on average over what the probes see.
+        x, normal = self._gathered.x.reshape(-1, 3), self._gathered.normal.reshape(-1, 3)
+        hit = (normal != 0).any(-1).nonzero()[:, 0][::7]
+        radiance = self._gathered.radiance.reshape(-1, 3)[hit]
+        ratio = new.irradiance(x[hit], normal[hit]) / old.irradiance(x[hit], normal[hit])
+        return float(luma(radiance).sum() / luma(radiance * ratio).sum().clamp_min(1e-6))
+
+    def check(self, moments: tuple[Weather, ...]) -> None:
+        """Refuse a clear sky without a sun above the horizon.
+
+        Raises:
+            UserError: the sun is below it.
+        """
+        for moment in moments:
+            elevation = moment.sun.elevation
+            if moment.sky.kind == "clear" and elevation is not None and elevation <= 0:
+                raise UserError(
+                    "--sky.kind clear needs the sun above the horizon; give --sun.elevation above"
+                    " 0 deg, or --sky.kind dusk"
+                )
+
+    def facts(self) -> dict[str, float]:
+        """Where the photos' sun stands, and how bright a white sheet in the open is."""
+        if "captured" not in self.__dict__ or self.captured is None:
+            return {}
+        captured = self.captured
+        found: dict[str, float] = {}
+        if captured.sun is not None:
+            elevation, azimuth = elevation_azimuth(captured.sun)
+            found |= {
+                "photos_sun_elevation_deg": math.degrees(elevation),
+                "photos_sun_azimuth_deg": math.degrees(azimuth),
+                "photos_sun_error_deg": math.degrees(captured.sun_error),
+            }
+        return found
+
+
+def snow_cover(cover: float, up: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Fraction of surfaces with normals of z `up` that snow hides; `cover` on level ground.
+
+    Slopes keep (60 deg - slope)/30 deg of the snow (EN 1991-1-3, 5.3).
+    """
+    slope = torch.acos(up.clamp(-1, 1))
+    return cover * ((STEEPEST - slope) / (STEEPEST - LEVEL)).clamp(0, 1)
+
+
+def below_smog(weather: Weather, light: SceneLight) -> SceneLight:
+    """The sky and sun below smog: what it takes from a hard sun it spreads over the whole sky.
+
+    That smog takes light from sky and sun together is left out, as if a camera made up for it.
+    """
+    sigma = sigma_of(weather.smog) if weather.smog.light == "scene" else None
+    if light.sun is None or sigma is None:
+        return light
+    sine = max(float(light.sun.direction[2]), 0.0)
+    passed = sun_transmittance(weather.smog, sigma, math.asin(sine))
+    beam = light.sun_irradiance
+    kept = beam * beam.new_tensor(passed)
+    spread = (beam - kept) * sine / math.pi
+
+    def radiance(d: Tensor) -> Tensor:
+        return light.radiance(d) + spread
+
+    return replace(light, radiance=radiance, sun_irradiance=kept, captured=None)
+
+
+def _lit_smog(weather: Weather) -> bool:
+    return weather.smog.light == "scene" and bool(sigma_of(weather.smog))
+
+
+def prepare(preparation: Preparation) -> LightEntity:
+    """Light is found when a frame first needs it."""
+    return LightEntity(preparation)

@@ -1,0 +1,486 @@
+"""Find the light of a place from its photos: the sky that they clip or do not show, and the sun.
+
+Surfaces of one class have one albedo on average, so how their radiance varies tells where light
+comes from: each surface point sees a part of the sky, and what stands around it. Candidates for the
+sky are compared by the median deviation of log radiance from log irradiance within each class.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import optimize
+from torch import Tensor
+
+from climatenerf.core.classes import PERSON, SKY, VEGETATION, VEHICLE
+from climatenerf.core.device import to_device, to_numpy
+from climatenerf.field.compositing import chunks, composited
+from climatenerf.field.protocol import RadianceField, device_of, observed
+from climatenerf.scene.photo_rays import PhotoRays
+from climatenerf.weather.light.captured import CLIPPED, COLUMNS, ROWS, CapturedLight
+
+PAIRS = 12000  # of neighbouring surface points
+GATHERED_PAIRS = 800  # whose difference is explained by candidates for the sun
+SHADOW_PAIRS, MIN_SHADOW_PAIRS = 200, 8  # which a shadow's edge parts, for the sun's strength
+MIN_PAIRS = 300
+TRIES = 4  # for each pair; most random pixels do not show one plane
+DARK = 2e-3  # radiance; photos show nothing below
+APART = 16  # pixels of the reduced photos between the points of a pair
+NEAR_PAIR, FAR_PAIR = 0.15, 2.5  # m between them
+ALIKE = np.cos(np.radians(20.0))  # cosine between their normals
+DIRECTIONS = 384  # over the whole sphere, from each point
+STEP = 5.0  # marching step of the rays that gather light
+LIFT = 0.06  # m; rays begin so far above a surface, beyond its blurred density
+FAR = 40.0  # m; points further from their camera are not used
+AMOUNTS = np.geomspace(0.3, 12.0, 8)  # light of the sun over that of the sky, on open ground
+LOWEST_SUN = 0.08  # sine of its elevation
+ROUNDS = tuple(np.radians([8.0, 2.5]))  # rad, in which the sun's direction is refined
+NEIGHBOURS = 61  # directions in each
+MARGIN, AROUND_SUN = np.radians(2.5), 9  # of the directions in which a point is lit, or is not
+PARTS = 8  # of the pairs, for the error
+MIN_GAIN = 0.02  # by which a sun must lower the deviation, relative
+MAX_ERROR = np.radians(8.0)
+MIN_SKY, MAX_SKY = 50, 1500  # pixels of the reduced photos that show sky
+MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
+CLOUDS = 60  # independent patches of the sky that photos show
+SKY_ERROR = 0.08  # of log radiance, by clouds
+GROUND_ALBEDO, ALBEDO_SPREAD = 0.15, 0.5  # asphalt and grass .1, soil .15, concrete .3; of its log
+RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
+TYPICAL_WIDTH, WIDTH_SPREAD = np.radians(20.0), 0.5  # of a sun behind thin cloud; of its log
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+WHITE = np.ones(3)
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Light that arrives at pairs of surface points from `DIRECTIONS`.
+
+    Attributes:
+        pairs: the points.
+        weights: solid angle times cosine of each direction, 0 behind the surface.
+        through: fraction of the sky's light that arrives.
+        bounced: irradiance by surfaces.
+    """
+
+    pairs: "Pairs"
+    weights: Float[np.ndarray, "n k"]
+    through: Float[np.ndarray, "n k"]
+    bounced: Float[np.ndarray, "n 3"]
+
+    def ambient(self, sky: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "n 3"]:
+        """Irradiance of the points under a sky."""
+        return (self.weights * self.through) @ sky + self.bounced
+
+
+def sphere_directions(count: int) -> Float[np.ndarray, "k 3"]:
+    """Unit vectors, evenly spread over the sphere (Fibonacci's spiral), the highest first."""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    angle = i * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(1 - z**2)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], -1)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Neighbouring surface points of one plane and class, two after two.
+
+    Attributes:
+        x: points, world m.
+        normal: unit, towards the camera.
+        radiance: towards the camera that shows them.
+    """
+
+    x: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    radiance: Float[np.ndarray, "n 3"]
+
+    def selected(self, pairs: Int[np.ndarray, "m"]) -> "Pairs":
+        """Some of the pairs."""
+        rows = np.repeat(2 * pairs, 2)
+        rows[1::2] += 1
+        return Pairs(self.x[rows], self.normal[rows], self.radiance[rows])
+
+    @property
+    def start(self) -> Float[np.ndarray, "n 3"]:
+        """Where rays from the points begin, clear of their blurred density."""
+        return self.x + LIFT * self.normal
+
+
+@torch.no_grad()
+def find_pairs(
+    field: RadianceField, photos: list[PhotoRays], count: int, rng: np.random.Generator
+) -> Pairs | None:
+    """Choose pairs of neighbouring pixels at random; None if there are too few.
+
+    Args:
+        field: without unobserved density.
+        photos: rays of its photos.
+        count: number of pairs wanted.
+        rng: source of randomness.
+    """
+    found = [_neighbours(photo, TRIES * count // len(photos) + 1, rng) for photo in photos]
+    x, d, eye, normal = (np.concatenate([pair[k] for pair in found]) for k in range(4))
+    if len(x) < MIN_PAIRS:
+        return None
+    chosen = rng.choice(len(x), min(count, len(x)), replace=False)
+    x, d, eye, normal = (v[chosen].reshape(-1, 3) for v in (x, d, eye, normal))
+    radiance = to_numpy(_surface_radiance(field, _sent(eye, field), _sent(d, field)))
+    valid = (radiance.min(-1) > DARK) & (radiance.max(-1) < CLIPPED)
+    pairs = Pairs(x, normal, radiance)
+    return pairs.selected(np.flatnonzero(valid.reshape(-1, 2).all(1)))
+
+
+@torch.no_grad()
+def gather_light(field: RadianceField, pairs: Pairs) -> Gathered:
+    """Gather the light that arrives at pairs of points in a field without unobserved density."""
+    directions = sphere_directions(DIRECTIONS)
+    cosine = pairs.normal @ directions.T
+    weights = np.where(cosine > 0.05, cosine, 0.0) * (4 * np.pi / DIRECTIONS)
+    start = _sent(pairs.start, field)
+    through, bounced = arriving(field, start, _sent(directions, field), weights > 0)
+    return Gathered(pairs, weights, through, np.einsum("nk,nkc->nc", weights, bounced))
+
+
+def _sent(values: np.ndarray, field: RadianceField) -> Tensor:
+    return to_device(np.ascontiguousarray(values, np.float32), device_of(field))
+
+
+def _neighbours(
+    photo: PhotoRays, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Ends, directions, eyes and normals of pairs of pixels that show one plane of one class."""
+    height, width = photo.t.shape
+    row, column = rng.integers(height, size=count), rng.integers(width, size=count)
+    shift = rng.integers(-APART, APART + 1, (count, 2))
+    other = row + shift[:, 0], column + shift[:, 1]
+    inside = (other[0] >= 0) & (other[0] < height) & (other[1] >= 0) & (other[1] < width)
+    ends = [(row[inside], column[inside]), (other[0][inside], other[1][inside])]
+    x, d, normal = (
+        np.stack([values[at] for at in ends], 1) for values in (photo.x, photo.d, photo.normal)
+    )
+    t, label = (np.stack([values[at] for at in ends], 1) for values in (photo.t, photo.label))
+    with np.errstate(invalid="ignore"):
+        gap = x[:, 1] - x[:, 0]
+        distance = np.linalg.norm(gap, axis=-1)
+        aside = np.abs((gap * normal[:, 0]).sum(-1))
+    usable = np.isfinite(t).all(1) & (t.max(1) < FAR) & (label[:, 0] == label[:, 1])
+    usable &= ~np.isin(label[:, 0], (PERSON, VEHICLE, SKY, VEGETATION))
+    usable &= (normal[:, 0] * normal[:, 1]).sum(-1) > ALIKE
+    usable &= (distance > NEAR_PAIR) & (distance < FAR_PAIR) & (aside < 0.15 * distance)
+    eye = np.broadcast_to(photo.c2w[:3, 3], x.shape)
+    return x[usable], d[usable], eye[usable], normal[usable]
+
+
+def arriving(
+    field: RadianceField,
+    x: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "k 3"],
+    wanted: Bool[np.ndarray, "n k"],
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k 3"]]:
+    """Fraction of the sky's light and radiance of surfaces that arrive at points x (world m).
+
+    Only pairs of points and directions that are `wanted` are traced; others have 0.
+    """
+    through = np.zeros(wanted.shape, np.float32)
+    bounced = np.zeros((*wanted.shape, 3), np.float32)
+    row, column = np.nonzero(wanted)
+    rows, columns = to_device(row, x.device), to_device(column, x.device)
+    for chunk in chunks(rows):
+        o, d = x[rows[chunk]], directions[columns[chunk]].contiguous()
+        start = torch.zeros(len(o), device=o.device)
+        matter, passed, _ = composited(field, o, d, start, STEP, stop=1e-2)
+        through[row[chunk], column[chunk]] = to_numpy(passed)
+        bounced[row[chunk], column[chunk]] = to_numpy(matter)
+    return through, bounced
+
+
+def _surface_radiance(
+    field: RadianceField, o: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    parts = []
+    for chunk in chunks(o):
+        near = torch.full((len(o[chunk]),), field.near, device=o.device)
+        matter, passed, _ = composited(field, o[chunk], d[chunk], near)
+        parts.append(matter / (1 - passed).clamp_min(0.5)[:, None])
+    return torch.cat(parts)
+
+
+# --- the sky that photos show ---------------------------------------------------------------------
+
+
+def shown_sky(photos: list[PhotoRays]) -> Float[np.ndarray, "rows columns"]:
+    """Fraction of each cell of directions that photos show as sky."""
+    counts = np.zeros((ROWS, COLUMNS))
+    for photo in photos:
+        clear = np.isinf(photo.t) & (photo.transmittance > 0.99) & (photo.d[..., 2] > 0)
+        d = photo.d[clear]
+        row = (np.arcsin(np.clip(d[:, 2], 0, 1)) / (np.pi / 2) * ROWS).astype(int)
+        column = (np.arctan2(d[:, 0], d[:, 1]) % (2 * np.pi) / (2 * np.pi) * COLUMNS).astype(int)
+        np.add.at(counts, (row.clip(0, ROWS - 1), column % COLUMNS), 1)
+    return np.clip(counts / 4, 0, 1)
+
+
+# --- which sun explains the surfaces --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class HardSun:
+    """A sun found from its shadows.
+
+    Attributes:
+        direction: unit vector towards it.
+        error: standard error of the direction, rad.
+        gain: by which it lowers the mean deviation, relative.
+    """
+
+    direction: Float[np.ndarray, "3"]
+    error: float
+    gain: float
+
+
+def deviations(
+    radiance: Float[np.ndarray, "n"],
+    ambient: Float[np.ndarray, "n"],
+    direct: Float[np.ndarray, "n m"],
+) -> Float[np.ndarray, "pairs m"]:
+    """Deviation of each pair's log radiance from its log irradiance, for m candidates.
+
+    Both points of a pair have one albedo on average, which their difference leaves out.
+    """
+    # 1e-4: a point that nothing reaches has no logarithm.
+    log = np.log(radiance)[:, None] - np.log(np.maximum(ambient[:, None] + direct, 1e-4))
+    return np.abs(log[::2] - log[1::2])
+
+
+def hard_sun(field: RadianceField, gathered: Gathered, sky: Float[np.ndarray, "k 3"]) -> HardSun:
+    """Return the sun whose shadows explain the surfaces best, however little it explains.
+
+    Args:
+        field: without unobserved density.
+        gathered: light at surface points.
+        sky: radiance of the sky in `sphere_directions`, 0 below the horizon.
+    """
+    pairs, directions = gathered.pairs, sphere_directions(DIRECTIONS)
+    radiance, ambient = pairs.radiance @ LUMA, gathered.ambient(sky) @ LUMA
+    level = float(np.clip(directions[:, 2], 0, 1) @ sky @ LUMA) * 4 * np.pi / DIRECTIONS
+    none = deviations(radiance, ambient, np.zeros((len(ambient), 1))).mean()
+
+    def search(
+        candidates: Float[np.ndarray, "k 3"], through: Float[np.ndarray, "n k"]
+    ) -> Float[np.ndarray, "pairs k"]:
+        """Deviations at the best amount of each candidate."""
+        best = []
+        for k, candidate in enumerate(candidates):
+            facing = np.clip(pairs.normal @ candidate, 0, 1) * through[:, k]
+            found = deviations(radiance, ambient, facing[:, None] * AMOUNTS * level / candidate[2])
+            best.append(found[:, int(found.mean(0).argmin())])
+        return np.stack(best, -1)
+
+    near = directions[directions[:, 2] > LOWEST_SUN]
+    found = search(near, gathered.through[:, directions[:, 2] > LOWEST_SUN])
+    start = _sent(pairs.start, field)
+    for spread in ROUNDS:
+        near = _around(near[found.mean(0).argmin()], spread, NEIGHBOURS)
+        near = near[near[:, 2] > LOWEST_SUN]
+        through, _ = arriving(field, start, _sent(near, field), pairs.normal @ near.T > 0.05)
+        found = search(near, through)
+    middle = near[found.mean(0).argmin()]
+    # Jackknife: leave out one part of the pairs after another.
+    parts = np.arange(len(found)) % PARTS
+    left = np.stack([near[found[parts != part].mean(0).argmin()] for part in range(PARTS)])
+    angles = np.arccos(np.clip(left @ middle, -1, 1))
+    error = float(np.sqrt((PARTS - 1) / PARTS * (angles**2).sum() + (ROUNDS[-1] / 4) ** 2))
+    return HardSun(middle, error, float(1 - found.mean(0).min() / none))
+
+
+def sun_strength(
+    field: RadianceField,
+    pairs: Pairs,
+    sun: Float[np.ndarray, "3"],
+    sky: Float[np.ndarray, "k 3"],
+) -> Float[np.ndarray, "3"]:
+    """Irradiance across the sun's rays, from pairs of which one point is lit and one in shadow.
+
+    L_lit/L_shadow = (E_lit + E_sun cos)/E_shadow for each of them. Geometry misplaces shadows a
+    little, so a point counts if it is lit, or in shadow, from all directions near the sun.
+
+    Args:
+        field: without unobserved density.
+        pairs: many; the few that a shadow's edge parts are chosen.
+        sun: unit vector towards the sun.
+        sky: radiance of the sky in `sphere_directions`, 0 below the horizon.
+
+    Returns:
+        Irradiance; 0 if no shadow is found.
+    """
+    facing = np.clip(pairs.normal @ sun, 0, 1)
+    start = _sent(pairs.start, field)
+    near = _around(sun, MARGIN, AROUND_SUN)
+    wanted = np.repeat(facing[:, None] > 0.2, len(near), axis=1)
+    through, _ = arriving(field, start, _sent(near, field), wanted)
+    lit = np.all(through > 0.9, axis=1)
+    shadow = np.all(wanted & (through < 0.1), axis=1)
+    parted = (lit[::2] & shadow[1::2]) | (shadow[::2] & lit[1::2])
+    chosen = np.flatnonzero(parted)[:SHADOW_PAIRS]
+    if len(chosen) < MIN_SHADOW_PAIRS:
+        return np.zeros(3)
+    ambient = gather_light(field, pairs.selected(chosen)).ambient(sky)
+    bright = 2 * np.arange(len(chosen)) + (~lit[::2])[chosen]
+    dark = bright ^ 1
+    radiance, cosine = pairs.selected(chosen).radiance, facing[2 * chosen + (bright & 1)]
+    contrast = radiance[bright] / radiance[dark]
+    strength = (contrast * ambient[dark] - ambient[bright]) / cosine[:, None]
+    return np.maximum(np.median(strength, axis=0), 0.0)
+
+
+def _around(middle: Float[np.ndarray, "3"], spread: float, count: int) -> Float[np.ndarray, "k 3"]:
+    """A round patch of unit vectors within an angle of a direction, itself the first."""
+    side = np.cross(middle, [0.0, 0.0, 1.0] if abs(middle[2]) < 0.9 else [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side)
+    other = np.cross(middle, side)
+    i = np.arange(count)
+    angle, radius = i * np.pi * (3 - np.sqrt(5)), np.tan(spread) * np.sqrt(i / count)
+    out = middle + radius[:, None] * (
+        np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other
+    )
+    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+
+
+# --- the sky that photos do not show --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SkyModel:
+    """Base and bright lobe of a sky; see `captured.CapturedLight`."""
+
+    horizon: Float[np.ndarray, "3"]
+    zenith: Float[np.ndarray, "3"]
+    sun: Float[np.ndarray, "3"] | None
+    width: float
+    lobe: Float[np.ndarray, "3"]
+
+
+def fit_sky(
+    d: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], ground: float, lobe: bool
+) -> SkyModel:
+    """Fit base and lobe to the sky that photos show, which clip at white.
+
+    What photos show of a bright lobe is its flank, which leaves its height open: a high and bright
+    one looks like a low and dim one. Of these the fit takes the one whose light on level ground
+    agrees best with an albedo of `GROUND_ALBEDO`.
+
+    Args:
+        d: directions of sky in the photos.
+        radiance: of the fitted sky there.
+        ground: mean luma of level ground that photos show; 0: unknown.
+        lobe: whether there is a lobe besides the base.
+    """
+    rgb = np.minimum(radiance, 1.0)
+    brightness = rgb @ LUMA
+    grid = sphere_directions(DIRECTIONS)
+    grid = grid[grid[:, 2] > 0]
+    share = np.sqrt(CLOUDS / len(d)) / SKY_ERROR
+
+    def model(p: np.ndarray, at: np.ndarray) -> np.ndarray:
+        base = np.exp(p[0]) * (1 + (np.exp(p[1]) - 1) * np.clip(at[:, 2], 0, 1))
+        if not lobe:
+            return base
+        angle = np.arccos(np.clip(at @ _direction(p[2], p[3]), -1, 1))
+        return base + np.exp(p[5]) * np.exp(-((angle / np.exp(p[4])) ** 2))
+
+    def residuals(p: np.ndarray) -> np.ndarray:
+        shown = np.log(np.minimum(model(p, d), 1.0)) - np.log(brightness)
+        level = (model(p, grid) * grid[:, 2]).sum() * 4 * np.pi / DIRECTIONS
+        expected = np.log(level / np.pi * GROUND_ALBEDO / ground) if ground > 0 else 0.0
+        prior = [p[1] / RATIO_SPREAD, expected / ALBEDO_SPREAD]
+        if lobe:
+            prior.append((p[4] - np.log(TYPICAL_WIDTH)) / WIDTH_SPREAD)
+        return np.concatenate([share * shown, prior])
+
+    bright = d[brightness >= np.quantile(brightness, 0.95)].mean(0)
+    azimuth = float(np.arctan2(bright[0], bright[1]))
+    low = [-5.0, np.log(0.15), np.radians(3), azimuth - 2, np.log(np.radians(6)), np.log(0.05)]
+    high = [1.0, np.log(4.0), np.radians(80), azimuth + 2, np.log(np.radians(40)), np.log(40.0)]
+    count = 6 if lobe else 2
+    best = None
+    for elevation in (15.0, 40.0, 60.0) if lobe else (0.0,):
+        start = [np.log(np.median(brightness)), 0.0, np.radians(elevation), azimuth]
+        start = [*start, np.log(TYPICAL_WIDTH), np.log(2.0)][:count]
+        start = np.clip(start, np.array(low[:count]) + 1e-3, np.array(high[:count]) - 1e-3)
+        found = optimize.least_squares(
+            residuals, start, bounds=(low[:count], high[:count]), loss="soft_l1"
+        )
+        best = found if best is None or found.cost < best.cost else best
+    assert best is not None
+    p = best.x
+    # The base's colour is that of the sky where it is darker than white.
+    plain = (rgb.max(-1) < CLIPPED) if (rgb.max(-1) < CLIPPED).any() else np.ones(len(rgb), bool)
+    colour = np.median(rgb[plain] / brightness[plain, None], axis=0)
+    zenith_colour = colour / (colour @ LUMA)
+    horizon = np.exp(p[0]) * zenith_colour
+    zenith = np.exp(p[0] + p[1]) * zenith_colour
+    if not lobe:
+        return SkyModel(horizon, zenith, None, 0.0, np.zeros(3))
+    # Sunlight through thin cloud is white.
+    return SkyModel(
+        horizon, zenith, _direction(p[2], p[3]), float(np.exp(p[4])), np.exp(p[5]) * WHITE
+    )
+
+
+def _direction(elevation: float, azimuth: float) -> Float[np.ndarray, "3"]:
+    flat = np.cos(elevation)
+    return np.array([flat * np.sin(azimuth), flat * np.cos(azimuth), np.sin(elevation)])
+
+
+# --- all together ---------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def find_light(
+    field: RadianceField, photos: list[PhotoRays], seed: int = 0
+) -> CapturedLight | None:
+    """Return the light of a scene's photos; None if they show too little to find it.
+
+    Args:
+        field: the fitted field; world axes, z up.
+        photos: rays of its photos on the field without unobserved density.
+        seed: random seed of the points that are looked at.
+    """
+    field = observed(field)
+    shown, rng = shown_sky(photos), np.random.default_rng(seed)
+    sky_d = np.concatenate(
+        [p.d[np.isinf(p.t) & (p.transmittance > 0.99) & (p.d[..., 2] > 0.03)] for p in photos]
+    )
+    pairs = find_pairs(field, photos, PAIRS, rng)
+    if pairs is None or len(sky_d) < MIN_SKY:
+        return None
+    sky_d = sky_d[rng.choice(len(sky_d), min(MAX_SKY, len(sky_d)), replace=False)]
+    seen = to_numpy(field.sky(_sent(sky_d, field))).astype(float)
+    plain = fit_sky(sky_d, seen, 0.0, lobe=False)
+    light = _assembled(plain, shown, 0.0)
+    d = _sent(sphere_directions(DIRECTIONS), field)
+    sky = to_numpy(light.sky(d, field.sky(d)) * (d[:, 2:] > 0)).astype(float)
+    few = pairs.selected(np.arange(min(len(pairs.x) // 2, GATHERED_PAIRS)))
+    sun = hard_sun(field, gather_light(field, few), sky)
+    if sun.gain > MIN_GAIN and sun.error < MAX_ERROR:
+        strength = sun_strength(field, pairs, sun.direction, sky)
+        if strength.min() > 0:
+            model = SkyModel(plain.horizon, plain.zenith, sun.direction, 0.0, strength)
+            return _assembled(model, shown, sun.error)
+    if (seen.max(-1) >= CLIPPED).mean() > MIN_CLIPPED:
+        level = pairs.normal[:, 2] > 0.9
+        enough = level.sum() >= 2 * MIN_PAIRS // 3
+        ground = float((pairs.radiance[level] @ LUMA).mean()) if enough else 0.0
+        model = fit_sky(sky_d, seen, ground, lobe=True)
+        return _assembled(model, shown, model.width / 3)
+    return light
+
+
+def _assembled(
+    model: SkyModel, shown: Float[np.ndarray, "rows columns"], error: float
+) -> CapturedLight:
+    return CapturedLight(
+        model.horizon, model.zenith, model.sun, model.width, model.lobe, shown, error
+    )

@@ -1,0 +1,157 @@
+"""Light probes: kernel and twin, closed forms, and the light that surfaces send back."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from climatenerf.field.analytic import AnalyticField, Box, HalfSpace
+from climatenerf.field.spherical_harmonics import harmonics
+from climatenerf.ops import probes
+from climatenerf.ops.probes import ProbeGrid
+from climatenerf.weather.light import scene_light
+from climatenerf.weather.light.probes import gather
+from climatenerf.weather.light.scene_light import SceneLight, Surfaces, light_of_photos, relit
+from climatenerf.weather.light.spherical import project, sphere_directions
+
+UP = torch.tensor([[0.0, 0.0, 1.0]])
+
+
+def random_grid(rng):
+    shape = (4, 3, 5)
+    count = math.prod(shape)
+    valid = torch.from_numpy(rng.random(count) > 0.2)
+    grid = ProbeGrid(torch.tensor([-1.0, 2.0, 0.5]), torch.tensor([2.0, 1.5, 1.0]), shape, valid)
+    tables = tuple(
+        torch.from_numpy(rng.normal(size=(count, 9, 3)).astype(np.float32)) for _ in range(2)
+    )
+    return grid, tables
+
+
+def test_kernel_equals_its_twin():
+    rng = np.random.default_rng(0)
+    grid, tables = random_grid(rng)
+    x = torch.from_numpy(rng.uniform(-4, 9, (500, 3)).astype(np.float32))
+    normal = torch.nn.functional.normalize(
+        torch.from_numpy(rng.normal(size=(500, 3))).float(), dim=-1
+    )
+    basis = harmonics(normal).T[:9].contiguous()
+    fast = probes.irradiance(grid, tables, x, normal, basis)
+    for found, table in zip(fast, tables, strict=True):
+        expected = torch.einsum("tn,ntc->nc", basis, probes.interpolated(grid, table, x, normal))
+        torch.testing.assert_close(found, expected.clamp_min(0), rtol=2e-3, atol=2e-3)
+
+
+def test_probes_inside_matter_do_not_count():
+    rng = np.random.default_rng(1)
+    grid, (table, _) = random_grid(rng)
+    poisoned = torch.where(grid.valid[:, None, None], table, 1e6)
+    x = torch.tensor([[1.3, 3.1, 2.2]])
+    clean = probes.interpolated(grid, table, x, UP)
+    torch.testing.assert_close(probes.interpolated(grid, poisoned, x, UP), clean)
+
+
+def test_irradiance_of_an_even_sky():
+    d = sphere_directions(512)
+    sky = torch.where(d[:, 2:] > 0, 1.0, 0.0).expand(-1, 3)
+    coefficients = project(d, sky)
+    for normal, expected in (((0, 0, 1), math.pi), ((1, 0, 0), math.pi / 2), ((0, 0, -1), 0.0)):
+        basis = harmonics(torch.tensor([normal]).float())[0, :9]
+        assert float(basis @ coefficients[:, 0]) == pytest.approx(expected, abs=0.03 * math.pi)
+
+
+def yard(albedo, sky=1.0):
+    """Level ground of an albedo under an even sky, as photos show it: radiance albedo * sky."""
+    ground = HalfSpace(colour=(albedo * sky,) * 3)
+    return AnalyticField(
+        [ground], zenith=(sky,) * 3, horizon=(sky,) * 3, box=((-60, -60, -1), (60, 60, 12))
+    )
+
+
+@pytest.fixture(scope="module")
+def gathered():
+    return gather(yard(0.2), torch.tensor([0.0, 0.0, 1.6]), 2.0, 0.0)
+
+
+def even(level):
+    return lambda d: torch.full_like(d, level)
+
+
+def no_sun():
+    return torch.zeros(3)
+
+
+def test_light_of_photos_over_open_ground(gathered):
+    """E_h = pi L; a wall gets E_h (1 + albedo)/2."""
+    light = light_of_photos(gathered, even(1.0), no_sun(), None)
+    x = torch.tensor([[0.3, 0.2, 1.7]])
+    assert float(light.irradiance(x, UP)[0, 0]) == pytest.approx(math.pi, rel=0.04)
+    wall = light.irradiance(x, torch.tensor([[1.0, 0.0, 0.0]]))
+    assert float(wall[0, 0]) == pytest.approx(math.pi * (1 + 0.2) / 2, rel=0.05)
+    np.testing.assert_allclose(light.open_irradiance(), math.pi, rtol=0.01)
+    mean = light.mean_radiance(x)
+    assert float(mean[0, 0]) == pytest.approx((1 + 0.2) / 2, rel=0.05)
+
+
+def test_white_ground_brightens_a_wall(gathered):
+    """Even sky, ground .2 to .87: a wall receives (1 + .87)/(1 + .2) = 1.56 times the light."""
+    old = light_of_photos(gathered, even(1.0), no_sun(), None)
+    snow = Surfaces(lambda up: (up > 0.8).float(), 0.87)
+    new = relit(gathered, old, old, snow)
+    x, wall = torch.tensor([[0.3, 0.2, 1.7]]), torch.tensor([[1.0, 0.0, 0.0]])
+    ratio = float((new.irradiance(x, wall) / old.irradiance(x, wall))[0, 0])
+    assert ratio == pytest.approx((1 + 0.87) / (1 + 0.2), rel=0.05)
+    assert float((new.irradiance(x, UP) / old.irradiance(x, UP))[0, 0]) == pytest.approx(
+        1, abs=0.02
+    )
+
+
+def test_white_ground_under_the_overcast_sky():
+    """CIE sky: E_v/E_h = .396 + albedo/2, so .12 to .85 brightens a wall 1.80 times."""
+
+    def cie(d):
+        return ((1 + 2 * d[:, 2:].clamp(0, 1)) / 3).expand(-1, 3)
+
+    level = 7 / 9  # E_h/pi for L_z = 1
+    ground = HalfSpace(colour=(0.12 * level,) * 3)
+    field = AnalyticField(
+        [ground], zenith=(1.0,) * 3, horizon=(1 / 3,) * 3, box=((-60, -60, -1), (60, 60, 12))
+    )
+    gathered = gather(field, torch.tensor([0.0, 0.0, 1.6]), 2.0, 0.0)
+    old = light_of_photos(gathered, cie, no_sun(), None)
+    new = relit(gathered, old, old, Surfaces(lambda up: (up > 0.8).float(), 0.85))
+    x, wall = torch.tensor([[0.3, 0.2, 1.7]]), torch.tensor([[0.0, 1.0, 0.0]])
+    ratio = float((new.irradiance(x, wall) / old.irradiance(x, wall))[0, 0])
+    assert ratio == pytest.approx(1.80, rel=0.05)
+
+
+def test_the_same_light_changes_nothing(gathered):
+    old = light_of_photos(gathered, even(1.0), no_sun(), None)
+    new = relit(gathered, old, old)
+    torch.testing.assert_close(new.coefficients, old.coefficients, rtol=0.02, atol=0.02)
+
+
+def test_twice_the_sky_is_twice_the_light(gathered):
+    old = light_of_photos(gathered, even(1.0), no_sun(), None)
+    new = relit(gathered, old, SceneLight(old.grid, old.coefficients, even(2.0), no_sun(), None))
+    above = old.grid.valid.clone()
+    above[: old.grid.shape[0] * old.grid.shape[1]] = False  # the lowest are in the ground
+    torch.testing.assert_close(
+        new.coefficients[above], 2 * old.coefficients[above], rtol=0.02, atol=0.06
+    )
+
+
+def test_a_probe_inside_a_block_is_invalid():
+    block = Box((-3.0, -3.0, 0.0), (3.0, 3.0, 8.0))
+    field = AnalyticField([HalfSpace(), block], box=((-60, -60, -1), (60, 60, 12)))
+    grid = gather(field, torch.tensor([0.0, 0.0, 1.6]), 2.0, 0.0).grid
+    nodes = scene_light.probes  # the module; positions follow from the grid
+    assert nodes is probes
+    nx, ny, nz = grid.shape
+    k, j, i = torch.meshgrid(*(torch.arange(n) for n in (nz, ny, nx)), indexing="ij")
+    x = grid.origin + torch.stack([i, j, k], -1).reshape(-1, 3) * grid.spacing
+    inside = (x[:, :2].abs() < 2.5).all(-1) & (x[:, 2] > 0.5) & (x[:, 2] < 7.5)
+    outside = (x[:, :2].abs() > 3.5).any(-1) & (x[:, 2] > 0.5)
+    assert inside.any() and not grid.valid[inside].any()
+    assert grid.valid[outside].all()
