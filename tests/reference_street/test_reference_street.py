@@ -98,18 +98,19 @@ def test_snow_is_reproducible_by_its_seed(yard):
     np.testing.assert_array_equal(first, second)
 
 
-def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path):
+def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path, monkeypatch):
     from climatenerf.weather.flood.parameters import Flood
     from climatenerf.weather.flood.waves import at_time, heights, make_waves, slopes
 
+    monkeypatch.setattr(water, "EXTENT", ((-14.0, 14.0), (-22.0, 18.0)))
     water.wavy(5.0, 1.0, tmp_path)
     raw = (tmp_path / "water.ply").read_bytes()
     start = raw.index(b"end_header\n") + len(b"end_header\n")
-    (x0, x1), (y0, y1) = water.NEAR
+    (x0, x1), (y0, y1) = water.EXTENT
     columns, rows = round((x1 - x0) / water.STEP) + 1, round((y1 - y0) / water.STEP) + 1
     table = np.frombuffer(raw, "<f4", rows * columns * 6, start).reshape(rows, columns, 6)
     z, normal = table[..., 2].astype(float) - 5.0, table[..., 3:].astype(float)
-    inner = (slice(80, -80), slice(80, -80))  # without the damped border
+    inner = (slice(80, -80), slice(80, -80))
     slope_y, slope_x = np.gradient(z, water.STEP)
     analytic = -normal[..., :2] / normal[..., 2:]
     expected = np.stack([slope_x, slope_y], -1)
@@ -127,7 +128,7 @@ def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path):
         assert (error < 0.01) == same, (time, error)
     spread = np.sqrt(sum(float(heights(waves, i, 1.0).var()) for i in range(len(waves.tiles))))
     assert z[inner].std() == pytest.approx(spread, rel=0.25)
-    assert abs(z[0]).max() < 1e-5 and abs(z[:, -1]).max() < 1e-5, "still water at the border"
+    assert z[0].std() > 0.5 * spread, "waves out to the border"
 
 
 def test_periodic_interpolation_is_exact_at_the_nodes():
@@ -186,7 +187,11 @@ def test_people_move_between_the_pictures_that_show_them():
 
 
 REFERENCE = ROOT / "reference" / "street"
-PHOTOS = {"": 64, "busy": 64, "turned": 64, "sparse": 20, "tracks": 64, "plain": 64, "hard": 20}
+PHOTOS = {
+    "": 64, "busy": 64, "turned": 64, "sparse": 20, "tracks": 64, "plain": 64, "hard": 20,
+    "sun": 64, "overcast": 64,
+}  # fmt: skip
+LIT = ("sun", "overcast")  # under another sky
 PLAIN = ("plain", "hard")  # with ground and light of their own
 
 
@@ -210,7 +215,7 @@ def test_the_set_on_disk_is_small():
     sizes = {p: p.stat().st_size for p in REFERENCE.parent.rglob("*") if p.is_file()}
     folders = {p.relative_to(REFERENCE.parent).parts[0] for p in sizes}
     assert folders == {variant(name).name for name in PHOTOS}
-    assert sum(sizes.values()) < 36e6
+    assert sum(sizes.values()) < 45e6
     for name in ("sparse", "tracks", "hard"):  # lists and points, no pictures
         assert sum(size for p, size in sizes.items() if variant(name) in p.parents) < 300e3
 
@@ -225,7 +230,8 @@ def test_the_set_is_readable_as_capture_and_as_ground_truth():
         assert all(view.path.is_file() for view in scene.views)
         reference = read_reference(variant(name))
         assert len(reference.truths) == 6
-        assert len(reference.weathers) == (0 if name in PLAIN else 9)
+        expected = 0 if name in PLAIN else 1 if name in LIT else 11
+        assert len(reference.weathers) == expected
     reference = read_reference(REFERENCE)
     cases = {case.name: case for case in reference.weathers}
     truth = reference.truths[0]
@@ -539,7 +545,8 @@ def test_smog_transmittance_equals_the_closed_forms():
     low = smog.transmittance("haze", np.array([[20.0]]), 1.7, np.array([[-0.2]]), 0.1)
     above = falloff * (1 - np.exp(-1.6 / falloff)) / 0.2
     assert low[0, 0] == pytest.approx(np.exp(-sigma * (above + 12.0)), rel=1e-3)
-    white = smog.smoggy(np.zeros((1, 1, 3)), np.zeros((1, 1)))
+    white, passed = smog.smoggy(np.zeros((1, 1, 16)), "smog-mid", 1.0)
+    assert passed.max() == 0
     assert np.abs(render.encode(white)[0, 0] / 255 - smog.COLOUR).max() < 0.003
 
 

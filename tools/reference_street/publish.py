@@ -6,6 +6,7 @@ docs/reference-scene.md describes the files.
 import hashlib
 import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,15 @@ from tools.reference_street.layout import (
     passers_by,
 )
 from tools.reference_street.render import EXPOSURE, encode, load
+from tools.reference_street.sky import (
+    CLEAR_SHEET,
+    SUN_AZIMUTH,
+    SUN_ELEVATION,
+    environment,
+    overcast,
+)
 from tools.reference_street.snowfall import snow_meshes
-from tools.reference_street.truth import layers, pixel_rays, snow_layers
+from tools.reference_street.truth import layers, snow_layers
 from tools.reference_street.write import (
     mean_of,
     save_jpeg,
@@ -31,7 +39,13 @@ from tools.reference_street.write import (
 )
 
 SNOW = {"snow-thin": 0.03, "snow-deep": 0.15}  # m
-LEVELS = {"flood-low": 0.25, "flood-high": 0.6, "flood-waves": 0.6}  # m above the ground datum
+LEVELS = {
+    "flood-low": 0.25,
+    "flood-high": 0.6,
+    "flood-waves": 0.6,
+    "flood-mud": 0.6,
+}  # m above the ground datum
+RELIT = {"sun": "overcast", "overcast": "sun"}  # captures under another sky, and their twins
 MAX_THICKNESS = 3.0  # times the depth in the open; overhanging snow is thicker
 WAVE_TIME = 1.0  # s
 EXPOSURE_SPREAD = 0.12  # standard deviation of the busy variant's log exposure
@@ -39,18 +53,50 @@ TURN = ((0.5, -0.7, 0.4), 40.0)  # axis and angle (degrees) of the turned varian
 SHRUNK, SHIFT = 0.37, (12.0, -5.0, 3.0)  # its units per metre, and its translation, units
 
 
-def write_reference(store: Path, out: Path, width: int, height: int) -> None:
-    """Write the reference set to `out`, and its variants to `out`-busy and `out`-turned."""
-    walk, tests = camera_poses(), heldout_poses()
-    poses = walk + tests
+def write_reference(
+    store: Path, out: Path, width: int, height: int, only: list[str] | None = None
+) -> None:
+    """Write the reference set to `out`, and its variants to `out`-busy and `out`-turned.
+
+    `only` names groups of pictures, and leaves the files of other groups as they are.
+    """
+
+    def wanted(name: str) -> bool:
+        return only is None or name in only
+
+    if wanted("clean"):
+        write_capture(store, out, width, height)
+    if wanted("smog"):
+        write_smog(store, out)
+    for name, _ in heldout_poses():
+        stem = Path(name).stem
+        for group in filter(wanted, (*LEVELS, *SNOW, "smog-scattering")):
+            linear = EXPOSURE * mean_of(store / group, name)
+            save_png(encode(linear), out / "weather" / group / f"{stem}.png")
+        if wanted("mirror"):
+            linear = EXPOSURE * mean_of(store / "mirror", name)
+            save_arrays(out / "mirror" / f"{stem}.npz", linear=linear.astype(np.float16))
+    write_snow_truth(store, out, width, height, [kind for kind in SNOW if wanted(kind)])
+    write_weather_files(out)
+    write_list(out, ".", [name for name, _ in heldout_poses()])
+    if wanted("people"):
+        write_busy(store, out, width, height)
+    if wanted("clean"):
+        write_turned(out)
+    for folder in (out, variant_folder(out, "busy"), variant_folder(out, "turned")):
+        write_sums(folder)
+
+
+def write_capture(store: Path, out: Path, width: int, height: int) -> None:
+    """Write photos, labels, scene and the truth of the dry test views."""
+    tests = heldout_poses()
+    poses = camera_poses() + tests
     write_pictures(store / "clean", out / "images", poses)
     known = truths(store, poses, width, height)
     for name, truth in known.items():
         save_png(truth["label"], out / "labels" / f"{Path(name).stem}.png")
-    heldout = {name for name, _ in tests}
-    write_scene(out, poses, heldout, known, width, height)
-    datum = ground_datum()[0]
-    for name, pose in tests:
+    write_scene(out, poses, {name for name, _ in tests}, known, width, height)
+    for name, _ in tests:
         truth, clean = known[name], EXPOSURE * mean_of(store / "clean", name)
         save_arrays(
             out / "truth" / f"{Path(name).stem}.npz",
@@ -59,28 +105,17 @@ def write_reference(store: Path, out: Path, width: int, height: int) -> None:
             sun=truth["sun"].astype(np.float16),
             clean=clean.astype(np.float16),
         )
-        rise = pixel_rays(pose, width, height)[..., 2]
+
+
+def write_smog(store: Path, out: Path) -> None:
+    """Write pictures and transmittances of the smog with a constant airlight."""
+    for name, _ in heldout_poses():
+        through = mean_of(store / "smog", name)
         for kind in smog.VISIBILITY:
-            passed = smog.transmittance(kind, truth["depth"], pose[2, 3], rise, datum)
-            picture = encode(smog.smoggy(clean, passed))
-            save_png(picture, out / "weather" / kind / f"{Path(name).stem}.png")
-            path = out / "weather" / kind / f"{Path(name).stem}.npz"
-            save_arrays(path, transmittance=passed.astype(np.float16))
-        for group, folder in (
-            *((kind, out / "weather" / kind) for kind in (*LEVELS, *SNOW)),
-            ("mirror", out / "mirror"),
-        ):
-            linear = EXPOSURE * mean_of(store / group, name)
-            save_png(encode(linear), folder / f"{Path(name).stem}.png")
-    scattered = EXPOSURE * mean_of(store / "scattering", tests[0][0])
-    save_png(encode(scattered), out / "scattering" / f"{Path(tests[0][0]).stem}.png")
-    write_snow_truth(store, out, width, height)
-    write_weather_files(out)
-    write_list(out, ".", [name for name, _ in tests])
-    write_busy(store, out, known, width, height)
-    write_turned(out)
-    for folder in (out, variant_folder(out, "busy"), variant_folder(out, "turned")):
-        write_sums(folder)
+            picture, passed = smog.smoggy(through, kind, EXPOSURE)
+            path = out / "weather" / kind / f"{Path(name).stem}.png"
+            save_png(encode(picture), path)
+            save_arrays(path.with_suffix(".npz"), transmittance=passed.astype(np.float16))
 
 
 def variant_folder(out: Path, variant: str) -> Path:
@@ -88,10 +123,12 @@ def variant_folder(out: Path, variant: str) -> Path:
     return out.with_name(f"{out.name}-{variant}")
 
 
-def write_snow_truth(store: Path, out: Path, width: int, height: int) -> None:
+def write_snow_truth(store: Path, out: Path, width: int, height: int, kinds: Sequence[str]) -> None:
     """Write depth and thickness of the snow in the test views; the store caches them."""
     meshes = build_scene()
-    for kind, depth in SNOW.items():
+    (store / "layers").mkdir(parents=True, exist_ok=True)
+    for kind in kinds:
+        depth = SNOW[kind]
         limit = MAX_THICKNESS * depth
         with tempfile.TemporaryDirectory() as scratch:
             scenes = None
@@ -114,48 +151,97 @@ def write_snow_truth(store: Path, out: Path, width: int, height: int) -> None:
 
 def write_weather_files(out: Path) -> None:
     """Write the weather file of each weather."""
-    for kind, visibility in smog.VISIBILITY.items():
-        lines = ["[smog]", f'visibility = "{visibility:g} m"', f"colour = {list(smog.COLOUR)}"]
+    for kind in (*smog.VISIBILITY, "smog-scattering", *LEVELS, *SNOW):
+        save_text(out / "weather" / f"{kind}.toml", weather_file(kind))
+
+
+def weather_file(kind: str) -> list[str]:
+    """Return the lines of a weather file: what was put into the street, in the program's words."""
+    sun = [
+        "[sun]",
+        f'elevation = "{SUN_ELEVATION:g} deg"',
+        f'azimuth = "{SUN_AZIMUTH:g} deg"',
+    ]
+    if kind in smog.VISIBILITY:
+        lines = ["[smog]", f'visibility = "{smog.VISIBILITY[kind]:g} m"']
+        lines += ['light = "paper"', f"colour = {list(smog.COLOUR)}"]
         if kind in smog.FALLOFF:
             lines.append(f'height-falloff = "{smog.FALLOFF[kind]:g} m"')
-        _save_text(out / "weather" / f"{kind}.toml", lines)
-    for kind, level in LEVELS.items():
-        wind = water.WIND if kind == "flood-waves" else 0.0
-        lines = [
-            f"seed = {water.SEED}", "[flood]", f'level = "{level:g} m"',
-            f'wind-speed = "{wind:g} m/s"', f"wave-scale = {water.WAVE_SCALE}",
-            "colour = [0.0, 0.0, 0.0]", f"attenuation = {[water.ABSORPTION] * 3}",
-            f"ior = {water.IOR}", "gloss = 1e9",
+        return lines + sun
+    if kind == "smog-scattering":
+        return [
+            "[smog]", f'visibility = "{smog.VISIBILITY["smog-mid"]:g} m"',
+            f"albedo = {list(smog.ALBEDO)}", f"asymmetry = {smog.ASYMMETRY}",
+            f'top = "{smog.TOP - ground_datum()[0]:g} m"', *sun,
         ]  # fmt: skip
-        _save_text(out / "weather" / f"{kind}.toml", lines)
-    for kind, depth in SNOW.items():
-        _save_text(out / "weather" / f"{kind}.toml", ["[snow]", f'depth = "{depth:g} m"'])
+    if kind in LEVELS:
+        mud = kind == "flood-mud"
+        colour = water.mud_colour() if mud else (0.0, 0.0, 0.0)
+        attenuation = water.mud_extinction() if mud else 3 * [water.ABSORPTION]
+        return [
+            f"seed = {water.SEED}", "[flood]", f'level = "{LEVELS[kind]:g} m"',
+            f'wind-speed = "{water.WIND if kind == "flood-waves" else 0.0:g} m/s"',
+            f"wave-scale = {water.WAVE_SCALE}",
+            f"colour = {[round(float(value), 3) for value in colour]}",
+            f"attenuation = {[round(float(value), 3) for value in attenuation]}",
+            f"ior = {water.IOR}", "gloss = 1e9", *sun,
+        ]  # fmt: skip
+    depth = SNOW.get(kind, SNOW["snow-deep"])
+    return ["[snow]", f'depth = "{depth:g} m"', *([] if kind == "snow-overcast" else sun)]
 
 
-def write_list(out: Path, truth: str, views: list[str], clean: str | None = None) -> None:
+def write_list(
+    out: Path,
+    truth: str,
+    views: list[str],
+    clean: str | None = None,
+    light: str | None = None,
+) -> None:
     """Write reference.json: the test views, the weathers and the folder of the truth.
 
     `clean` is the folder of the clean pictures of a variant with a light of its own. Such a variant
-    has no pictures in weather.
+    has no pictures in the street's weathers. One of a `light` in `RELIT` has deep snow, and is
+    compared with the other one.
     """
-    kinds = [*smog.VISIBILITY, *LEVELS, *SNOW]
+    kinds = [*smog.VISIBILITY, "smog-scattering", *LEVELS, *SNOW]
     data: dict = {
-        "schema_version": 1,
+        "schema_version": 3,
         "truth": truth,
         "views": views,
         "weather": {k: {"time_s": WAVE_TIME if k == "flood-waves" else 0.0} for k in kinds},
         "mirror_level_m": LEVELS["flood-high"],
     }
+    data["light"] = {"sheet": sheet(light or "cloudy"), "sun_deg": None}
+    if light == "sun":
+        data["light"]["sun_deg"] = [SUN_ELEVATION, SUN_AZIMUTH]
     if clean is not None:
-        data |= {"schema_version": 2, "clean": clean, "weather": {}, "mirror_level_m": None}
-    _save_text(out / "reference.json", [json.dumps(data, indent=1)])
+        data |= {"clean": clean, "weather": {}, "mirror_level_m": None}
+        if light is None:  # of dusk, which is not stated
+            data["light"] = None
+    if light is not None:
+        snow = {"time_s": 0.0, "folder": ".", "layers": "snow-deep"}
+        data["weather"] = {f"snow-{light}": snow}
+        data["relight"] = {RELIT[light]: f"../{variant_folder(Path(truth), RELIT[light]).name}"}
+    save_text(out / "reference.json", [json.dumps(data, indent=1)])
 
 
-def write_busy(
-    store: Path, out: Path, known: dict[str, dict[str, np.ndarray]], width: int, height: int
-) -> None:
+def sheet(light: str) -> list[float]:
+    """Return the exposed radiance of a white sheet on open level ground under one of the skies."""
+    if light == "sun":
+        radiance = CLEAR_SHEET
+    else:
+        sky = {"cloudy": environment, "overcast": overcast}[light]()
+        rows = (np.arange(len(sky)) + 0.5) * np.pi / len(sky)
+        ring = 2 * np.pi / sky.shape[1] * np.pi / len(sky) * np.sin(rows)
+        weights = ring * np.maximum(np.cos(rows), 0.0) / np.pi
+        radiance = np.einsum("r,rac->c", weights, sky)
+    return [round(float(EXPOSURE * value), 4) for value in radiance]
+
+
+def write_busy(store: Path, out: Path, width: int, height: int) -> None:
     """Write the variant with people and a random exposure of each picture."""
     walk, tests = camera_poses(), heldout_poses()
+    known = truths(store, walk + tests, width, height)
     busy, rng = variant_folder(out, "busy"), np.random.default_rng(5)
     meshes = build_scene()
     changed = set()
@@ -213,7 +299,7 @@ def write_turned(out: Path) -> None:
         "train_filenames": listed["train"], "test_filenames": listed["heldout"],
         "frames": frames,
     }  # fmt: skip
-    _save_text(turned / "transforms.json", [json.dumps(data, indent=1)])
+    save_text(turned / "transforms.json", [json.dumps(data, indent=1)])
     assert scene.points is not None
     write_points(turned / "points.ply", scene.points @ similarity[:3, :3].T + similarity[:3, 3])
     write_list(turned, f"../{out.name}", [view.name for view in scene.of_split("heldout")])
@@ -226,7 +312,7 @@ def write_sums(out: Path) -> None:
         for path in sorted(out.rglob("*"))
         if path.is_file() and path.name != "SHA256SUMS"
     ]
-    _save_text(out / "SHA256SUMS", lines)
+    save_text(out / "SHA256SUMS", lines)
 
 
 def _rotation(axis: tuple[float, float, float], degrees: float) -> np.ndarray:
@@ -243,6 +329,7 @@ def save_arrays(path: Path, **arrays: np.ndarray) -> None:
     np.savez_compressed(path, **arrays)
 
 
-def _save_text(path: Path, lines: list[str]) -> None:
+def save_text(path: Path, lines: list[str]) -> None:
+    """Write lines of text."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -2,14 +2,15 @@
 
     python -m tools.reference_street.reference --out reference/street
 
-The store holds the linear mean of every picture in one file, and each pass adds samples to it:
-re-run the same command to resume. `--only flood-low` limits the run to some groups. See
-docs/reference-scene.md.
+The store holds the linear mean of every picture in one file. Passes add samples to it until its
+noise is low enough: re-run the same command to resume. `--only flood-low` limits the run to some
+groups. See docs/reference-scene.md.
 """
 
 import argparse
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,12 +27,12 @@ from tools.reference_street.layout import (
 )
 from tools.reference_street.mirror import mirrored_view
 from tools.reference_street.publish import LEVELS, SNOW, WAVE_TIME, write_reference
-from tools.reference_street.render import load, render_view
-from tools.reference_street.sky import dusk
-from tools.reference_street.smog import air_box, scattering_air
+from tools.reference_street.render import EXPOSURE, load, render_view
+from tools.reference_street.sky import clear, dusk, environment, overcast
+from tools.reference_street.smog import air_box, scattering_air, smoggy_view
 from tools.reference_street.snowfall import snow_meshes
-from tools.reference_street.store import add, stored
-from tools.reference_street.variants import write_variants
+from tools.reference_street.store import add, noise_db, stored
+from tools.reference_street.variants import VARIANTS, write_variants
 from tools.reference_street.water import still, wavy
 from tools.reference_street.write import write_demo
 
@@ -47,82 +48,108 @@ class Group:
         name: folder in the store.
         poses: names and poses of the views.
         samples: samples per pixel and pass; a square number.
-        passes: number of passes to average.
+        noise: PSNR of the noise that ends a picture's passes, dB.
+        light: a key of `LIGHTS`.
+        snow: depth of snow, m.
     """
 
     name: str
     poses: Poses
     samples: int
-    passes: int
+    noise: float
+    light: str = "cloudy"
+    snow: float = 0.0
+
+
+LIGHTS: dict[str, Callable[[], np.ndarray | dict]] = {
+    "cloudy": environment,
+    "dusk": dusk,
+    "overcast": overcast,
+    "sun": clear,
+}
+MAX_PASSES = 64
 
 
 def groups() -> list[Group]:
-    """Return all groups, the expensive ones last; their samples give 37 to 42 dB of noise."""
-    test = heldout_poses()
-    walk = [pose for i, pose in enumerate(camera_poses()) if passers_by(i)]
+    """Return all groups, the expensive ones last."""
+    test, photos = heldout_poses(), camera_poses()
+    walk = [pose for i, pose in enumerate(photos) if passers_by(i)]
     return [
-        Group("clean", test + camera_poses(), 49, 2),
-        Group("flood-high", test, 100, 4),
-        Group("flood-low", test, 100, 2),
-        Group("flood-waves", test, 100, 2),
-        Group("snow-deep", test, 49, 2),
-        Group("snow-thin", test, 49, 2),
-        Group("mirror", test, 36, 1),
-        Group("people", walk, 49, 2),
-        Group("clean", test, 49, 3),
-        Group("scattering", test[:1], 25, 1),
+        Group("clean", test, 49, 43.5),
+        Group("smog", test, 25, 40.0),
+        Group("clean", photos, 49, 41.0),
+        Group("sun", test, 49, 43.5, "sun"),
+        Group("overcast", test, 49, 43.5, "overcast"),
+        Group("sun", photos, 49, 40.0, "sun"),
+        Group("overcast", photos, 49, 40.0, "overcast"),
+        Group("snow-deep", test, 49, 40.0, snow=SNOW["snow-deep"]),
+        Group("snow-thin", test, 49, 40.0, snow=SNOW["snow-thin"]),
+        Group("snow-sun", test, 49, 40.0, "sun", SNOW["snow-deep"]),
+        Group("snow-overcast", test, 49, 40.0, "overcast", SNOW["snow-deep"]),
+        Group("flood-waves", test, 100, 36.0),
+        Group("flood-mud", test, 100, 34.5),
+        Group("flood-high", test, 100, 37.0),
+        Group("flood-low", test, 100, 37.0),
+        Group("mirror", test, 16, 38.0),
+        Group("smog-scattering", test, 36, 34.0),
+        Group("people", walk, 49, 41.0),
         # The photos receive far more noise afterwards than 25 samples leave.
-        Group("plain", test + camera_poses(), 25, 1),
-        Group("plain", test, 25, 6),
+        Group("plain", test, 25, 42.0, "dusk"),
+        Group("plain", photos, 25, 0.0, "dusk"),
     ]
 
 
-def open_group(group: Group, view: int, folder: Path, threads: int):
+def open_group(group: Group, view: int, folder: Path, threads: int, variant: str):
     """Return the Mitsuba scene of a group for one of its views, and the medium of its air."""
-    mi.set_variant("scalar_rgb")
-    plain = group.name == "plain"
-    meshes, water, air, datum = build_scene(plain), None, None, ground_datum()[0]
-    if group.name in ("flood-low", "flood-high"):
-        water = still(datum + LEVELS[group.name])
-    if group.name == "flood-waves":
-        water = wavy(datum + LEVELS[group.name], WAVE_TIME, folder)
-    if group.name == "scattering":
+    mi.set_variant(variant)
+    meshes, water, air, datum = build_scene(group.name == "plain"), None, None, ground_datum()[0]
+    if group.name in LEVELS:
+        level = datum + LEVELS[group.name]
+        waves = group.name == "flood-waves"
+        water = wavy(level, WAVE_TIME, folder) if waves else still(level, group.name == "flood-mud")
+    if group.name == "smog-scattering":
         air = mi.load_dict(scattering_air())
         water = air_box(air)
-    if group.name in SNOW:
-        meshes += snow_meshes(meshes, SNOW[group.name])
+    if group.snow:
+        meshes += snow_meshes(meshes, group.snow)
     if group.name == "people":
         meshes += passers_by(view)
-    return load(meshes, folder, threads, water, sky=dusk() if plain else None), air
+    return load(meshes, folder, threads, water, sky=LIGHTS[group.light](), variant=variant), air
 
 
-def trace(group: Group, store: Path, threads: int) -> None:
-    """Add the missing passes of a group to the store."""
+def trace(group: Group, store: Path, threads: int, variant: str) -> None:
+    """Add passes to the pictures of a group until their noise is low enough."""
+    if group.name in ("mirror", "smog"):
+        variant = "scalar_rgb"  # they sample path by path
     names = [name for name, _ in camera_poses()]
     folder = store / group.name
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         opened = None
-        for number in range(group.passes):
+        for number in range(MAX_PASSES):
             for index, (name, pose) in enumerate(group.poses):
                 path = (folder / name).with_suffix(".npz")
-                if stored(path)[0] > number:
+                passes = stored(path)[0]
+                enough = passes >= 1 if not group.noise else noise_db(path, EXPOSURE) >= group.noise
+                if passes > number or enough:
                     continue
                 if opened is None or group.name == "people":
                     view = names.index(name) if name in names else index
-                    opened = open_group(group, view, Path(scratch), threads)
+                    opened = open_group(group, view, Path(scratch), threads, variant)
                 start = time.monotonic()
-                seed = 1000 * number + index
+                seed, size = 1000 * number + index, (WIDTH, HEIGHT)
                 scene, air = opened
                 if group.name == "mirror":
                     level = ground_datum()[0] + LEVELS["flood-high"]
-                    size = (WIDTH, HEIGHT)
                     fresh = mirrored_view(scene, pose, level, size, group.samples, seed)
+                elif group.name == "smog":
+                    base = ground_datum()[0]
+                    fresh = smoggy_view(scene, pose, base, size, group.samples, seed)
                 else:
-                    fresh = render_view(scene, pose, WIDTH, HEIGHT, group.samples, seed, air=air)
-                add(path, fresh[..., :3])
-                seconds = time.monotonic() - start
-                print(f"{group.name} pass {number} {name} {seconds:.1f} s", flush=True)
+                    fresh = render_view(scene, pose, *size, group.samples, seed, air=air)[..., :3]
+                add(path, fresh)
+                seconds, noise = time.monotonic() - start, noise_db(path, EXPOSURE)
+                print(f"{group.name} {name} {number} {seconds:.1f} s {noise:.1f} dB", flush=True)
 
 
 def main() -> None:
@@ -135,15 +162,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write the reference set into this folder")
     parser.add_argument("--demo", type=Path, help="write the demo's subset into this folder")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument(
+        "--llvm", action="store_true", help="trace with LLVM (16 may fail; 19 works): twice as fast"
+    )
     args = parser.parse_args()
     for group in groups():
         if args.only is None or group.name in args.only:
-            trace(group, args.store, args.threads)
+            trace(group, args.store, args.threads, "llvm_ad_rgb" if args.llvm else "scalar_rgb")
     if args.demo:
         write_demo(args.store, args.demo, WIDTH, HEIGHT)
     if args.out:
-        write_reference(args.store, args.out, WIDTH, HEIGHT)
-        write_variants(args.store, args.out)
+        write_reference(args.store, args.out, WIDTH, HEIGHT, args.only)
+        wanted = [name for name in VARIANTS if args.only is None or name in args.only]
+        write_variants(args.store, args.out, wanted)
 
 
 if __name__ == "__main__":

@@ -61,7 +61,8 @@ def load(
     threads: int = 1,
     water: dict | None = None,
     named: bool = False,
-    sky: Float[np.ndarray, "h w 3"] | None = None,
+    sky: Float[np.ndarray, "h w 3"] | dict | None = None,
+    variant: str = "scalar_rgb",
 ):
     """Return a Mitsuba scene of diffuse, textured meshes under the sky.
 
@@ -71,12 +72,13 @@ def load(
         threads: number of rendering threads.
         water: Mitsuba's description of a water surface with or without a medium, if any.
         named: keep every mesh as a shape with its name; otherwise meshes of a texture are merged.
-        sky: radiance of the sky; default the cloudy one by day.
+        sky: radiance of the sky, or Mitsuba's description of it; default the cloudy one by day.
+        variant: of Mitsuba; it stays set.
     """
     import drjit as dr
     import mitsuba as mi
 
-    mi.set_variant("scalar_rgb")
+    mi.set_variant(variant)
     dr.set_thread_count(threads)
     scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 5}}
     if water is not None:
@@ -103,9 +105,12 @@ def load(
             "face_normals": not mesh.smooth,
             "bsdf": textures[mesh.texture],
         }
-    rotate = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # y up to z up
-    bitmap = mi.Bitmap((environment() if sky is None else sky).astype(np.float32))
-    scene["sky"] = {"type": "envmap", "bitmap": bitmap, "to_world": rotate}
+    if isinstance(sky, dict):
+        scene["sky"] = sky
+    else:
+        rotate = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # y up to z up
+        bitmap = mi.Bitmap((environment() if sky is None else sky).astype(np.float32))
+        scene["sky"] = {"type": "envmap", "bitmap": bitmap, "to_world": rotate}
     return mi.load_dict(scene, optimize=not named)
 
 

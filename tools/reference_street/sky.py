@@ -1,4 +1,7 @@
-"""The illumination: equirectangular pictures of a cloudy sky with a broad sun, and of dusk."""
+"""The illumination: a cloudy sky with a broad sun, dusk, an overcast sky, a clear sky with its sun.
+
+All but the last are equirectangular pictures.
+"""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,6 +13,12 @@ SUN_ELEVATION = 40.0  # degrees
 SUN_WIDTH = 24.0  # degrees to 1/e, as through thin cloud. Paths through water hit the sun only by
 # chance; a narrow sun would give fireflies at any affordable number of samples.
 SUN_RADIANCE = 5.5  # relative to a cloudy sky of about 0.8
+
+OVERCAST_ZENITH = 1.28  # radiance; exposed, the sky is white from 70 degrees up
+TURBIDITY = 3.0  # of the clear sky: clean air
+GROUND_ALBEDO = 0.15  # of the surroundings that light the clear sky from below
+CLEAR_GAIN = 3.9  # of the clear sky's model, for about the cloudy sky's irradiance
+CLEAR_SHEET = (1.334, 1.216, 1.130)  # irradiance over pi of level ground under it, integrated
 
 DUSK_WIDTH, DUSK_HEIGHT = 55.0, 11.0  # degrees to 1/e of the glow at the horizon after sunset
 
@@ -76,3 +85,28 @@ def dusk(height: int = 128) -> Float[np.ndarray, "h w 3"]:
     sky += glow[..., None] * np.array([0.95, 0.60, 0.34])
     sky[d[..., 2] < 0] = np.array([0.05, 0.05, 0.04])
     return sky
+
+
+def overcast(height: int = 128) -> Float[np.ndarray, "h w 3"]:
+    """Return the linear radiance of the CIE standard overcast sky, laid out as `environment`.
+
+    L = L_z (1 + 2 sin h)/3 at elevation h, without colour (CIE S 011, type 1 of the older form).
+    """
+    up = _directions(height)[..., 2]
+    sky = np.where(up < 0, 0.1, OVERCAST_ZENITH * (1 + 2 * up) / 3)
+    return np.repeat(sky[..., None], 3, axis=-1)
+
+
+def clear() -> dict:
+    """Return Mitsuba's description of a clear sky with its sun, which is 0.53 degrees wide.
+
+    It is the model of Hosek and Wilkie (2012, 2013), z up.
+    """
+    return {
+        "type": "sunsky",
+        "sun_direction": direction(SUN_AZIMUTH, SUN_ELEVATION).tolist(),
+        "turbidity": TURBIDITY,
+        "albedo": GROUND_ALBEDO,
+        "sun_scale": CLEAR_GAIN,
+        "sky_scale": CLEAR_GAIN,
+    }

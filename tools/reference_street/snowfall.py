@@ -4,7 +4,8 @@ The code shares nothing with the program's own snow. It fills a height field fla
 stays on a bare surface with the probability that roofs of that pitch keep their snow (EN 1991-1-3,
 5.3: all up to 30 degrees, none from 60), and on snow up to the angle of repose. Otherwise it moves
 to the lowest neighbour, also over an edge. Flakes never reach surfaces under a roof or a table.
-Leaves keep a fraction of the flakes that depends on their pitch; the rest falls through the crown.
+Leaves keep a fraction of the flakes that depends on their pitch, up to what a crown can hold; the
+rest falls through. Snow in a crown does not follow single leaves: it bridges them in cushions.
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from jaxtyping import Float
+from scipy import ndimage
 
 from tools.reference_street.geometry import Mesh
 
@@ -23,6 +25,12 @@ KEEPS, SHEDS = 30.0, 60.0  # degrees of pitch up to which all, and from which no
 MAX_MOVES = 400  # of one flake
 MAX_RISE = 2.5  # height difference of neighbours on one surface, cells
 MIN_DEPTH = 0.002  # m, thinner snow is removed
+# A crown intercepts some 5 kg/m2 of snow for each unit of leaf area that it shows to the sky
+# (Hedstrom and Pomeroy 1998): half a decimetre of fresh snow, and a little more in clumps.
+CROWN_HOLDS = 0.08  # m
+CUSHION = 0.1  # m, standard deviation of the smoothing of crowns
+ONE_LAYER = 0.6  # m below the highest leaf nearby; deeper leaves carry no part of a cushion
+CLOSED = (0.25, 0.6)  # fraction covered by leaves at which a cushion begins, and is complete
 
 
 @dataclass(frozen=True)
@@ -66,15 +74,47 @@ def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> tu
         surfaces.append((top, np.clip((SHEDS - pitch) / (SHEDS - KEEPS), 0, 1)))
     (ground, keeps), (crown, holds) = surfaces
     crown[crown <= ground] = -np.inf
+    crown, holds, most = cushions(crown, holds, depth, cell)
     rng = np.random.default_rng(seed)
     steepest = MAX_RISE * cell
-    lying, held = _settle(ground, keeps, crown, holds, depth / FLAKES, REPOSE * cell, rng)
+    lying, held = _settle(ground, keeps, crown, holds, most, depth / FLAKES, REPOSE * cell, rng)
     covers = []
-    for top, snow in ((ground, lying), (crown, held)):
-        for _ in range(4):  # removes the bumps of single flakes
+    for top, snow, times in ((ground, lying, 4), (crown, held, round(8 * CUSHION / cell))):
+        for _ in range(times):  # removes the bumps of single flakes
             snow = _smooth(snow, top, steepest)
         covers.append(Cover(x0, y0, cell, top, np.where(snow > MIN_DEPTH, snow, 0.0)))
     return covers[0], covers[1]
+
+
+def cushions(
+    crown: Float[np.ndarray, "rows columns"],
+    holds: Float[np.ndarray, "rows columns"],
+    depth: float,
+    cell: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return crowns as surfaces that snow can lie on: smooth over leaves and the gaps between.
+
+    Args:
+        crown: height of the highest leaf over each cell, m; -inf without one.
+        holds: fraction of the flakes that this leaf keeps.
+        depth: depth of snow on open level ground, m.
+        cell: side of a cell, m.
+
+    Returns:
+        The heights of cushions, m (-inf without one); the fraction of the flakes that they keep;
+        and the depth up to which they keep any, which falls to 0 at their rims.
+    """
+    sigma, leaf = CUSHION / cell, np.isfinite(crown)
+    size = 2 * int(np.ceil(2 * sigma)) + 1
+    highest = ndimage.maximum_filter(crown, size)
+    top = leaf & (crown > highest - ONE_LAYER)
+    weight = ndimage.gaussian_filter(top.astype(float), sigma)
+    share = np.maximum(weight, 1e-6)  # no leaf near: 0/0; its cells are no cushion
+    height = ndimage.gaussian_filter(np.where(top, crown, 0.0), sigma) / share
+    kept = ndimage.gaussian_filter(np.where(top, holds, 0.0), sigma) / share
+    complete = np.clip((weight - CLOSED[0]) / (CLOSED[1] - CLOSED[0]), 0, 1)
+    most = min(depth, CROWN_HOLDS) * complete * (2 - complete)
+    return np.where(complete > 0, height, -np.inf), kept, most
 
 
 def snow_meshes(meshes: list[Mesh], depth: float) -> list[Mesh]:
@@ -167,8 +207,10 @@ def _from_above(triangles, x0, y0, cell, ground, level):
 
 
 @numba.njit(cache=True)
-def _settle(ground, keeps, crown, holds, flake, steepest, rng):
-    """Drop all flakes one by one; return the depths of snow on surfaces and on leaves.
+def _settle(ground, keeps, crown, holds, most, flake, steepest, rng):
+    """Drop all flakes one by one; return the depths of snow on surfaces and in crowns.
+
+    Crowns keep the fraction `holds` of the flakes until their depth is `most`.
 
     A flake that slides continues until a surface that keeps all snow, or over an edge.
     """
@@ -177,7 +219,7 @@ def _settle(ground, keeps, crown, holds, flake, steepest, rng):
     for _ in range(FLAKES * rows * columns):
         j, i = int(rng.random() * rows), int(rng.random() * columns)
         slides = False
-        if crown[j, i] > -np.inf and rng.random() < holds[j, i]:
+        if held[j, i] < most[j, i] and rng.random() < holds[j, i]:
             held[j, i] += flake
             continue
         if ground[j, i] == -np.inf:

@@ -17,17 +17,38 @@ from PIL import Image
 
 from tools.reference_street.layout import heldout_poses
 from tools.reference_street.phone import photo
-from tools.reference_street.publish import save_arrays, variant_folder, write_list, write_sums
+from tools.reference_street.publish import (
+    RELIT,
+    save_arrays,
+    save_text,
+    variant_folder,
+    weather_file,
+    write_list,
+    write_sums,
+)
+from tools.reference_street.render import EXPOSURE, encode
+from tools.reference_street.sky import SUN_AZIMUTH, SUN_ELEVATION
 from tools.reference_street.tracks import sfm_points
-from tools.reference_street.write import mean_of, save_portable
+from tools.reference_street.write import mean_of, save_jpeg, save_png, save_portable
 
 if TYPE_CHECKING:
     from climatenerf.scene import Scene
 
+VARIANTS = ("sparse", "tracks", "plain", "hard", "sun", "overcast")
 SPARSE_PHOTOS = 20
 PLAIN_EXPOSURE = 1.6  # gain of the plain variant's linear pictures: dark photos
 PLAIN_QUALITY = 88  # of its JPEGs, with colour at half the resolution
 PLAIN_SEED = 3
+SKIES = {
+    "overcast": ["[sky]", 'kind = "overcast"'],
+    "sun": [
+        "[sky]",
+        'kind = "clear"',
+        "[sun]",
+        f'elevation = "{SUN_ELEVATION:g} deg"',
+        f'azimuth = "{SUN_AZIMUTH:g} deg"',
+    ],
+}  # what turns one capture into its twin
 
 
 def write_variants(store: Path, out: Path, only: list[str] | None = None) -> None:
@@ -37,6 +58,8 @@ def write_variants(store: Path, out: Path, only: list[str] | None = None) -> Non
         "tracks": lambda: write_tracks(store, out),
         "plain": lambda: write_plain(store, out),
         "hard": lambda: write_hard(store, out),
+        "sun": lambda: write_lit(store, out, "sun"),
+        "overcast": lambda: write_lit(store, out, "overcast"),
     }
     for name in write if only is None else only:
         write[name]()
@@ -101,6 +124,33 @@ def write_hard(store: Path, out: Path) -> None:
     write_list(scene.root, f"../{out.name}", _tests(), clean=f"../{plain}")
 
 
+def write_lit(store: Path, out: Path, light: str) -> None:
+    """Write the variant under another sky: photos, what is clean, and the deep snow in its light.
+
+    Geometry, labels, points and the layers of the snow are the street's.
+    """
+    folder = variant_folder(out, light)
+    scene = _variant_scene(out, light, folder.name)
+    for view in scene.views:
+        linear = EXPOSURE * mean_of(store / light, view.name)
+        save_jpeg(linear, folder / "images" / view.name)
+        if view.split == "heldout":
+            truth = folder / "truth" / f"{Path(view.name).stem}.npz"
+            save_arrays(truth, clean=linear.astype(np.float16))
+            snowy = EXPOSURE * mean_of(store / f"snow-{light}", view.name)
+            picture = folder / "weather" / f"snow-{light}" / f"{Path(view.name).stem}.png"
+            save_png(encode(snowy), picture)
+    shared = {key: f"../{out.name}/{key}" for key in ("points.ply", "points_seen.npz")}
+    save_portable(
+        replace(scene, points=None),
+        points=shared["points.ply"],
+        points_seen=shared["points_seen.npz"],
+    )
+    save_text(folder / "weather" / f"snow-{light}.toml", weather_file(f"snow-{light}"))
+    save_text(folder / "relight" / f"{RELIT[light]}.toml", SKIES[RELIT[light]])
+    write_list(folder, f"../{out.name}", _tests(), clean=".", light=light)
+
+
 def _variant_scene(out: Path, variant: str, photos: str) -> "Scene":
     """Return the street's scene for a variant, with the photos of the folder `photos` beside it."""
     from climatenerf.scene import load_scene
@@ -144,9 +194,7 @@ def main() -> None:
     )
     parser.add_argument("--store", type=Path, default=Path("build/street-reference"))
     parser.add_argument("--out", type=Path, required=True, help="the published street")
-    parser.add_argument(
-        "--only", nargs="*", choices=("sparse", "tracks", "plain", "hard"), help="default: all"
-    )
+    parser.add_argument("--only", nargs="*", choices=VARIANTS, help="default: all")
     args = parser.parse_args()
     write_variants(args.store, args.out, args.only)
 
