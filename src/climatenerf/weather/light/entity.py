@@ -173,19 +173,23 @@ class LightEntity:
         sky = self._sky(weather)
         direct = torch.tensor(sky.sun_irradiance, device=device_of(self._given.field))
         shadow = self._sun_map(np.array(sky.sun)) if bool((direct > 0).any()) else None
-        unit = replace(old, radiance=sky.radiance, sun_irradiance=direct, sun=shadow, captured=None)
-        bare = relit(self._gathered, old, unit)
-        gain = self._gain(weather, old, bare) * 2.0**weather.sky.ev
 
-        def radiance(d: Tensor) -> Tensor:
-            return gain * sky.radiance(d)
+        def under(gain: float) -> SceneLight:
+            """The new sky and sun, klx times a gain."""
+            return replace(
+                old,
+                radiance=lambda d: gain * sky.radiance(d),
+                sun_irradiance=gain * direct,
+                sun=shadow,
+                captured=None,
+            )
 
-        scaled = replace(
-            bare,
-            coefficients=gain * bare.coefficients,
-            radiance=radiance,
-            sun_irradiance=gain * direct,
-        )
+        # First as bright as the old light in the open, since changes of light are bounded.
+        level = float(luma(under(1.0).open_irradiance()))
+        first = float(luma(old.open_irradiance())) / level
+        bare = relit(self._gathered, old, under(first))
+        gain = self._gain(weather, old, bare, first) * 2.0**weather.sky.ev
+        scaled = replace(under(gain), coefficients=gain / first * bare.coefficients)
         hazy = below_smog(weather, scaled)
         if surfaces is None and hazy is scaled:
             return scaled
@@ -206,8 +210,8 @@ class LightEntity:
         sun = (flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(elevation))
         return skies.NewSky(weather.sky.kind, sun, weather.sky.cover)
 
-    def _gain(self, weather: Weather, old: SceneLight, new: SceneLight) -> float:
-        """Factor from klx to the units of the photos."""
+    def _gain(self, weather: Weather, old: SceneLight, new: SceneLight, gain: float) -> float:
+        """Factor from klx to the units of the photos; `new` has the factor `gain`."""
         if weather.sky.exposure == "fixed":
             captured = self.captured
             assert captured is not None
@@ -221,7 +225,8 @@ class LightEntity:
         hit = (normal != 0).any(-1).nonzero()[:, 0][::7]
         radiance = self._gathered.radiance.reshape(-1, 3)[hit]
         ratio = new.irradiance(x[hit], normal[hit]) / old.irradiance(x[hit], normal[hit])
-        return float(luma(radiance).sum() / luma(radiance * ratio).sum().clamp_min(1e-6))
+        change = luma(radiance).sum() / luma(radiance * ratio).sum().clamp_min(1e-6)
+        return gain * float(change)
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a clear sky without a sun above the horizon.
