@@ -214,8 +214,8 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
             cannot be used.
     """
     from climatenerf.core.device import resolve_device
+    from climatenerf.core.storage import hash_of_files
     from climatenerf.field.checkpoint import load_field
-    from climatenerf.output.job import hash_of_files
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
     from climatenerf.training.snapshot import CONFIG, FIELD, SCENE, identity_of, read_together
@@ -331,8 +331,10 @@ def render_movie(
     )
 
     def prepare() -> "jobs.FrameSource":
+        from climatenerf.weather.world import Kept
+
         field = run.completed(progress) if complete_ground else run.field
-        return jobs.frame_source(job, field, run.scene, progress, run.folder)
+        return jobs.frame_source(job, field, run.scene, progress, Kept(run.folder, job.run))
 
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.core.srgb import DISPLAY_TOE, EXPONENT, LINEAR_TOE, OFFSET, SCALE, TOE_SLOPE
+from climatenerf.core.srgb import DISPLAY_TOE, EXPONENT, LINEAR_TOE, LUMA, OFFSET, SCALE, TOE_SLOPE
 
 _SLOPE_AT_ONE = SCALE / EXPONENT  # of the encoding curve
 
@@ -68,4 +68,4 @@ def decode_srgb(display: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 def luma(linear: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
     """Return the Rec. 709 luminance of linear colours."""
-    return linear @ linear.new_tensor([0.2126, 0.7152, 0.0722])
+    return linear @ linear.new_tensor(LUMA)

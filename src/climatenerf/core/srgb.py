@@ -17,6 +17,10 @@ EXPONENT, OFFSET, SCALE = 2.4, 0.055, 1.055
 """Above the toe: linear = ((display + OFFSET) / SCALE) ** EXPONENT."""
 
 
+LUMA = (0.2126, 0.7152, 0.0722)
+"""Weights of linear red, green and blue in luminance (Rec. 709)."""
+
+
 def to_linear(display: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """Return the linear radiance of display values in [0, 1]."""
     curve = ((display + OFFSET) / SCALE) ** EXPONENT

@@ -8,6 +8,7 @@ the process that uses it, so that `remove_abandoned` can tell what a dead proces
 import contextlib
 import dataclasses
 import errno
+import hashlib
 import itertools
 import json
 import math
@@ -258,6 +259,22 @@ def read_safetensors(path: Path | str, what: str = "file") -> tuple[dict[str, An
     except (SafetensorError, ValueError, TypeError, KeyError) as error:
         reason = one_line(str(error), 100)
         raise UserError(f"{what}: {path} is damaged ({reason}); restore or recreate it") from error
+
+
+def hash_of_files(paths: Iterable[Path]) -> str:
+    """Return the hash of the contents of files.
+
+    Raises:
+        UserError: one cannot be read.
+    """
+    found = hashlib.sha256()
+    for path in paths:
+        try:
+            with path.open("rb") as file:
+                found.update(hashlib.file_digest(file, "sha256").digest())
+        except OSError as error:
+            raise explain(error, path) from error
+    return found.hexdigest()
 
 
 def digest(tensors: Mapping[str, Any]) -> int:

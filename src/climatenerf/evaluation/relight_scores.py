@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from climatenerf.core.classes import BUILDING, GROUND, MERGED
+from climatenerf.core.srgb import LUMA
 from climatenerf.evaluation.reference import Truth
 
-LUMA = np.array([0.2126, 0.7152, 0.0722])
 DARKEST = 1e-3  # radiance; ratios of darker pixels are noise
 STEEP = 0.5  # |z| of a wall's normal
 APART = 3  # pixels between the two sides of a shadow's edge

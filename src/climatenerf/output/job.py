@@ -23,7 +23,7 @@ from jaxtyping import Float, UInt8
 import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.layer_table import Layer
-from climatenerf.core.storage import explain, plain, read_json, write_json
+from climatenerf.core.storage import hash_of_files, plain, read_json, write_json
 from climatenerf.field.capabilities import APPEARANCE
 from climatenerf.output import render_folder
 from climatenerf.output.layers import LayerFormat, require_exr, save_layers
@@ -45,6 +45,7 @@ from climatenerf.weather.registry import COMPLETED_GROUND, EFFECTS, MEAN_TRANSMI
 
 if TYPE_CHECKING:
     from climatenerf.field.protocol import RadianceField
+    from climatenerf.weather.world import Kept
 
 MAX_SIDE = 8192
 MAX_RAYS = 2**26
@@ -270,22 +271,6 @@ def hash_of_run(run: Path) -> str:
     return hash_of_files([run / name for name in ("field.safetensors", "scene.json")])
 
 
-def hash_of_files(paths: Iterable[Path]) -> str:
-    """Return the hash of the contents of files.
-
-    Raises:
-        UserError: one cannot be read.
-    """
-    digest = hashlib.sha256()
-    for path in paths:
-        try:
-            with path.open("rb") as file:
-                digest.update(hashlib.file_digest(file, "sha256").digest())
-        except OSError as error:
-            raise explain(error, path) from error
-    return digest.hexdigest()
-
-
 def frames_of_part(job: RenderJob, part: tuple[int, int] | None = None) -> range:
     """Return the indices of the frames of a part (number from 1, of how many); None takes all."""
     number, count = part or (1, 1)
@@ -450,7 +435,7 @@ def frame_source(
     field: "RadianceField",
     scene: Scene,
     progress: Progress | None = None,
-    folder: Path | None = None,
+    kept: "Kept | None" = None,
 ) -> FrameSource:
     """Prepare light, waves and snow for a job, and return what renders its frames.
 
@@ -459,16 +444,14 @@ def frame_source(
         field: the fitted field of its run.
         scene: the capture of its run.
         progress: called with what is being prepared and the fraction that is done.
-        folder: the run folder, where what is found in the field is kept; None: nowhere.
+        kept: the run folder, where what is found in the field is kept; None: nowhere.
 
     Raises:
         UserError: the weather does not fit the scene.
     """
     from climatenerf.field.protocol import require
     from climatenerf.render.session import RenderSession
-    from climatenerf.weather.world import Kept
 
-    kept = None if folder is None else Kept(folder, job.run)
     appearance = None
     if job.appearance is not None:
         require(field, frozenset({APPEARANCE}), "the appearance of a photo")

@@ -17,9 +17,9 @@ from torch import Tensor
 from climatenerf.core.classes import SOLID, TERRAIN, UNKNOWN
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import COMPLETED, Samples
-from climatenerf.field.capabilities import COMPLETES, FUSED
-from climatenerf.field.compositing import composited
-from climatenerf.field.protocol import RadianceField, observed
+from climatenerf.field.capabilities import COMPLETES
+from climatenerf.field.protocol import observed
+from climatenerf.field.wrapped import WrappedField
 from climatenerf.ops import compositing, heightfield
 from climatenerf.ops.heightfield_reference import bilinear
 from climatenerf.scene.terrain import Terrain, nearest_known
@@ -34,11 +34,9 @@ SMOOTHING = 20  # steps of diffusion at each level of a continuation
 
 
 @dataclass(frozen=True)
-class CompletedField:
+class CompletedField(WrappedField):
     """A field (`field.protocol.RadianceField`) with completed ground."""
 
-    field: RadianceField
-    """The field that photos were fitted to."""
     terrain: Terrain
     """The ground; its `completed` nodes are what this class adds."""
 
@@ -116,19 +114,9 @@ class CompletedField:
     # --- the protocol ---------------------------------------------------------------------------
 
     @property
-    def near(self) -> float:
-        """Ray length at which camera rays begin, m."""
-        return self.field.near
-
-    @property
-    def bounds(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Lower and upper corner of the box that holds all density, m."""
-        return self.field.bounds
-
-    @property
     def capabilities(self) -> frozenset[str]:
-        """Those of the field, but for rendering in one launch."""
-        return (self.field.capabilities - {FUSED}) | {COMPLETES}
+        """Those of the field, but for rendering in one launch; and `COMPLETES`."""
+        return super().capabilities | {COMPLETES}
 
     def march(
         self,
@@ -197,26 +185,6 @@ class CompletedField:
         colour[own] = torch.stack([bilinear(raster[..., k], at) for k in range(3)], dim=-1)
         return colour
 
-    def sky(
-        self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None
-    ) -> Float[Tensor, "n 3"]:
-        """Linear radiance of the field's sky."""
-        return self.field.sky(d, appearance)
-
-    def composite(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        t_min: Float[Tensor, "n"],
-        step_scale: float = 1.0,
-        stop: float = 1e-3,
-        pruning_threshold: float | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Radiance, transmittance and weighted sum of ray lengths (m), in several launches."""
-        given = t_min, step_scale, stop, pruning_threshold, appearance
-        return composited(self, rays_o, rays_d, *given)
-
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Extinction at positions (m), 1/m."""
         own = self._on_ground(x)
@@ -259,10 +227,6 @@ class CompletedField:
     def observed_only(self) -> "CompletedField":
         """The same, without density that no photo shows; completed ground stays."""
         return CompletedField(observed(self.field), self.terrain)
-
-    def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
-        """Appearance of a training photo."""
-        return self.field.photo_appearance(index)
 
     # --- colours --------------------------------------------------------------------------------
 

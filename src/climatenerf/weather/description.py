@@ -229,6 +229,8 @@ def _interpolate(frames: Keyframes, time: float) -> Any:
     if i == 0 or i == len(frames):
         return frames[min(i, len(frames) - 1)][1]
     (t0, a), (t1, b) = frames[i - 1], frames[i]
+    if isinstance(a, str):
+        return a  # a word holds until the next keyframe
     fraction = (time - t0) / (t1 - t0)
     if isinstance(a, tuple):
         return tuple((1 - fraction) * x + fraction * y for x, y in zip(a, b, strict=True))

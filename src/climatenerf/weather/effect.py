@@ -83,7 +83,7 @@ class Effect:
         prepared_from: Parameters ("snow.fall_tilt", "seed") whose change prepares the entity again.
             A change of any other parameter only places it anew.
         version: Version of the effect's code. A new one renders finished frames again.
-        always: Whether it is placed in every frame, whatever its parameters are.
+        always: Placed in every frame, with any parameters.
     """
 
     name: str

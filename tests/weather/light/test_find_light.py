@@ -16,9 +16,9 @@ from climatenerf.weather.light.find_light import (
     fit_sky,
     gather_light,
     hard_sun,
-    sphere_directions,
     sun_strength,
 )
+from climatenerf.weather.light.spherical import sphere_directions
 
 BLOCKS = [Box((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0)), Box((4.0, 2.0, 0.0), (6.0, 3.0, 2.0))]
 STRENGTH = np.array([4.0, 3.0, 2.0])
@@ -42,7 +42,7 @@ def sunlit_yard(sun, count=1200):
         free &= ~((x[..., :2] > low) & (x[..., :2] < high)).all(-1).any(1)
     x = x[free].reshape(-1, 3)
     normal = np.tile([0.0, 0.0, 1.0], (len(x), 1))
-    sky = np.where(sphere_directions(finding.DIRECTIONS)[:, 2:] > 0, 1.0, 0.0).repeat(3, axis=1)
+    sky = np.where(finding.gathering_directions()[:, 2:] > 0, 1.0, 0.0).repeat(3, axis=1)
     dark = Pairs(x, normal, np.ones_like(x))
     ambient = gather_light(field, dark).ambient(sky)
     o = torch.tensor(x + 0.01 * normal, dtype=torch.float32)
@@ -85,7 +85,7 @@ def lobe_sky(d, elevation=35.0, azimuth=100.0, width=20.0, peak=4.0):
 
 def test_a_clipped_lobe_is_extrapolated_from_its_flank():
     """Photos show the sky up to 25 degrees; the lobe stands at 35 and is white in them."""
-    d = sphere_directions(6000)
+    d = sphere_directions(6000).double().numpy()
     low = d[(d[:, 2] > 0.03) & (d[:, 2] < math.sin(math.radians(25)))]
     up = d[d[:, 2] > 0]
     level = float((lobe_sky(up)[:, 0] * up[:, 2]).sum() * 4 / 6000)  # E/pi

@@ -229,10 +229,11 @@ class LightEntity:
         return gain * float(change)
 
     def check(self, moments: tuple[Weather, ...]) -> None:
-        """Refuse a clear sky without a sun above the horizon.
+        """Refuse a sun that does not belong to its sky.
 
         Raises:
-            UserError: the sun is below it.
+            UserError: a clear sky without a sun above the horizon, or dusk with a sun that is not
+                just below it.
         """
         for moment in moments:
             elevation = moment.sun.elevation
@@ -241,9 +242,15 @@ class LightEntity:
                     "--sky.kind clear needs the sun above the horizon; give --sun.elevation above"
                     " 0 deg, or --sky.kind dusk"
                 )
+            dusk = moment.sky.kind == "dusk"
+            if dusk and elevation is not None and not skies.NIGHT <= elevation <= 0:
+                raise UserError(
+                    "--sky.kind dusk needs the sun between 12 deg below the horizon and the"
+                    " horizon; give --sun.elevation from -12 deg to 0 deg, or leave it out"
+                )
 
     def facts(self) -> dict[str, float]:
-        """Where the photos' sun stands, and how bright a white sheet in the open is."""
+        """Where the sun of the photos stands."""
         if "captured" not in self.__dict__ or self.captured is None:
             return {}
         captured = self.captured

@@ -15,10 +15,12 @@ from torch import Tensor
 
 from climatenerf.core.classes import PERSON, SKY, VEGETATION, VEHICLE
 from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.srgb import LUMA
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.weather.light.captured import CLIPPED, COLUMNS, ROWS, CapturedLight
+from climatenerf.weather.light.spherical import sphere_directions
 
 PAIRS = 12000  # of neighbouring surface points
 GATHERED_PAIRS = 800  # whose difference is explained by candidates for the sun
@@ -48,7 +50,6 @@ SKY_ERROR = 0.08  # of log radiance, by clouds
 GROUND_ALBEDO, ALBEDO_SPREAD = 0.15, 0.5  # asphalt and grass .1, soil .15, concrete .3; of its log
 RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
 TYPICAL_WIDTH, WIDTH_SPREAD = np.radians(20.0), 0.5  # of a sun behind thin cloud; of its log
-LUMA = np.array([0.2126, 0.7152, 0.0722])
 WHITE = np.ones(3)
 
 
@@ -73,13 +74,9 @@ class Gathered:
         return (self.weights * self.through) @ sky + self.bounced
 
 
-def sphere_directions(count: int) -> Float[np.ndarray, "k 3"]:
-    """Unit vectors, evenly spread over the sphere (Fibonacci's spiral), the highest first."""
-    i = np.arange(count) + 0.5
-    z = 1 - 2 * i / count
-    angle = i * np.pi * (3 - np.sqrt(5))
-    flat = np.sqrt(1 - z**2)
-    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], -1)
+def gathering_directions() -> Float[np.ndarray, "k 3"]:
+    """Directions of the rays that gather light at surface points, over the whole sphere."""
+    return sphere_directions(DIRECTIONS).double().numpy()
 
 
 @dataclass(frozen=True)
@@ -135,7 +132,7 @@ def find_pairs(
 @torch.no_grad()
 def gather_light(field: RadianceField, pairs: Pairs) -> Gathered:
     """Gather the light that arrives at pairs of points in a field without unobserved density."""
-    directions = sphere_directions(DIRECTIONS)
+    directions = gathering_directions()
     cosine = pairs.normal @ directions.T
     weights = np.where(cosine > 0.05, cosine, 0.0) * (4 * np.pi / DIRECTIONS)
     start = _sent(pairs.start, field)
@@ -260,9 +257,9 @@ def hard_sun(field: RadianceField, gathered: Gathered, sky: Float[np.ndarray, "k
     Args:
         field: without unobserved density.
         gathered: light at surface points.
-        sky: radiance of the sky in `sphere_directions`, 0 below the horizon.
+        sky: radiance of the sky in `gathering_directions`, 0 below the horizon.
     """
-    pairs, directions = gathered.pairs, sphere_directions(DIRECTIONS)
+    pairs, directions = gathered.pairs, gathering_directions()
     radiance, ambient = pairs.radiance @ LUMA, gathered.ambient(sky) @ LUMA
     level = float(np.clip(directions[:, 2], 0, 1) @ sky @ LUMA) * 4 * np.pi / DIRECTIONS
     none = deviations(radiance, ambient, np.zeros((len(ambient), 1))).mean()
@@ -310,7 +307,7 @@ def sun_strength(
         field: without unobserved density.
         pairs: many; the few that a shadow's edge parts are chosen.
         sun: unit vector towards the sun.
-        sky: radiance of the sky in `sphere_directions`, 0 below the horizon.
+        sky: radiance of the sky in `gathering_directions`, 0 below the horizon.
 
     Returns:
         Irradiance; 0 if no shadow is found.
@@ -379,7 +376,7 @@ def fit_sky(
     """
     rgb = np.minimum(radiance, 1.0)
     brightness = rgb @ LUMA
-    grid = sphere_directions(DIRECTIONS)
+    grid = gathering_directions()
     grid = grid[grid[:, 2] > 0]
     share = np.sqrt(CLOUDS / len(d)) / SKY_ERROR
 
@@ -460,7 +457,7 @@ def find_light(
     seen = to_numpy(field.sky(_sent(sky_d, field))).astype(float)
     plain = fit_sky(sky_d, seen, 0.0, lobe=False)
     light = _assembled(plain, shown, 0.0)
-    d = _sent(sphere_directions(DIRECTIONS), field)
+    d = _sent(gathering_directions(), field)
     sky = to_numpy(light.sky(d, field.sky(d)) * (d[:, 2:] > 0)).astype(float)
     few = pairs.selected(np.arange(min(len(pairs.x) // 2, GATHERED_PAIRS)))
     sun = hard_sun(field, gather_light(field, few), sky)

@@ -79,13 +79,13 @@ class ReferenceAlbedo:
         mean, spread = self.at(x, kind), self.spread[kind]
         log = (torch.pi * luma(radiance)).clamp_min(1e-5).log()
         dark, sun = luma(shaded), luma(sunny) - luma(shaded)
-        believed = (1 - TRUST) + (2 * TRUST - 1) * visibility
+        lit_prior = (1 - TRUST) + (2 * TRUST - 1) * visibility
         total = torch.zeros_like(log)
         expected = torch.zeros_like(log)
         for fraction, partial in FRACTIONS:
             # A shadow's soft edge is rare, and blurred by the fit.
             prior = partial + (1 - PARTIAL) * (
-                believed * (fraction == 1.0) + (1 - believed) * (fraction == 0.0)
+                lit_prior * (fraction == 1.0) + (1 - lit_prior) * (fraction == 0.0)
             )
             off = (log - (dark + fraction * sun).log() - mean) / spread
             likely = prior * torch.exp(-0.5 * off.square().clamp_max(60.0))

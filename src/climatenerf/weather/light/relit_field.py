@@ -9,17 +9,15 @@ from dataclasses import dataclass, replace
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.core.samples import Samples
-from climatenerf.field.capabilities import FUSED
-from climatenerf.field.compositing import composited
-from climatenerf.field.protocol import RadianceField, observed
+from climatenerf.field.protocol import observed
+from climatenerf.field.wrapped import WrappedField
 from climatenerf.weather.light.normals import normals_at
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
 from climatenerf.weather.light.scene_light import MOST, SceneLight
 
 
 @dataclass(frozen=True)
-class RelitField:
+class RelitField(WrappedField):
     """A field (`field.protocol.RadianceField`) under another light.
 
     Attributes:
@@ -31,42 +29,10 @@ class RelitField:
             None: geometry alone tells.
     """
 
-    field: RadianceField
     old: SceneLight
     new: SceneLight
     new_sky: bool
     albedo: ReferenceAlbedo | None = None
-
-    @property
-    def near(self) -> float:
-        """Ray length at which camera rays begin, m."""
-        return self.field.near
-
-    @property
-    def bounds(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Lower and upper corner of the box that holds all density, m."""
-        return self.field.bounds
-
-    @property
-    def capabilities(self) -> frozenset[str]:
-        """Those of the field, but for rendering in one launch."""
-        return self.field.capabilities - {FUSED}
-
-    def march(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        t_min: Float[Tensor, "n"],
-        t_max: Float[Tensor, "n"],
-        step_scale: float = 1.0,
-        *,
-        stop: float = 1e-3,
-        pruning_threshold: float | None = None,
-    ) -> Samples:
-        """Samples of the field."""
-        return self.field.march(
-            rays_o, rays_d, t_min, t_max, step_scale, stop=stop, pruning_threshold=pruning_threshold
-        )
 
     def colour(
         self,
@@ -119,38 +85,6 @@ class RelitField:
         """Linear radiance of the sky."""
         return self.new.radiance(d) if self.new_sky else self.field.sky(d, appearance)
 
-    def composite(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        t_min: Float[Tensor, "n"],
-        step_scale: float = 1.0,
-        stop: float = 1e-3,
-        pruning_threshold: float | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
-    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Radiance, transmittance and weighted sum of ray lengths (m), in several launches."""
-        given = t_min, step_scale, stop, pruning_threshold, appearance
-        return composited(self, rays_o, rays_d, *given)
-
-    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Extinction at positions (m), 1/m."""
-        return self.field.density(x)
-
-    def surface_heads(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        samples: Samples,
-        selected: Int[Tensor, "k"],
-    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
-        """Normals and class logits of some samples."""
-        return self.field.surface_heads(rays_o, rays_d, samples, selected)
-
     def observed_only(self) -> "RelitField":
         """The same, without density that no photo shows."""
         return replace(self, field=observed(self.field))
-
-    def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
-        """Appearance of a training photo."""
-        return self.field.photo_appearance(index)

@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from climatenerf.core.srgb import LUMA
+
 # Gradation a, b and indicatrix c, d, e of CIE S 011.
 OVERCAST = (4.0, -0.70, 0.0, -1.0, 0.0)  # type 1
 CLEAR = (-1.0, -0.32, 10.0, -3.0, 0.45)  # type 12
@@ -22,11 +24,11 @@ RAYLEIGH = (0.0635, 0.0973, 0.1925)  # optical depth of clean air upwards at 610
 HAZE = (0.115, 0.131, 0.163)  # of dust and droplets on a clear day: .06 wavelength^-1.3, um
 OZONE = (0.030, 0.025, 0.003)
 SUNLIGHT = (1.05, 0.99, 0.93)  # of the sun above the air, in linear sRGB of luma 1
-LUMA = (0.2126, 0.7152, 0.0722)
 WHITE = (1.0, 1.0, 1.0)
 STORM_TINT = (0.86, 1.0, 1.12)  # thick cloud absorbs red light first
 STORM_SHARE = 0.2  # of an overcast sky's light
-DUSK_ELEVATION = math.radians(-2.5)  # of the sun, unless another one below the horizon is given
+DUSK_ELEVATION = math.radians(-2.5)  # of the sun, unless another one is given
+NIGHT = math.radians(-12.0)  # elevation of the sun below which `dusk` ends
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.srgb import LUMA
 from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.weather.snow.lattice import Deposits, SnowGrid
 from climatenerf.weather.snow.parameters import Snow
@@ -28,7 +29,6 @@ JITTER = 0.05
 """Spread of the fall direction, rad."""
 _CHUNK = 1 << 14  # rays per march
 _STRETCH = 100.0  # spacings; a field's steps may grow along a ray, so rays restart after this
-_LUMA = (0.2126, 0.7152, 0.0722)  # Rec. 709
 
 
 class Light(NamedTuple):
@@ -258,8 +258,8 @@ def _shade(
         return np.zeros(0, np.float32)
     lower, upper = field.bounds
     device = lower.device
-    luma = torch.tensor(_LUMA, device=device)
-    white = max(float(np.dot(light.irradiance_over_pi, _LUMA)), 1e-6)  # black scene: g would be 0/0
+    luma = torch.tensor(LUMA, device=device)
+    white = max(float(np.dot(light.irradiance_over_pi, LUMA)), 1e-6)  # black scene: g would be 0/0
     positions = torch.tensor(cameras, dtype=torch.float32, device=device)
     sun = light.sun_direction
     lift = (snow.depth or 0.0) + max(0.05, spacing)
