@@ -4,8 +4,8 @@ python benchmarks/relight.py RUN
 python benchmarks/relight.py RUN --photo t01.jpg --repeats 5
 
 Rows are frames of one camera at 480 by 270 pixels, in turn, so that other load meets all alike.
-`over_clean` is the ratio of the medians. `prepared_s` is the time until the first frame of a new sky:
-the light of the photos, probes and maps of the sun, nothing of it kept from earlier.
+`over_clean` is the ratio of the medians. `prepared_s` is the time until the first frame, with
+the light of the photos, probes and maps of the sun found anew.
 """
 
 import argparse

@@ -140,3 +140,11 @@ def test_a_flag_for_clarity_replaces_the_files_attenuation():
     mixed = combine(film, flags, given).at(0)
     assert mixed.flood.attenuation is None and mixed.flood.clarity == 2.0
     assert combine(film, flags, frozenset()).at(0).flood.attenuation == (0.1, 0.2, 0.3)
+
+
+def test_a_word_in_keyframes_holds_until_the_next():
+    film = weather_from_table({"sky": {"kind": {"0 s": "captured", "2 s": "overcast"}}})
+    kinds = [film.at(time).sky.kind for time in (0.0, 1.9, 2.0, 5.0)]
+    assert kinds == ["captured", "captured", "overcast", "overcast"]
+    with pytest.raises(UserError, match="must be one of captured, overcast"):
+        weather_from_table({"sky": {"kind": {"0 s": "sunny"}}})

@@ -121,3 +121,15 @@ def test_smoke_takes_the_sun_and_reddens_it():
     red, green, blue = sun_transmittance(Smog(sigma=0.01, kind="smoke", top=300.0), 0.01, 0.7)
     assert 0 < blue < green < red < 0.3
     assert sun_transmittance(Smog(sigma=0.0, kind="smoke"), 0.0, 0.7) == (1.0, 1.0, 1.0)
+
+
+def test_ambient_is_the_even_part_of_what_particles_scatter():
+    smog = Smog(sigma=0.02, albedo=(0.9, 0.9, 0.9), asymmetry=0.6)
+    source = lit(smog, EvenLight(0.5)).source(*ray(0, 1, 0))
+    np.testing.assert_allclose(source, 0.5 * 0.9 * 0.4 / (1 - 0.9 * 0.6), rtol=1e-5)
+
+
+def test_a_level_ray_leaves_thin_smog():
+    endless = torch.tensor([torch.inf])
+    thin = media.attenuate([lit(Smog(sigma=1e-8))], torch.ones(1, 3), *ray(0, 1, 0), endless)
+    assert float((1 - thin).abs().max()) < 1 / 255

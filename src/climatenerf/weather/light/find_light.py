@@ -16,6 +16,7 @@ from torch import Tensor
 from climatenerf.core.classes import PERSON, SKY, VEGETATION, VEHICLE
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.srgb import LUMA
+from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.scene.photo_rays import PhotoRays
@@ -117,7 +118,8 @@ def find_pairs(
         count: number of pairs wanted.
         rng: source of randomness.
     """
-    found = [_neighbours(photo, TRIES * count // len(photos) + 1, rng) for photo in photos]
+    tries, classes = TRIES * count // len(photos) + 1, CLASSES in field.capabilities
+    found = [_neighbours(photo, tries, classes, rng) for photo in photos]
     x, d, eye, normal = (np.concatenate([pair[k] for pair in found]) for k in range(4))
     if len(x) < MIN_PAIRS:
         return None
@@ -145,9 +147,12 @@ def _sent(values: np.ndarray, field: RadianceField) -> Tensor:
 
 
 def _neighbours(
-    photo: PhotoRays, count: int, rng: np.random.Generator
+    photo: PhotoRays, count: int, classes: bool, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Ends, directions, eyes and normals of pairs of pixels that show one plane of one class."""
+    """Ends, directions, eyes and normals of pairs of pixels that show one plane of one class.
+
+    Without `classes` the labels of a field that has learned none are left out.
+    """
     height, width = photo.t.shape
     row, column = rng.integers(height, size=count), rng.integers(width, size=count)
     shift = rng.integers(-APART, APART + 1, (count, 2))
@@ -162,8 +167,10 @@ def _neighbours(
         gap = x[:, 1] - x[:, 0]
         distance = np.linalg.norm(gap, axis=-1)
         aside = np.abs((gap * normal[:, 0]).sum(-1))
-    usable = np.isfinite(t).all(1) & (t.max(1) < FAR) & (label[:, 0] == label[:, 1])
-    usable &= ~np.isin(label[:, 0], (PERSON, VEHICLE, SKY, VEGETATION))
+    usable = np.isfinite(t).all(1) & (t.max(1) < FAR)
+    if classes:
+        usable &= label[:, 0] == label[:, 1]
+        usable &= ~np.isin(label[:, 0], (PERSON, VEHICLE, SKY, VEGETATION))
     usable &= (normal[:, 0] * normal[:, 1]).sum(-1) > ALIKE
     usable &= (distance > NEAR_PAIR) & (distance < FAR_PAIR) & (aside < 0.15 * distance)
     eye = np.broadcast_to(photo.c2w[:3, 3], x.shape)

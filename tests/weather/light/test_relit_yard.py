@@ -1,0 +1,191 @@
+"""Light in a yard photographed in the sun: found, replaced, and changed by weather."""
+
+import numpy as np
+import pytest
+import torch
+from support.sunlit_yard import (
+    SUN,
+    TO_SUN,
+    in_sun,
+    sunlit_yard,
+    without_sun,
+    yard_scene,
+)
+
+from climatenerf.core.errors import UserError
+from climatenerf.render.session import RenderSession
+from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.light.relit_field import RelitField
+from climatenerf.weather.light.sun_map import sun_map
+from climatenerf.weather.world import Kept
+
+ACROSS = torch.tensor([[x, y, 0.0] for x in np.linspace(-5, 3, 81) for y in (0.0, 0.4)]).float()
+DOWN = torch.tensor([[0.0, 0.0, -1.0]])
+
+
+def session(field, **table):
+    return RenderSession(field, yard_scene(), weather_from_table(table))
+
+
+@pytest.fixture(scope="module")
+def overcast():
+    return session(sunlit_yard(), sky={"kind": "overcast"})
+
+
+def ground(field):
+    """Luma of open ground along a line that the block's shadow and the block cross."""
+    x = ACROSS[(ACROSS[:, 0] < -2.3) | (ACROSS[:, 0] > 0.3)]
+    return x, field.colour(x, DOWN.expand_as(x))[:, 0]
+
+
+def test_the_map_of_the_sun_equals_the_shadows_in_closed_form():
+    found = sun_map(sunlit_yard(), TO_SUN, np.array([0.0, 0.0, 1.0]))
+    rng = np.random.default_rng(0)
+    x = torch.tensor(np.c_[rng.uniform(-9, 9, (2000, 2)), np.zeros(2000)]).float()
+    up = torch.tensor([0.0, 0.0, 0.15])
+    expected = in_sun(x + up)
+    wrong = (found.visibility(x + up) - expected).abs()
+    assert 0.1 < float(1 - expected.mean()) < 0.6
+    assert float((wrong > 0.5).float().mean()) < 0.04, "the edges of the shadows alone"
+    far = torch.tensor([[300.0, 0.0, 0.0]])
+    assert float(found.visibility(far)) == 1.0
+
+
+def test_the_sun_of_the_yard_is_found(overcast):
+    overcast.world(0.0)
+    light = overcast._entities["sky"].captured
+    assert light.hard
+    assert np.degrees(np.arccos(light.sun @ TO_SUN)) < 4.0
+    # The yard's shade is as bright beside the block as in the open, so the sun seems weaker.
+    np.testing.assert_allclose(light.lobe, SUN, rtol=0.3)
+
+
+def test_the_shadow_goes_with_the_sun(overcast):
+    """In the photos the ground is up to 2.3 times as bright beside the shadow; relit it is even."""
+    x, before = ground(sunlit_yard())
+    world = overcast.world(0.0)
+    assert isinstance(world.field, RelitField)
+    after = world.field.colour(x, DOWN.expand_as(x))[:, 0]
+    assert float(before.quantile(0.9) / before.quantile(0.1)) > 2.0
+    assert float(after.quantile(0.9) / after.quantile(0.1)) < 1.45
+    true = ground(without_sun())[1]
+    ratio = (after / true).numpy()
+    assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.1
+
+
+def test_a_new_sun_casts_the_shadow_elsewhere():
+    opposite = {"elevation": "45 deg", "azimuth": "315 deg"}
+    world = session(sunlit_yard(), sky={"kind": "clear"}, sun=opposite).world(0.0)
+    to_sun = np.array([-0.5, 0.5, np.sqrt(0.5)])
+    x, _ = ground(sunlit_yard())
+    lit = in_sun(x + torch.tensor([0.0, 0.0, 0.1]), to_sun).bool()
+    colour = world.field.colour(x, DOWN.expand_as(x))[:, 0]
+    assert lit.any() and (~lit).any()
+    assert float(colour[lit].median()) > 1.8 * float(colour[~lit].median())
+
+
+def test_exposure_is_kept_on_average_and_ev_doubles_it(overcast):
+    x = torch.cat([ACROSS, torch.tensor([[x, 5.99, 2.0] for x in np.linspace(-6, 6, 40)]).float()])
+    d = torch.where(x[:, 1:2] > 5, torch.tensor([[0.0, 1.0, 0.0]]), DOWN)
+    before = sunlit_yard().colour(x, d).mean()
+    kept = overcast.world(0.0).field.colour(x, d).mean()
+    assert 0.6 < float(kept / before) < 1.4
+    twice = session(sunlit_yard(), sky={"kind": "overcast", "ev": 1.0}).world(0.0)
+    assert float(twice.field.colour(x, d).mean() / kept) == pytest.approx(2.0, rel=0.01)
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    assert float(twice.field.sky(up)[0, 0] / overcast.world(0.0).field.sky(up)[0, 0]) == (
+        pytest.approx(2.0, rel=0.01)
+    )
+
+
+def test_light_that_stays_is_bit_identical():
+    """Nothing is found or gathered for a clean frame, and the field is the given one."""
+    field, scene = sunlit_yard(), yard_scene()
+    clean = session(field)
+    world = clean.world(0.0)
+    assert world.field is field and world.light is None
+    assert "captured" not in clean._entities["sky"].__dict__
+    flooded = session(field, flood={"level": "0.2 m"})
+    world = flooded.world(0.0)
+    assert world.field is field and world.light is not None
+    camera, pose = scene.cameras[0].resized(40, 25), scene.c2w_world(scene.views[0])
+    none = session(field, smog={"sigma": "0 1/m"}, snow={"depth": "0 m"}).frame(camera, pose)
+    np.testing.assert_array_equal(none.linear, clean.frame(camera, pose).linear)
+
+
+def test_the_photos_own_sun_keeps_its_shadows_under_snow():
+    """Snow brightens the wall, and the shadow's edge stays where the photo has it."""
+    field = sunlit_yard()
+    world = session(field, snow={"depth": "10 cm"}).world(0.0)
+    x, before = ground(field)
+    after = world.field.colour(x, DOWN.expand_as(x))[:, 0]
+    ratio = after / before
+    assert float(ratio.max() / ratio.min()) < 1.35, "no second edge beside the photo's"
+    wall = torch.tensor([[-4.0, 5.99, 1.0]])
+    ahead = torch.tensor([[0.0, 1.0, 0.0]])
+    brighter = world.field.colour(wall, ahead) / field.colour(wall, ahead)
+    assert 1.05 < float(brighter[0, 0]) < 2.0
+
+
+def test_snow_and_mud_receive_the_light_of_their_place():
+    field = sunlit_yard()
+    world = session(field, snow={"depth": "10 cm"}).world(0.0)
+    (snow,) = world.matters
+    assert snow.place_light is world.light
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
+    places = torch.tensor([[-6.0, -5.0, 0.1], [5.0, 0.0, 0.1]])  # in the open, below the roof
+    light = world.light.irradiance(places, up)
+    assert float(light[1, 0] / light[0, 0]) < 0.75
+    muddy = session(field, flood={"level": "0.1 m", "clarity": "5 cm", "wind-speed": "0 m/s"})
+    world = muddy.world(0.0)
+    (water,) = world.surfaces
+    received = water._irradiance_at(world, places)
+    assert float(received[1, 0] / received[0, 0]) < 0.75
+
+
+def test_faint_smog_in_the_sun_changes_nothing():
+    field, scene = sunlit_yard(), yard_scene()
+    camera, pose = scene.cameras[0].resized(40, 25), scene.c2w_world(scene.views[0])
+    clean = session(field).frame(camera, pose)
+    hazy = session(field, smog={"visibility": "10000 km"}).frame(camera, pose)
+    assert np.abs(hazy.picture.astype(int) - clean.picture.astype(int)).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("sky", "elevation", "message"),
+    [
+        ("clear", "-3 deg", "needs the sun above the horizon"),
+        ("dusk", "30 deg", "from -12 deg to 0 deg"),
+        ("dusk", "-40 deg", "from -12 deg to 0 deg"),
+    ],
+)
+def test_a_sun_that_does_not_belong_to_its_sky_is_refused(sky, elevation, message):
+    with pytest.raises(UserError, match=message):
+        session(sunlit_yard(), sky={"kind": sky}, sun={"elevation": elevation})
+
+
+def test_photos_that_show_too_little_are_refused_in_one_sentence():
+    from climatenerf.field.analytic import AnalyticField
+
+    plain = AnalyticField(sunlit_yard().solids)
+    with pytest.raises(UserError, match="needs the light of the photos"):
+        session(plain, sky={"kind": "overcast"}).world(0.0)
+
+
+def test_the_light_is_kept_with_the_run(tmp_path):
+    table = {"flood": {"level": "0.1 m"}}
+    first = RenderSession(
+        sunlit_yard(), yard_scene(), weather_from_table(table), kept=Kept(tmp_path, "a")
+    )
+    first.world(0.0)
+    written = (tmp_path / "light.json").read_bytes()
+    moved = written.replace(b'"checkpoint": "a"', b'"checkpoint": "b"')
+    assert moved != written
+    again = RenderSession(
+        sunlit_yard(), yard_scene(), weather_from_table(table), kept=Kept(tmp_path, "a")
+    )
+    again.world(0.0)
+    assert (tmp_path / "light.json").read_bytes() == written
+    np.testing.assert_allclose(
+        again._entities["sky"].captured.sun, first._entities["sky"].captured.sun
+    )
