@@ -134,9 +134,9 @@ class LightEntity:
             radiance = field.colour(x, d, appearance=self._given.appearance)
             normal, kind = normals_at(field, x, d)
             (shaded,) = SceneLight.shaded((old,), x, normal)
-            sunny = shaded + old.full_sun(normal)
-            lit = old.visibility(x, normal)
-            self._reference = estimate(radiance, x, kind, shaded, sunny, lit)
+            sun, lit = old.full_sun(normal), old.visibility(x, normal)
+            beam = old.sun_irradiance
+            self._reference = estimate(radiance, x, kind, shaded, sun, beam, lit)
         return self._reference
 
     # --- one moment ---------------------------------------------------------------------------

@@ -6,6 +6,7 @@ albedo. It is wrong for what is glossy, and for what photos clip.
 
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -14,6 +15,8 @@ from climatenerf.field.wrapped import WrappedField
 from climatenerf.weather.light.normals import normals_at
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
 from climatenerf.weather.light.scene_light import MOST, SceneLight
+
+SHARED = 0.4  # m along a ray, within which samples share the change of their light
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,12 @@ class RelitField(WrappedField):
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance under the new light."""
         colour = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
-        along = d if ray is None else d[ray]
-        normal, kind = normals_at(self.field, x, along)
-        return colour * self.ratio(colour, x, normal, kind)
+        if ray is None:
+            return colour * self.ratio(colour, x, *normals_at(self.field, x, d))
+        middle, group = shared_lookups(x, d, ray)
+        place, along = x[middle], d[ray[middle]]
+        ratio = self.ratio(colour[middle], place, *normals_at(self.field, place, along))
+        return colour * ratio[group]
 
     def ratio(
         self,
@@ -68,16 +74,17 @@ class RelitField(WrappedField):
         if self.old.sun is None:
             new = new + self.new.direct(x, normal)
             return (new / old).clamp(1 / MOST, MOST)
-        lit = self.old.visibility(x, normal)
-        full = self.old.full_sun(normal)
-        if self.albedo is not None:
-            lit = self.albedo.lit(radiance, x, kind, old, old + full, lit)
+        lit, full = self.old.visibility(x, normal), self.old.full_sun(normal)
+        if self.albedo is None:
+            direct = lit[:, None] * full
+        else:
+            beam = self.old.sun_irradiance
+            direct = self.albedo.sunlight(radiance, x, kind, old, full, beam, lit)
         if self.new.sun is self.old.sun:  # the sun of the photos keeps its shadows
-            new = new + lit[:, None] * self.new.full_sun(normal)
+            new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
         else:
             new = new + self.new.direct(x, normal)
-        old = old + lit[:, None] * full
-        return (new / old).clamp(1 / MOST, MOST)
+        return (new / (old + direct)).clamp(1 / MOST, MOST)
 
     def sky(
         self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None
@@ -88,3 +95,24 @@ class RelitField(WrappedField):
     def observed_only(self) -> "RelitField":
         """The same, without density that no photo shows."""
         return replace(self, field=observed(self.field))
+
+
+def shared_lookups(
+    x: Float[Tensor, "s 3"], d: Float[Tensor, "n 3"], ray: Int[Tensor, "s"]
+) -> tuple[Int[Tensor, "g"], Int[Tensor, "s"]]:
+    """Group the samples of each ray that lie within `SHARED` of each other.
+
+    Args:
+        x: positions, sorted by ray and by depth.
+        d: unit directions of the rays.
+        ray: of each sample.
+
+    Returns:
+        The index of each group's middle sample, and the group of each sample.
+    """
+    cell = ((x * d[ray]).sum(-1) / SHARED).floor()
+    first = torch.ones_like(ray, dtype=torch.bool)
+    first[1:] = (cell[1:] != cell[:-1]) | (ray[1:] != ray[:-1])
+    start = first.nonzero()[:, 0]
+    end = torch.cat([start[1:], start.new_tensor([len(ray)])])
+    return (start + end - 1) // 2, first.cumsum(0) - 1

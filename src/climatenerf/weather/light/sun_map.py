@@ -16,6 +16,7 @@ from torch import Tensor
 from climatenerf.core.device import to_device
 from climatenerf.field.compositing import chunks
 from climatenerf.field.protocol import RadianceField, device_of
+from climatenerf.ops import relighting
 
 TEXELS = 768  # along a side of a map
 FINE, COARSE = 20.0, 80.0  # m, half sides of the maps across the sun's rays
@@ -43,40 +44,14 @@ class SunMap:
     axes: Float[Tensor, "3 3"]
     centre: Float[Tensor, "3"]
     half: tuple[float, ...]
-    depths: tuple[Float[Tensor, "rows columns 2"], ...]
+    depths: Float[Tensor, "maps rows columns 2"]
 
     def visibility(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Fraction of the sun's light that reaches positions (world m); 1 beyond the maps."""
+        texels = self.depths.shape[1] - 1
+        bias = tuple(BIAS + 2 * half / texels for half in self.half)
         at = (x - self.centre) @ self.axes.T
-        result = torch.ones_like(at[:, 0])
-        todo = torch.ones_like(result, dtype=torch.bool)
-        for half, depths in zip(self.half, self.depths, strict=True):
-            texel = 2 * half / (TEXELS - 1)
-            place = (at[:, :2] + half) / texel
-            inside = todo & ((place >= 0) & (place < TEXELS - 1)).all(-1)
-            rows = inside.nonzero()[:, 0]
-            result[rows] = _lookup(depths, place[rows], at[rows, 2], BIAS + texel)
-            todo &= ~inside
-        return result
-
-
-def _lookup(
-    depths: Float[Tensor, "rows columns 2"],
-    place: Float[Tensor, "n 2"],
-    depth: Float[Tensor, "n"],
-    bias: float,
-) -> Float[Tensor, "n"]:
-    corner = place.long()
-    u, v = (place - corner).unbind(-1)
-    total = torch.zeros_like(depth)
-    for dv, wv in ((0, 1 - v), (1, v)):
-        for du, wu in ((0, 1 - u), (1, u)):
-            first, last = depths[corner[:, 1] + dv, corner[:, 0] + du].unbind(-1)
-            first, last = first + bias, last + 2 * bias
-            passed = 1 - (depth - first) / (last - first)
-            passed = torch.where(first.isinf(), 1.0, passed.nan_to_num(0.0)).clamp(0, 1)
-            total = total + wu * wv * passed
-    return total
+        return relighting.visibility(self.depths, self.half, bias, at)
 
 
 @torch.no_grad()
@@ -106,7 +81,7 @@ def sun_map(
         to_device(axes.astype(np.float32), device),
         to_device(np.asarray(centre, np.float32), device),
         (FINE, COARSE),
-        tuple(maps),
+        torch.stack(maps),
     )
 
 
