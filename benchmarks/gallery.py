@@ -7,6 +7,7 @@ python benchmarks/gallery.py ditch RUN --surfaces
 python benchmarks/gallery.py street-busy RUN --passers-by
 python benchmarks/gallery.py ditch RUN --ground --level=-1.5m --columns 2
 python benchmarks/gallery.py street-hard RUN --before EARLIER --columns 2
+python benchmarks/gallery.py street-sun RUN --light --columns 3
 
 Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
 smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
@@ -14,7 +15,8 @@ shows colours, depth, normals and classes of held-out views. With --passers-by, 
 shows the most masked photos, the mask in red, and the field from the same cameras. With --ground,
 NAME-ground.jpg shows photos' cameras turned down by 15 degrees, clean and flooded, without and with
 completed ground. With --before, NAME-before-after.jpg shows each weather in an earlier run and in
-this one; levels count from the datum of each.
+this one; levels count from the datum of each. With --light, NAME-light.jpg shows the place in the
+light of the photos, under other skies, in fog and under snow.
 """
 
 import argparse
@@ -54,12 +56,32 @@ Rows = list[tuple[str, list[np.ndarray]]]
 
 
 def weathers(run: Path, options: argparse.Namespace) -> Rows:
-    """Render frames along the path in each weather with the command line."""
+    """Render frames along the path in each weather."""
     flood = ["--flood.level", options.level]
     smog = ["--smog.visibility", options.visibility]
     snow = ["--snow.depth", options.snow]
     flags = {"clean": [], "flood": flood, "smog": smog, "snow": snow}
     flags["all"] = [*flood, *smog, *snow]
+    return along_path(run, options, flags)
+
+
+def light(run: Path, options: argparse.Namespace) -> Rows:
+    """Render frames along the path under other skies."""
+    overcast = ["--sky.kind", "overcast"]
+    low_sun = ["--sun.elevation", "12 deg", "--sun.azimuth", options.azimuth]
+    flags = {
+        "captured": [],
+        "overcast": overcast,
+        "low sun": ["--sky.kind", "clear", *low_sun],
+        "dusk": ["--sky.kind", "dusk"],
+        "fog": ["--smog.kind", "fog", "--smog.visibility", options.visibility],
+        "snow, overcast": ["--snow.depth", options.snow, *overcast],
+    }
+    return along_path(run, options, flags)
+
+
+def along_path(run: Path, options: argparse.Namespace, flags: dict[str, list[str]]) -> Rows:
+    """Render frames along the path with the command line, for each set of flags."""
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         for label, args in flags.items():
@@ -159,6 +181,7 @@ def main() -> None:
     parser.add_argument("--level", default="0.5 m")
     parser.add_argument("--visibility", default="40 m")
     parser.add_argument("--snow", default="15 cm")
+    parser.add_argument("--azimuth", default="60 deg", help="of the low sun")
     parser.add_argument("--size", default="384x216")
     parser.add_argument("--path", default="training")
     parser.add_argument("--columns", type=int, default=4)
@@ -168,6 +191,7 @@ def main() -> None:
     kinds.add_argument("--surfaces", action="store_true")
     kinds.add_argument("--passers-by", action="store_true")
     kinds.add_argument("--ground", action="store_true")
+    kinds.add_argument("--light", action="store_true")
     kinds.add_argument("--before", type=Path, metavar="RUN", help="an earlier run")
     options = parser.parse_args()
     name = options.name
@@ -177,12 +201,14 @@ def main() -> None:
         name, rows = f"{name}-passers-by", passers_by(options.run, options.columns)
     elif options.ground:
         name, rows = f"{name}-ground", ground(options.run, options)
+    elif options.light:
+        name, rows = f"{name}-light", light(options.run, options)
     elif options.before:
         name += "-before-after"
         rows = before_after(options.before, options.run, options)
     else:
         rows = weathers(options.run, options)
-    width = 480 if options.ground or options.before else 320
+    width = 480 if options.ground or options.before or options.light else 320
     sheet = contact_sheet(rows, options.columns, cell_width=width)
     path = options.out / f"{name}.jpg"
     size = write_jpeg(path, sheet, max_bytes=150_000)

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -13,6 +13,7 @@ from climatenerf.cli import progress
 from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.input_limits import MAX_FRAMES
+from climatenerf.core.storage import read_json
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
 from climatenerf.weather.effect import Effect
@@ -107,6 +108,7 @@ def run(
         progress.warn(f"--{name} changes nothing without {absent}")
 
     from climatenerf.api import load_run, render_movie
+    from climatenerf.output.render_folder import SIDECAR
 
     run = load_run(options.run, device=options.device)
     check_out(options.out, options.run, run.scene)
@@ -131,8 +133,25 @@ def run(
             note=progress.say,
             effects=used,
         )
+    if part is None:
+        say_light(read_json(options.out / SIDECAR))
     progress.result(f"{'movie' if part is None else 'frames'}: {made}")
     return 0
+
+
+def say_light(sidecar: dict[str, Any]) -> None:
+    """Print where the sun of the photos was found, if the weather needed their light."""
+    if "photos_sun_elevation_deg" not in sidecar:
+        return
+    elevation, azimuth, error = (
+        sidecar[f"photos_sun_{name}_deg"] for name in ("elevation", "azimuth", "error")
+    )
+    place = f"{elevation:.0f} deg high at azimuth {azimuth:.0f} deg"
+    text = f"sun of the photos: {place} (+-{error:.0f} deg)"
+    difference = sidecar.get("photos_sun_from_almanac_deg")
+    if difference is not None:
+        text += f"; {difference:.1f} deg from the sun of their date, time and place"
+    progress.say(text)
 
 
 def check_out(out: Path, run: Path, scene: Scene) -> None:

@@ -47,7 +47,7 @@ from climatenerf.render.volume import camera_rays
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.surface import Water
-from climatenerf.weather.light.captured import open_sheet
+from climatenerf.weather.light.captured import UnknownLight, open_sheet
 from climatenerf.weather.light.file import light_of_photos_in
 from climatenerf.weather.light.parameters import Sun
 from climatenerf.weather.light.sun import sun_direction
@@ -231,9 +231,9 @@ def light_scores(run: EvaluatedRun) -> dict[str, float]:
     if true is None or NORMALS not in run.field.capabilities:
         return {"sheet_error": nothing, "sun_deg": nothing}
     light = light_of_photos_in(
-        run.kept, run.field, lambda: trace_photos(observed(run.field), run.scene)
+        run.kept, run.scene, run.field, lambda: trace_photos(observed(run.field), run.scene)
     )
-    if light is None:
+    if isinstance(light, UnknownLight):
         return {"sheet_error": nothing, "sun_deg": nothing}
     sheet = open_sheet(light, run.field)
     angle = nothing

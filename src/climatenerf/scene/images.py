@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from PIL import ExifTags, Image
 
 from climatenerf.core import arrays
 from climatenerf.core.cameras import Camera
@@ -113,6 +113,18 @@ def focal_35mm(path: Path) -> float | None:
     except (*_IMAGE_ERRORS, TypeError, ZeroDivisionError, UserError):
         return None
     return number if 0 < number < 1e4 else None
+
+
+def read_exif_of(path: Path) -> Image.Exif | None:
+    """Return a photo's EXIF; None if the photo is unreadable."""
+    try:
+        with open_image(path) as image:
+            exif = _exif(image)
+            for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo):
+                exif.get_ifd(part)  # read while the file is open
+            return exif
+    except (*_IMAGE_ERRORS, TypeError, ZeroDivisionError, UserError):
+        return None
 
 
 def _exif(image: Image.Image) -> Image.Exif:

@@ -9,7 +9,13 @@ import torch
 from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import AnalyticField, Box, HalfSpace
 from climatenerf.weather.light import find_light as finding
-from climatenerf.weather.light.captured import COLUMNS, ROWS, CapturedLight, elevation_azimuth
+from climatenerf.weather.light.captured import (
+    COLUMNS,
+    ROWS,
+    CapturedLight,
+    UnknownLight,
+    elevation_azimuth,
+)
 from climatenerf.weather.light.file import load_light, save_light
 from climatenerf.weather.light.find_light import (
     Pairs,
@@ -43,7 +49,8 @@ def sunlit_yard(sun, count=1200):
     x = x[free].reshape(-1, 3)
     normal = np.tile([0.0, 0.0, 1.0], (len(x), 1))
     sky = np.where(finding.gathering_directions()[:, 2:] > 0, 1.0, 0.0).repeat(3, axis=1)
-    dark = Pairs(x, normal, np.ones_like(x))
+    late = np.arange(len(x)) >= len(x) // 4 * 2
+    dark = Pairs(x, normal, np.ones_like(x), late)
     ambient = gather_light(field, dark).ambient(sky)
     o = torch.tensor(x + 0.01 * normal, dtype=torch.float32)
     d = torch.tensor(sun, dtype=torch.float32).expand_as(o).contiguous()
@@ -54,7 +61,7 @@ def sunlit_yard(sun, count=1200):
     lit = ~hit.numpy()
     albedo = 0.15 * np.exp(0.12 * rng.standard_normal((len(x), 1)))
     radiance = albedo / np.pi * (ambient + lit[:, None] * STRENGTH * sun[2])
-    return field, Pairs(x, normal, radiance), sky
+    return field, Pairs(x, normal, radiance, late), sky
 
 
 @pytest.mark.parametrize(("elevation", "azimuth"), [(40, 218), (25, 80)])
@@ -72,9 +79,25 @@ def test_no_sun_is_found_under_an_even_sky():
     field, pairs, sky = sunlit_yard(direction(40, 218))
     even = gather_light(field, pairs).ambient(sky)
     texture = np.exp(0.25 * np.random.default_rng(1).standard_normal((len(even), 1)))
-    plain = Pairs(pairs.x, pairs.normal, 0.15 / np.pi * even * texture)
+    plain = Pairs(pairs.x, pairs.normal, 0.15 / np.pi * even * texture, pairs.late)
     found = hard_sun(field, gather_light(field, plain), sky)
     assert found.gain < finding.MIN_GAIN
+
+
+def test_two_halves_of_the_photos_under_two_suns_contradict_each_other():
+    field, morning, sky = sunlit_yard(direction(35, 110))
+    _, evening, _ = sunlit_yard(direction(35, 250))
+    mixed = np.where(morning.late[:, None], evening.radiance, morning.radiance)
+    pairs = Pairs(morning.x, morning.normal, mixed, morning.late)
+    halves = hard_sun(field, gather_light(field, pairs), sky).halves
+    assert halves is not None
+    azimuths = [np.degrees(elevation_azimuth(sun)[1]) for sun in halves]
+    np.testing.assert_allclose(azimuths, [110, 250], atol=12)
+    assert hard_sun(field, gather_light(field, morning), sky).halves is None
+    shuffled = np.random.default_rng(2).permutation(len(mixed) // 2).repeat(2) % 2 == 0
+    mixed = np.where(shuffled[:, None], evening.radiance, morning.radiance)
+    pairs = Pairs(morning.x, morning.normal, mixed, morning.late)
+    assert hard_sun(field, gather_light(field, pairs), sky).halves is None, "not by halves"
 
 
 def lobe_sky(d, elevation=35.0, azimuth=100.0, width=20.0, peak=4.0):
@@ -125,15 +148,17 @@ def test_photographed_sky_is_kept_where_it_is_shown_and_not_clipped():
 def test_the_file_gives_back_the_same_light(tmp_path, width):
     shown = np.round(np.random.default_rng(0).random((ROWS, COLUMNS)), 3)
     light = CapturedLight(
-        np.array([0.3, 0.4, 0.5]), np.ones(3), direction(40, 218), width, STRENGTH, shown, 0.02
-    )
+        np.array([0.3, 0.4, 0.5]), np.ones(3), direction(40, 218), width, STRENGTH, shown, 0.02,
+        direction(41, 216),
+    )  # fmt: skip
     save_light(tmp_path / "light.json", light, "abc")
     again, checkpoint = load_light(tmp_path / "light.json")
     assert checkpoint == "abc" and again is not None and again.hard == (width == 0.0)
-    for name in ("horizon", "zenith", "sun", "width", "lobe", "shown", "sun_error"):
+    for name in ("horizon", "zenith", "sun", "width", "lobe", "shown", "sun_error", "almanac"):
         np.testing.assert_allclose(getattr(again, name), getattr(light, name), atol=1e-9)
-    save_light(tmp_path / "light.json", None, "abc")
-    assert load_light(tmp_path / "light.json") == (None, "abc")
+    unknown = UnknownLight("the photos show too little sky")
+    save_light(tmp_path / "light.json", unknown, "abc")
+    assert load_light(tmp_path / "light.json") == (unknown, "abc")
     for damaged in ('{"light": {"horizon": [1]}, "checkpoint": ""}', '{"light": 3}'):
         (tmp_path / "light.json").write_text(damaged)
         with pytest.raises(UserError, match=r"light\.json is damaged"):

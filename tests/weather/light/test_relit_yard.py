@@ -1,5 +1,7 @@
 """Light in a yard photographed in the sun: found, replaced, and changed by weather."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,8 +15,12 @@ from support.sunlit_yard import (
 )
 
 from climatenerf.core.errors import UserError
+from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.session import RenderSession
 from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.light import find_light as finding
+from climatenerf.weather.light import sun_map as sun_maps
+from climatenerf.weather.light.captured import UnknownLight
 from climatenerf.weather.light.relit_field import RelitField
 from climatenerf.weather.light.sun_map import sun_map
 from climatenerf.weather.world import Kept
@@ -27,9 +33,22 @@ def session(field, **table):
     return RenderSession(field, yard_scene(), weather_from_table(table))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_maps():
+    """Coarser maps of the sun: the yard is small, and marched in PyTorch."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sun_maps, "TEXELS", 320)
+        yield
+
+
 @pytest.fixture(scope="module")
 def overcast():
     return session(sunlit_yard(), sky={"kind": "overcast"})
+
+
+@pytest.fixture(scope="module")
+def snowy():
+    return session(sunlit_yard(), snow={"depth": "10 cm"}).world(0.0)
 
 
 def ground(field):
@@ -104,7 +123,7 @@ def test_light_that_stays_is_bit_identical():
     clean = session(field)
     world = clean.world(0.0)
     assert world.field is field and world.light is None
-    assert "captured" not in clean._entities["sky"].__dict__
+    assert "_found" not in clean._entities["sky"].__dict__
     flooded = session(field, flood={"level": "0.2 m"})
     world = flooded.world(0.0)
     assert world.field is field and world.light is not None
@@ -113,28 +132,26 @@ def test_light_that_stays_is_bit_identical():
     np.testing.assert_array_equal(none.linear, clean.frame(camera, pose).linear)
 
 
-def test_the_photos_own_sun_keeps_its_shadows_under_snow():
+def test_the_photos_own_sun_keeps_its_shadows_under_snow(snowy):
     """Snow brightens the wall, and the shadow's edge stays where the photo has it."""
     field = sunlit_yard()
-    world = session(field, snow={"depth": "10 cm"}).world(0.0)
     x, before = ground(field)
-    after = world.field.colour(x, DOWN.expand_as(x))[:, 0]
+    after = snowy.field.colour(x, DOWN.expand_as(x))[:, 0]
     ratio = after / before
     assert float(ratio.max() / ratio.min()) < 1.35, "no second edge beside the photo's"
     wall = torch.tensor([[-4.0, 5.99, 1.0]])
     ahead = torch.tensor([[0.0, 1.0, 0.0]])
-    brighter = world.field.colour(wall, ahead) / field.colour(wall, ahead)
+    brighter = snowy.field.colour(wall, ahead) / field.colour(wall, ahead)
     assert 1.05 < float(brighter[0, 0]) < 2.0
 
 
-def test_snow_and_mud_receive_the_light_of_their_place():
+def test_snow_and_mud_receive_the_light_of_their_place(snowy):
     field = sunlit_yard()
-    world = session(field, snow={"depth": "10 cm"}).world(0.0)
-    (snow,) = world.matters
-    assert snow.place_light is world.light
+    (snow,) = snowy.matters
+    assert snow.place_light is snowy.light
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
     places = torch.tensor([[-6.0, -5.0, 0.1], [5.0, 0.0, 0.1]])  # in the open, below the roof
-    light = world.light.irradiance(places, up)
+    light = snowy.light.irradiance(places, up)
     assert float(light[1, 0] / light[0, 0]) < 0.75
     muddy = session(field, flood={"level": "0.1 m", "clarity": "5 cm", "wind-speed": "0 m/s"})
     world = muddy.world(0.0)
@@ -170,6 +187,32 @@ def test_photos_that_show_too_little_are_refused_in_one_sentence():
     plain = AnalyticField(sunlit_yard().solids)
     with pytest.raises(UserError, match="needs the light of the photos"):
         session(plain, sky={"kind": "overcast"}).world(0.0)
+
+
+def test_photos_without_sky_or_ground_say_so():
+    field = sunlit_yard()
+    photos = trace_photos(field, yard_scene())
+    dark = [replace(photo, transmittance=0 * photo.transmittance) for photo in photos]
+    assert finding.find_light(field, dark) == UnknownLight("the photos show too little sky")
+    empty = [
+        replace(photo, t=photo.t + np.inf, transmittance=0 * photo.transmittance + 1)
+        for photo in photos
+    ]
+    found = finding.find_light(field, empty)
+    assert isinstance(found, UnknownLight) and "too little ground" in found.reason
+
+
+def test_two_suns_are_refused_in_one_sentence(monkeypatch):
+    """That they are noticed is tested in test_find_light."""
+    east, west = np.array([0.6, 0.0, 0.8]), np.array([-0.6, 0.0, 0.8])
+    two = finding.HardSun(east, 0.1, 0.5, (east, west))
+    monkeypatch.setattr(finding, "hard_sun", lambda *given: two)
+    with pytest.raises(UserError) as refused:
+        session(sunlit_yard(), sky={"kind": "overcast"}).world(0.0)
+    text = str(refused.value)
+    assert "contradict one sun: up to 5.png it stands 53 deg high at azimuth 90 deg" in text
+    assert "from there on 53 deg high at azimuth 270 deg" in text
+    session(sunlit_yard(), flood={"level": "0.1 m"}).world(0.0)
 
 
 def test_the_light_is_kept_with_the_run(tmp_path):

@@ -37,6 +37,7 @@ class CapturedLight:
         lobe: radiance of the lobe at its middle; for a hard sun its irradiance across its rays.
         shown: fraction of each cell of directions that photos show as sky, [0, 1].
         sun_error: error of the direction, rad; 0 without a sun.
+        almanac: unit vector towards the sun by date, time and place; None if photos do not tell.
     """
 
     horizon: Float[np.ndarray, "3"]
@@ -46,11 +47,19 @@ class CapturedLight:
     lobe: Float[np.ndarray, "3"]
     shown: Float[np.ndarray, "rows columns"]
     sun_error: float
+    almanac: Float[np.ndarray, "3"] | None = None
 
     @property
     def hard(self) -> bool:
         """Whether the sun casts sharp shadows."""
         return self.sun is not None and self.width <= HARD
+
+    @property
+    def almanac_difference(self) -> float | None:
+        """Angle between the sun that photos show and that of date, time and place, rad."""
+        if self.sun is None or self.almanac is None:
+            return None
+        return math.acos(max(-1.0, min(1.0, float(self.sun @ self.almanac))))
 
     def base(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Radiance of the model without the lobe, linear in the sine of the elevation."""
@@ -100,6 +109,17 @@ class CapturedLight:
                 ii = (i + a).long() % COLUMNS
                 total = total + wa * wb * table[jj, ii]
         return total
+
+
+@dataclass(frozen=True)
+class UnknownLight:
+    """Photos that do not tell their light.
+
+    Attributes:
+        reason: as a clause, such as "the photos show no sky".
+    """
+
+    reason: str
 
 
 def open_sheet(light: CapturedLight, field: RadianceField) -> Float[np.ndarray, "3"]:

@@ -19,7 +19,11 @@ from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import NORMALS
 from climatenerf.field.protocol import device_of, observed
 from climatenerf.weather.light import skies
-from climatenerf.weather.light.captured import CapturedLight, elevation_azimuth
+from climatenerf.weather.light.captured import (
+    CapturedLight,
+    UnknownLight,
+    elevation_azimuth,
+)
 from climatenerf.weather.light.file import light_of_photos_in
 from climatenerf.weather.light.normals import normals_at
 from climatenerf.weather.light.probes import GatheredLight, gather
@@ -59,12 +63,17 @@ class LightEntity:
     # --- what the scene gives -----------------------------------------------------------------
 
     @functools.cached_property
-    def captured(self) -> CapturedLight | None:
-        """The light of the photos; None if they show too little to find it."""
+    def _found(self) -> CapturedLight | UnknownLight:
+        """The light of the photos."""
         given = self._given
         if NORMALS not in given.field.capabilities or given.photo_rays is None:
-            return None
-        return light_of_photos_in(given.kept, given.field, given.photo_rays)
+            return UnknownLight("the field has no normals")
+        return light_of_photos_in(given.kept, given.scene, given.field, given.photo_rays)
+
+    @property
+    def captured(self) -> CapturedLight | None:
+        """The light of the photos; None if they show too little to find it."""
+        return self._found if isinstance(self._found, CapturedLight) else None
 
     @functools.cached_property
     def _gathered(self) -> GatheredLight:
@@ -147,11 +156,11 @@ class LightEntity:
         snow = weather.snow.depth or 0.0
         if not (new_sky or snow > 0 or weather.flood.level is not None or _lit_smog(weather)):
             return world
-        if self.captured is None:
+        if isinstance(self._found, UnknownLight):
             if new_sky:
                 raise UserError(
-                    f"--sky.kind {weather.sky.kind} needs the light of the photos, which these show"
-                    " too little of (some sky, and surfaces with normals); use --sky.kind captured"
+                    f"--sky.kind {weather.sky.kind} needs the light of the photos, and"
+                    f" {self._found.reason}; use --sky.kind captured, or photos that show it"
                 )
             return world  # snow, water and smog are lit as in the open
         override = None if new_sky else sun_direction(weather.sun)
@@ -251,7 +260,7 @@ class LightEntity:
 
     def facts(self) -> dict[str, float]:
         """Where the sun of the photos stands."""
-        if "captured" not in self.__dict__ or self.captured is None:
+        if "_found" not in self.__dict__ or self.captured is None:
             return {}
         captured = self.captured
         found: dict[str, float] = {}
@@ -262,6 +271,9 @@ class LightEntity:
                 "photos_sun_azimuth_deg": math.degrees(azimuth),
                 "photos_sun_error_deg": math.degrees(captured.sun_error),
             }
+            if captured.almanac_difference is not None:
+                difference = math.degrees(captured.almanac_difference)
+                found |= {"photos_sun_from_almanac_deg": difference}
         return found
 
 

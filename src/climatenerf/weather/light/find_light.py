@@ -20,7 +20,14 @@ from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.scene.photo_rays import PhotoRays
-from climatenerf.weather.light.captured import CLIPPED, COLUMNS, ROWS, CapturedLight
+from climatenerf.weather.light.captured import (
+    CLIPPED,
+    COLUMNS,
+    ROWS,
+    CapturedLight,
+    UnknownLight,
+    elevation_azimuth,
+)
 from climatenerf.weather.light.spherical import sphere_directions
 
 PAIRS = 12000  # of neighbouring surface points
@@ -44,6 +51,9 @@ MARGIN, AROUND_SUN = np.radians(2.5), 9  # of the directions in which a point is
 PARTS = 8  # of the pairs, for the error
 MIN_GAIN = 0.02  # by which a sun must lower the deviation, relative
 MAX_ERROR = np.radians(8.0)
+MIN_HALF = 60  # pairs of each half of the photos
+TWO_SUNS, CLEAR_GAIN = np.radians(30.0), 0.03  # of suns that contradict each other
+ALMANAC_ERROR = np.radians(3.0)  # of the sun by date, time and place: north is that of GPS
 MIN_SKY, MAX_SKY = 50, 1500  # pixels of the reduced photos that show sky
 MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
 CLOUDS = 60  # independent patches of the sky that photos show
@@ -88,17 +98,19 @@ class Pairs:
         x: points, world m.
         normal: unit, towards the camera.
         radiance: towards the camera that shows them.
+        late: whether they are from the later half of the photos, by name.
     """
 
     x: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]
     radiance: Float[np.ndarray, "n 3"]
+    late: Bool[np.ndarray, "n"]
 
     def selected(self, pairs: Int[np.ndarray, "m"]) -> "Pairs":
         """Some of the pairs."""
         rows = np.repeat(2 * pairs, 2)
         rows[1::2] += 1
-        return Pairs(self.x[rows], self.normal[rows], self.radiance[rows])
+        return Pairs(self.x[rows], self.normal[rows], self.radiance[rows], self.late[rows])
 
     @property
     def start(self) -> Float[np.ndarray, "n 3"]:
@@ -123,11 +135,18 @@ def find_pairs(
     x, d, eye, normal = (np.concatenate([pair[k] for pair in found]) for k in range(4))
     if len(x) < MIN_PAIRS:
         return None
+    order = np.argsort(np.argsort([photo.view.name for photo in photos]))
+    late = np.concatenate(
+        [
+            np.full((len(pair[0]), 2), rank >= len(photos) / 2)
+            for rank, pair in zip(order, found, strict=True)
+        ]
+    )
     chosen = rng.choice(len(x), min(count, len(x)), replace=False)
     x, d, eye, normal = (v[chosen].reshape(-1, 3) for v in (x, d, eye, normal))
     radiance = to_numpy(_surface_radiance(field, _sent(eye, field), _sent(d, field)))
     valid = (radiance.min(-1) > DARK) & (radiance.max(-1) < CLIPPED)
-    pairs = Pairs(x, normal, radiance)
+    pairs = Pairs(x, normal, radiance, late[chosen].reshape(-1))
     return pairs.selected(np.flatnonzero(valid.reshape(-1, 2).all(1)))
 
 
@@ -237,11 +256,14 @@ class HardSun:
         direction: unit vector towards it.
         error: standard error of the direction, rad.
         gain: by which it lowers the mean deviation, relative.
+        halves: the suns that explain the earlier and the later half of the photos best, if these
+            are two: neither half's sun explains the other half.
     """
 
     direction: Float[np.ndarray, "3"]
     error: float
     gain: float
+    halves: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
 
 
 def deviations(
@@ -269,7 +291,7 @@ def hard_sun(field: RadianceField, gathered: Gathered, sky: Float[np.ndarray, "k
     pairs, directions = gathered.pairs, gathering_directions()
     radiance, ambient = pairs.radiance @ LUMA, gathered.ambient(sky) @ LUMA
     level = float(np.clip(directions[:, 2], 0, 1) @ sky @ LUMA) * 4 * np.pi / DIRECTIONS
-    none = deviations(radiance, ambient, np.zeros((len(ambient), 1))).mean()
+    none = deviations(radiance, ambient, np.zeros((len(ambient), 1)))[:, 0]
 
     def search(
         candidates: Float[np.ndarray, "k 3"], through: Float[np.ndarray, "n k"]
@@ -284,6 +306,7 @@ def hard_sun(field: RadianceField, gathered: Gathered, sky: Float[np.ndarray, "k
 
     near = directions[directions[:, 2] > LOWEST_SUN]
     found = search(near, gathered.through[:, directions[:, 2] > LOWEST_SUN])
+    halves = _contradiction(near, found, none, pairs.late[::2])
     start = _sent(pairs.start, field)
     for spread in ROUNDS:
         near = _around(near[found.mean(0).argmin()], spread, NEIGHBOURS)
@@ -296,7 +319,33 @@ def hard_sun(field: RadianceField, gathered: Gathered, sky: Float[np.ndarray, "k
     left = np.stack([near[found[parts != part].mean(0).argmin()] for part in range(PARTS)])
     angles = np.arccos(np.clip(left @ middle, -1, 1))
     error = float(np.sqrt((PARTS - 1) / PARTS * (angles**2).sum() + (ROUNDS[-1] / 4) ** 2))
-    return HardSun(middle, error, float(1 - found.mean(0).min() / none))
+    return HardSun(middle, error, float(1 - found.mean(0).min() / none.mean()), halves)
+
+
+def _contradiction(
+    candidates: Float[np.ndarray, "k 3"],
+    found: Float[np.ndarray, "pairs k"],
+    none: Float[np.ndarray, "pairs"],
+    late: Bool[np.ndarray, "pairs"],
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None:
+    """The suns of both halves of the photos, if each explains its own half alone.
+
+    Args:
+        candidates: directions.
+        found: deviations of pairs at each candidate.
+        none: their deviations without a sun.
+        late: whether pairs are of the later half.
+    """
+    if min(late.sum(), (~late).sum()) < MIN_HALF:
+        return None
+    first, second = (
+        1 - found[half].mean(0) / max(none[half].mean(), 1e-9) for half in (~late, late)
+    )  # 1e-9: pairs without any contrast
+    a, b = int(first.argmax()), int(second.argmax())
+    apart = candidates[a] @ candidates[b] < np.cos(TWO_SUNS)
+    explained = min(first[a], second[b]) > CLEAR_GAIN
+    alone = first[b] < 0 and second[a] < 0
+    return (candidates[a], candidates[b]) if apart and explained and alone else None
 
 
 def sun_strength(
@@ -443,13 +492,18 @@ def _direction(elevation: float, azimuth: float) -> Float[np.ndarray, "3"]:
 
 @torch.no_grad()
 def find_light(
-    field: RadianceField, photos: list[PhotoRays], seed: int = 0
-) -> CapturedLight | None:
-    """Return the light of a scene's photos; None if they show too little to find it.
+    field: RadianceField,
+    photos: list[PhotoRays],
+    almanac: Float[np.ndarray, "3"] | None = None,
+    seed: int = 0,
+) -> CapturedLight | UnknownLight:
+    """Find the light of a scene's photos.
 
     Args:
         field: the fitted field; world axes, z up.
         photos: rays of its photos on the field without unobserved density.
+        almanac: unit vector towards the sun by date, time and place; None: unknown. It is used
+            where shadows tell no direction.
         seed: random seed of the points that are looked at.
     """
     field = observed(field)
@@ -458,33 +512,61 @@ def find_light(
         [p.d[np.isinf(p.t) & (p.transmittance > 0.99) & (p.d[..., 2] > 0.03)] for p in photos]
     )
     pairs = find_pairs(field, photos, PAIRS, rng)
-    if pairs is None or len(sky_d) < MIN_SKY:
-        return None
+    if len(sky_d) < MIN_SKY:
+        return UnknownLight("the photos show too little sky")
+    if pairs is None:
+        return UnknownLight("the photos show too little ground and too few walls to judge by")
     sky_d = sky_d[rng.choice(len(sky_d), min(MAX_SKY, len(sky_d)), replace=False)]
     seen = to_numpy(field.sky(_sent(sky_d, field))).astype(float)
     plain = fit_sky(sky_d, seen, 0.0, lobe=False)
-    light = _assembled(plain, shown, 0.0)
+    light = _assembled(plain, shown, 0.0, almanac)
     d = _sent(gathering_directions(), field)
     sky = to_numpy(light.sky(d, field.sky(d)) * (d[:, 2:] > 0)).astype(float)
     few = pairs.selected(np.arange(min(len(pairs.x) // 2, GATHERED_PAIRS)))
     sun = hard_sun(field, gather_light(field, few), sky)
-    if sun.gain > MIN_GAIN and sun.error < MAX_ERROR:
-        strength = sun_strength(field, pairs, sun.direction, sky)
+    if sun.halves is not None:
+        return UnknownLight(_two_suns(photos, sun.halves))
+    known = [(sun.direction, sun.error)] if sun.gain > MIN_GAIN and sun.error < MAX_ERROR else []
+    known += [] if almanac is None or almanac[2] < LOWEST_SUN else [(almanac, ALMANAC_ERROR)]
+    for direction, error in known:
+        strength = sun_strength(field, pairs, direction, sky)
         if strength.min() > 0:
-            model = SkyModel(plain.horizon, plain.zenith, sun.direction, 0.0, strength)
-            return _assembled(model, shown, sun.error)
+            model = SkyModel(plain.horizon, plain.zenith, direction, 0.0, strength)
+            return _assembled(model, shown, error, almanac)
     if (seen.max(-1) >= CLIPPED).mean() > MIN_CLIPPED:
         level = pairs.normal[:, 2] > 0.9
         enough = level.sum() >= 2 * MIN_PAIRS // 3
         ground = float((pairs.radiance[level] @ LUMA).mean()) if enough else 0.0
         model = fit_sky(sky_d, seen, ground, lobe=True)
-        return _assembled(model, shown, model.width / 3)
+        return _assembled(model, shown, model.width / 3, almanac)
     return light
 
 
+def _by_name(photos: list[PhotoRays]) -> list[str]:
+    return sorted(photo.view.name for photo in photos)
+
+
+def _two_suns(
+    photos: list[PhotoRays], suns: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+) -> str:
+    """Say that two halves of the photos were taken under different suns."""
+    second = _by_name(photos)[(len(photos) + 1) // 2]
+    places = [
+        "{:.0f} deg high at azimuth {:.0f} deg".format(*np.degrees(elevation_azimuth(sun)))
+        for sun in suns
+    ]
+    return (
+        f"the photos contradict one sun: up to {second} it stands {places[0]}, from there on"
+        f" {places[1]}"
+    )
+
+
 def _assembled(
-    model: SkyModel, shown: Float[np.ndarray, "rows columns"], error: float
+    model: SkyModel,
+    shown: Float[np.ndarray, "rows columns"],
+    error: float,
+    almanac: Float[np.ndarray, "3"] | None,
 ) -> CapturedLight:
     return CapturedLight(
-        model.horizon, model.zenith, model.sun, model.width, model.lobe, shown, error
+        model.horizon, model.zenith, model.sun, model.width, model.lobe, shown, error, almanac
     )

@@ -1,0 +1,171 @@
+"""What weather on the reference street would score if parts of a picture were the truth.
+
+python benchmarks/ceilings.py
+python benchmarks/ceilings.py --run RUN
+python benchmarks/ceilings.py --reference FOLDER
+
+Snow, from the truth alone: each row says what is known. `snow` has the true picture where snow lies
+and the true dry one elsewhere; `snow and gains` multiplies the dry one by the best gain of each
+class and channel. In the rows of vegetation all else is the truth, and vegetation is the dry
+picture, the best mixture of it with white, or the truth blurred by some pixels. `no_vegetation`
+leaves out vegetation's pixels. With a run `ours` is its picture; floods have it with the dry part
+or the water from the truth too. All in dB of display values, the mean of all views.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import common
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+
+from climatenerf.core.classes import MERGED, VEGETATION
+from climatenerf.core.srgb import to_linear
+from climatenerf.evaluation.evaluated_run import EvaluatedRun, display_8bit, prepare_weather
+from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, read_reference
+from climatenerf.field.checkpoint import load_field
+from climatenerf.render.frame import see_frame
+from climatenerf.scene import load_scene
+
+REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
+BLURS = (2.0, 4.0)  # px
+LEAST_SNOW = 1e-3  # m of thickness
+Picture = Float[np.ndarray, "h w 3"]
+
+
+def main() -> None:
+    """Compute and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--reference", type=Path, default=REFERENCE)
+    parser.add_argument("--run", type=Path, help="a fit of the reference, for the floods")
+    options = parser.parse_args()
+    reference = read_reference(options.reference)
+    found: dict[str, object] = {}
+    for case in reference.weathers:
+        if case.name.startswith("snow"):
+            found[case.name] = snow_ceilings(reference, case, options.run)
+        elif case.name.startswith("flood") and options.run is not None:
+            found[case.name] = flood_ceilings(reference, case, options.run)
+    common.report("ceilings of the reference street", found)
+
+
+def snow_ceilings(
+    reference: Reference, case: WeatherTruth, folder: Path | None
+) -> dict[str, dict[str, float]]:
+    """Scores of pictures made of the truth and of what is left unknown."""
+    true = [to_linear(case.picture(view.name) / 255.0) for view in reference.truths]
+    dry = [np.clip(view.clean, 0, 1).astype(float) for view in reference.truths]
+    leaves = [MERGED[view.label] == VEGETATION for view in reference.truths]
+    snowed = [case.layers(view.name)["thickness"] > LEAST_SNOW for view in reference.truths]
+    gained = gains(reference.truths, true, dry, snowed)
+    white = mixture(true, dry, leaves)
+
+    def scores(part: Callable[[int], Picture], unknown: list[Bool[np.ndarray, "h w"]]):
+        made = [np.where(m[..., None], part(k), true[k]) for k, m in enumerate(unknown)]
+        return {"psnr": psnr(made, true), "no_vegetation": psnr(made, true, leaves)}
+
+    everywhere, bare = [np.ones_like(m) for m in leaves], [~m for m in snowed]
+    rows = {
+        "dry": scores(lambda k: dry[k], everywhere),
+        "snow": scores(lambda k: dry[k], bare),
+        "snow and gains": scores(lambda k: gained[k], bare),
+        "vegetation dry": scores(lambda k: dry[k], leaves),
+        "vegetation mixed with white": scores(lambda k: white[k], leaves),
+    }
+    if folder is not None:
+        ours, _ = rendered(reference, case, folder)
+        rows["ours"] = scores(lambda k: ours[k], everywhere)
+    for blur in BLURS:
+        soft = [ndimage.gaussian_filter(each, (blur, blur, 0)) for each in true]
+        rows[f"vegetation blurred by {blur:g} px"] = scores(lambda k, s=soft: s[k], leaves)
+    return rows
+
+
+def gains(
+    views: tuple[Truth, ...],
+    true: list[Picture],
+    dry: list[Picture],
+    snowed: list[Bool[np.ndarray, "h w"]],
+) -> list[Picture]:
+    """The dry pictures, times the gain of each class and channel that fits bare pixels best."""
+    labels = [MERGED[view.label] for view in views]
+    made = [each.copy() for each in dry]
+    for label in np.unique(np.concatenate([each.ravel() for each in labels])):
+        masks = [(a == label) & ~b for a, b in zip(labels, snowed, strict=True)]
+        x = np.concatenate([each[m] for each, m in zip(dry, masks, strict=True)])
+        y = np.concatenate([each[m] for each, m in zip(true, masks, strict=True)])
+        gain = (x * y).sum(0) / np.maximum((x * x).sum(0), 1e-12)  # 1e-12: a class that is black
+        for each, before, mask in zip(made, dry, masks, strict=True):
+            each[mask] = before[mask] * gain
+    return made
+
+
+def mixture(
+    true: list[Picture], dry: list[Picture], leaves: list[Bool[np.ndarray, "h w"]]
+) -> list[Picture]:
+    """Vegetation as a factor times the dry picture plus one radiance, by least squares."""
+    x = np.concatenate([each[m] for each, m in zip(dry, leaves, strict=True)])
+    y = np.concatenate([each[m] for each, m in zip(true, leaves, strict=True)])
+    made = [np.empty_like(each) for each in dry]
+    for channel in range(3):
+        design = np.stack([x[:, channel], np.ones(len(x))], axis=-1)
+        factor, added = np.linalg.lstsq(design, y[:, channel], rcond=None)[0]
+        for each, before in zip(made, dry, strict=True):
+            each[..., channel] = factor * before[..., channel] + added
+    return made
+
+
+def flood_ceilings(reference: Reference, case: WeatherTruth, folder: Path) -> dict[str, float]:
+    """Scores of a run's flood, and with its dry part or its water from the truth."""
+    ours, layers = rendered(reference, case, folder)
+    water = [np.asarray(each["mask_water"]) > 0.5 for each in layers]
+    true = [to_linear(case.picture(view.name) / 255.0) for view in reference.truths]
+    mixed = {
+        "ours": ours,
+        "dry part true": [
+            np.where(m[..., None], a, b) for m, a, b in zip(water, ours, true, strict=True)
+        ],
+        "water true": [
+            np.where(m[..., None], b, a) for m, a, b in zip(water, ours, true, strict=True)
+        ],
+    }
+    return {name: psnr(pictures, true) for name, pictures in mixed.items()}
+
+
+def rendered(
+    reference: Reference, case: WeatherTruth, folder: Path
+) -> tuple[list[Picture], list[dict[str, np.ndarray]]]:
+    """A run's pictures of the test views in a weather, linear, and their layers."""
+    run = EvaluatedRun(load_field(folder), load_scene(folder), reference)
+    cameras = [run.camera(truth) for truth in reference.truths]
+    session = prepare_weather(run, case.weather, case.time, [c2w for _, c2w in cameras])
+    frames = [see_frame(session.world(case.time), *camera) for camera in cameras]
+    pictures = [np.clip(linear.double().numpy(), 0, 1) for linear, _ in frames]
+    return pictures, [layers for _, layers in frames]
+
+
+def psnr(
+    pictures: list[Picture],
+    true: list[Picture],
+    without: list[Bool[np.ndarray, "h w"]] | None = None,
+) -> float:
+    """Mean over views of the PSNR of display values, without some pixels."""
+    scores = []
+    for k, (a, b) in enumerate(zip(pictures, true, strict=True)):
+        error = (display(a) - display(b)) ** 2
+        error = error if without is None else error[~without[k]]
+        scores.append(-10 * np.log10(max(float(error.mean()), 1e-12)))  # 1e-12: equal pictures
+    return float(np.mean(scores))
+
+
+def display(linear: Picture) -> Picture:
+    """Display values in [0, 1]."""
+    return display_8bit(linear).astype(float) / 255
+
+
+if __name__ == "__main__":
+    main()
