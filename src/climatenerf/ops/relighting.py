@@ -139,7 +139,7 @@ def expected_fractions(
         from climatenerf.ops.cpu import relighting as kernel
 
         found = sent.new_empty(len(sent), 2)
-        kernel.expected_fractions(*dispatch.kernel_arrays(*tensors), found.numpy())
+        kernel.expected_fractions(*dispatch.kernel_arrays(*tensors, found))
         return found
     mine = brightness_and_tint(sent, DARKEST_SENT) - albedo
     total, expected = torch.zeros_like(visibility), sent.new_zeros(len(sent), 2)

@@ -23,7 +23,7 @@ def _gps_time(exif: Image.Exif) -> datetime | None:
     tags = exif.get_ifd(ExifTags.IFD.GPSInfo)
     day, clock = tags.get(ExifTags.GPS.GPSDateStamp), tags.get(ExifTags.GPS.GPSTimeStamp)
     try:
-        hours, minutes, seconds = (float(part) for part in clock)
+        hours, minutes, seconds = (float(part) for part in clock or ())
         date = datetime.strptime(_text(day), "%Y:%m:%d").replace(tzinfo=UTC)
         passed = timedelta(hours=hours, minutes=minutes, seconds=seconds)
         return date + passed if timedelta(0) <= passed < timedelta(days=1) else None
