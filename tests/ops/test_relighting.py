@@ -29,6 +29,14 @@ def test_visibility_equals_its_twin():
     assert bool(beyond.any()) and bool((fast[beyond] == 1).all())
 
 
+def test_leaves_let_half_of_the_light_pass():
+    """3/4 passes above the ground, 1/4 only at the ground: a crown that takes half."""
+    depths = torch.tensor([-5.0, 0.0]).expand(1, 2, 2, 2).contiguous()
+    at = torch.tensor([[0.0, 0.0, z] for z in (-6.0, -4.0, -0.1, 1.0)])
+    found = relighting.visibility(depths, (1.0,), (0.2,), at)
+    torch.testing.assert_close(found, torch.tensor([1.0, 0.5, 0.5, 0.0]))
+
+
 def test_interpolation_equals_its_twin_and_a_linear_function():
     rng = np.random.default_rng(1)
     grids = torch.from_numpy(rng.normal(size=(3, 4, 1, 6)).astype(np.float32))

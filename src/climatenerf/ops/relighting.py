@@ -1,7 +1,8 @@
 """Sunlight on samples: by shadow maps, and by what photos show. No gradients.
 
 A shadow map (Williams 1978) is an orthographic picture from the sun. Here each texel has two
-depths, where three quarters and one quarter of the light pass; visibility is linear between them.
+depths, where three quarters and one quarter of the light pass: behind the first half of it is left,
+behind both nothing.
 """
 
 import torch
@@ -62,10 +63,8 @@ def _bilinear(
     for dv, wv in ((0, 1 - v), (1, v)):
         for du, wu in ((0, 1 - u), (1, u)):
             first, last = depths[corner[:, 1] + dv, corner[:, 0] + du].unbind(-1)
-            first, last = first + bias, last + 2 * bias
-            passed = 1 - (depth - first) / (last - first)
-            passed = torch.where(first.isinf(), 1.0, passed.nan_to_num(0.0)).clamp(0, 1)
-            total = total + wu * wv * passed
+            stopped = sum(((depth - each) / bias - 1).clamp(0, 1) for each in (first, last))
+            total = total + wu * wv * (1 - stopped / 2)
     return total
 
 

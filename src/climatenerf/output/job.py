@@ -519,7 +519,7 @@ def _sidecar(job: RenderJob, scene: Scene, out: Path) -> dict[str, Any]:
         record = render_folder.frame_record(out, index, job.frame_key(index))
         if record is None:
             continue
-        facts = record["facts"]
+        facts |= record["facts"]
         camera, c2w, time = job.path.cameras[index], job.path.c2w[index], job.time(index)
         weather = weather_to_table(job.weather.at(time), job.effects)
         layers, numbers = record["layers"], record["measured"]

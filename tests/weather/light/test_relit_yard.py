@@ -20,7 +20,7 @@ from climatenerf.render.session import RenderSession
 from climatenerf.weather.description import weather_from_table
 from climatenerf.weather.light import find_light as finding
 from climatenerf.weather.light import sun_map as sun_maps
-from climatenerf.weather.light.captured import UnknownLight
+from climatenerf.weather.light.captured import UnknownLight, elevation_azimuth
 from climatenerf.weather.light.relit_field import RelitField
 from climatenerf.weather.light.sun_map import sun_map
 from climatenerf.weather.world import Kept
@@ -172,6 +172,7 @@ def test_faint_smog_in_the_sun_changes_nothing():
     ("sky", "elevation", "message"),
     [
         ("clear", "-3 deg", "needs the sun above the horizon"),
+        ("captured", "-3 deg", "taken by day"),
         ("dusk", "30 deg", "from -12 deg to 0 deg"),
         ("dusk", "-40 deg", "from -12 deg to 0 deg"),
     ],
@@ -187,6 +188,27 @@ def test_photos_that_show_too_little_are_refused_in_one_sentence():
     plain = AnalyticField(sunlit_yard().solids)
     with pytest.raises(UserError, match="needs the light of the photos"):
         session(plain, sky={"kind": "overcast"}).world(0.0)
+
+
+def test_parameters_move_the_sun_of_the_photos():
+    """What they leave out stays as found."""
+    table = {"flood": {"level": "0.1 m"}, "sun": {"azimuth": "200 deg"}}
+    moved = session(sunlit_yard(), **table)
+    direction = moved.world(0.0).light.sun.direction
+    elevation, azimuth = np.degrees(elevation_azimuth(direction))
+    found = elevation_azimuth(moved._entities["sky"].captured.sun)
+    assert azimuth == pytest.approx(200) and elevation == pytest.approx(np.degrees(found[0]))
+
+
+def test_a_sun_by_the_calendar_needs_shadows_or_strength(monkeypatch):
+    """Where shadows tell no direction it is taken if it is strong, and left if it is not."""
+    photos = trace_photos(sunlit_yard(), yard_scene())
+    none = finding.HardSun(TO_SUN, 9.0, 0.0)
+    monkeypatch.setattr(finding, "hard_sun", lambda *given: none)
+    light = finding.find_light(sunlit_yard(), photos, TO_SUN)
+    np.testing.assert_array_equal(light.sun, TO_SUN)
+    assert light.hard and light.almanac_difference == pytest.approx(0.0, abs=1e-6)
+    assert not finding.find_light(without_sun(), photos, TO_SUN).hard
 
 
 def test_photos_without_sky_or_ground_say_so():
@@ -210,8 +232,8 @@ def test_two_suns_are_refused_in_one_sentence(monkeypatch):
     with pytest.raises(UserError) as refused:
         session(sunlit_yard(), sky={"kind": "overcast"}).world(0.0)
     text = str(refused.value)
-    assert "contradict one sun: up to 5.png it stands 53 deg high at azimuth 90 deg" in text
-    assert "from there on 53 deg high at azimuth 270 deg" in text
+    assert "contradict one sun: in the first half of them it stands 53 deg high" in text
+    assert "from 5.png on, 53 deg high at azimuth 270 deg; fit photos of one time" in text
     session(sunlit_yard(), flood={"level": "0.1 m"}).world(0.0)
 
 
@@ -222,13 +244,22 @@ def test_the_light_is_kept_with_the_run(tmp_path):
     )
     first.world(0.0)
     written = (tmp_path / "light.json").read_bytes()
-    moved = written.replace(b'"checkpoint": "a"', b'"checkpoint": "b"')
-    assert moved != written
     again = RenderSession(
         sunlit_yard(), yard_scene(), weather_from_table(table), kept=Kept(tmp_path, "a")
     )
     again.world(0.0)
     assert (tmp_path / "light.json").read_bytes() == written
+    for old, new in (
+        (b'"checkpoint": "a"', b'"checkpoint": "b"'),
+        (b'_version": 2', b'_version": 1'),
+    ):
+        assert old in written
+        (tmp_path / "light.json").write_bytes(written.replace(old, new))
+        third = RenderSession(
+            sunlit_yard(), yard_scene(), weather_from_table(table), kept=Kept(tmp_path, "a")
+        )
+        third.world(0.0)
+        assert (tmp_path / "light.json").read_bytes() == written, "found anew"
     np.testing.assert_allclose(
         again._entities["sky"].captured.sun, first._entities["sky"].captured.sun
     )

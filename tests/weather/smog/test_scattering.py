@@ -133,3 +133,13 @@ def test_a_level_ray_leaves_thin_smog():
     endless = torch.tensor([torch.inf])
     thin = media.attenuate([lit(Smog(sigma=1e-8))], torch.ones(1, 3), *ray(0, 1, 0), endless)
     assert float((1 - thin).abs().max()) < 1 / 255
+
+
+@pytest.mark.parametrize("base", [-3.0, 0.0, 8.0, 50.0])
+def test_the_suns_path_through_smog_that_thins_with_height(base):
+    smog = Smog(sigma=0.002, kind="fog", height_falloff=5.0, base=base, top=30.0)
+    z = (np.arange(60000) + 0.5) * 30.0 / 60000
+    column = np.exp(-np.clip(z - base, 0, None) / 5.0).mean() * 30.0
+    even = Smog(sigma=0.002, kind="fog", top=float(column))
+    expected = sun_transmittance(even, 0.002, 0.7)
+    np.testing.assert_allclose(sun_transmittance(smog, 0.002, 0.7), expected, rtol=1e-5)

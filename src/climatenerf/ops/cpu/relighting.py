@@ -23,14 +23,10 @@ def visibility(depths, half, bias, at, found):
             total = np.float32(0.0)
             for k in range(4):
                 a, b = k & 1, k >> 1
-                first = depths[m, row + b, column + a, 0]
-                if first == np.inf:
-                    passed = np.float32(1.0)
-                else:
-                    first += np.float32(bias[m])
-                    last = depths[m, row + b, column + a, 1] + np.float32(2 * bias[m])
-                    passed = 1 - (at[i, 2] - first) / (last - first)
-                    passed = min(max(passed, np.float32(0.0)), np.float32(1.0))
+                passed = np.float32(1.0)
+                for part in range(2):
+                    behind = (at[i, 2] - depths[m, row + b, column + a, part]) / bias[m] - 1
+                    passed -= np.float32(0.5) * np.float32(min(max(behind, 0.0), 1.0))
                 total += (fu if a else 1 - fu) * (fv if b else 1 - fv) * passed
             found[i] = total
             break

@@ -26,6 +26,7 @@ from climatenerf.weather.light.captured import (
 )
 from climatenerf.weather.light.file import light_of_photos_in
 from climatenerf.weather.light.normals import normals_at
+from climatenerf.weather.light.parameters import Sun
 from climatenerf.weather.light.probes import GatheredLight, gather
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo, estimate
 from climatenerf.weather.light.relit_field import RelitField
@@ -55,9 +56,9 @@ class LightEntity:
     def __init__(self, preparation: Preparation):
         """Take the preparation; nothing is computed yet."""
         self._given = preparation
-        self._reference: ReferenceAlbedo | None = None
+        self._reference: tuple[SceneLight, ReferenceAlbedo] | None = None
         self._maps: list[SunMap] = []
-        self._last: tuple[object, SceneLight] | None = None
+        self._last: tuple[object, SceneLight, float] | None = None
         self._lights: dict[tuple[float, ...], SceneLight] = {}
 
     # --- what the scene gives -----------------------------------------------------------------
@@ -67,7 +68,7 @@ class LightEntity:
         """The light of the photos."""
         given = self._given
         if NORMALS not in given.field.capabilities or given.photo_rays is None:
-            return UnknownLight("the field has no normals")
+            return UnknownLight("the field has no normals; fit it without --loss normals=0")
         return light_of_photos_in(given.kept, given.scene, given.field, given.photo_rays)
 
     @property
@@ -130,7 +131,7 @@ class LightEntity:
         """The usual albedo of surfaces, where photos have a sun that casts shadows."""
         if old.sun is None or self._given.photo_rays is None:
             return None
-        if self._reference is None:
+        if self._reference is None or self._reference[0] is not old:
             field, photos = self._given.field, self._given.photo_rays()
             parts = []
             for photo in photos:
@@ -145,8 +146,20 @@ class LightEntity:
             (shaded,) = SceneLight.shaded((old,), x, normal)
             sun, lit = old.full_sun(normal), old.visibility(x, normal)
             beam = old.sun_irradiance
-            self._reference = estimate(radiance, x, kind, shaded, sun, beam, lit)
-        return self._reference
+            self._reference = old, estimate(radiance, x, kind, shaded, sun, beam, lit)
+        return self._reference[1]
+
+    def _sun_of_photos(self, weather: Weather) -> Float[np.ndarray, "3"] | None:
+        """The sun of the photos by the parameters; what they leave out is as found."""
+        captured, sun = self.captured, weather.sun
+        if captured is None or captured.sun is None:
+            return None
+        if sun.elevation is None and sun.azimuth is None:
+            return None
+        found = elevation_azimuth(captured.sun)
+        elevation = found[0] if sun.elevation is None else sun.elevation
+        azimuth = found[1] if sun.azimuth is None else sun.azimuth
+        return sun_direction(Sun(elevation, azimuth))
 
     # --- one moment ---------------------------------------------------------------------------
 
@@ -156,23 +169,20 @@ class LightEntity:
         snow = weather.snow.depth or 0.0
         if not (new_sky or snow > 0 or weather.flood.level is not None or _lit_smog(weather)):
             return world
-        if isinstance(self._found, UnknownLight):
-            if new_sky:
-                raise UserError(
-                    f"--sky.kind {weather.sky.kind} needs the light of the photos, and"
-                    f" {self._found.reason}; use --sky.kind captured, or photos that show it"
-                )
+        if self.captured is None:
             return world  # snow, water and smog are lit as in the open
-        override = None if new_sky else sun_direction(weather.sun)
+        override = None if new_sky else self._sun_of_photos(weather)
         old = self._photographed(override)
         cover = round((1 - math.exp(-snow / COVERING)) * COVER_STEPS) / COVER_STEPS
         if not new_sky and cover == 0 and not (old.sun is not None and _lit_smog(weather)):
             return replace(world, light=old)
         key = (weather.sky, weather.sun, cover, weather.smog if _lit_smog(weather) else None)
         if self._last is None or self._last[0] != key:
-            self._last = key, self._new_light(weather, old, cover)
-        new = self._last[1]
-        field = RelitField(world.field, old, new, new_sky, self._albedo(old))
+            new = self._new_light(weather, old, cover)
+            brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
+            self._last = key, new, brighter
+        _, new, brighter = self._last
+        field = RelitField(world.field, old, new, new_sky, brighter, self._albedo(old))
         return replace(world, field=field, light=new)
 
     def _new_light(self, weather: Weather, old: SceneLight, cover: float) -> SceneLight:
@@ -241,11 +251,16 @@ class LightEntity:
         """Refuse a sun that does not belong to its sky.
 
         Raises:
-            UserError: a clear sky without a sun above the horizon, or dusk with a sun that is not
-                just below it.
+            UserError: a clear sky or photos with a sun below the horizon, dusk with one that is not
+                just below it, or a new sky over photos that do not tell their light.
         """
         for moment in moments:
             elevation = moment.sun.elevation
+            if moment.sky.kind == "captured" and elevation is not None and elevation <= 0:
+                raise UserError(
+                    "the photos were taken by day; give --sun.elevation above 0 deg, or another"
+                    " --sky.kind"
+                )
             if moment.sky.kind == "clear" and elevation is not None and elevation <= 0:
                 raise UserError(
                     "--sky.kind clear needs the sun above the horizon; give --sun.elevation above"
@@ -256,6 +271,13 @@ class LightEntity:
                 raise UserError(
                     "--sky.kind dusk needs the sun between 12 deg below the horizon and the"
                     " horizon; give --sun.elevation from -12 deg to 0 deg, or leave it out"
+                )
+
+        for kind in {moment.sky.kind for moment in moments} - {"captured"}:
+            if isinstance(self._found, UnknownLight):
+                raise UserError(
+                    f"--sky.kind {kind} needs the light of the photos: {self._found.reason}; or use"
+                    " --sky.kind captured"
                 )
 
     def facts(self) -> dict[str, float]:
@@ -271,7 +293,7 @@ class LightEntity:
                 "photos_sun_azimuth_deg": math.degrees(azimuth),
                 "photos_sun_error_deg": math.degrees(captured.sun_error),
             }
-            if captured.almanac_difference is not None:
+            if captured.almanac_difference:
                 difference = math.degrees(captured.almanac_difference)
                 found |= {"photos_sun_from_almanac_deg": difference}
         return found

@@ -24,7 +24,7 @@ from climatenerf.weather.light.solar_position import almanac_sun
 from climatenerf.weather.world import Kept
 
 FILE_NAME = "light.json"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2  # 1 knew no sun of the calendar
 NO_REASON = "the photos show too little of it"  # of files that were written without one
 
 
@@ -48,7 +48,7 @@ def light_of_photos_in(
     path = None if kept is None else kept.folder / FILE_NAME
     if kept is not None and path is not None and path.is_file():
         light, made_from = load_light(path)
-        if made_from == kept.checkpoint:
+        if made_from == kept.checkpoint and read_json(path).get("schema_version") == SCHEMA_VERSION:
             return light
     light = find_light(field, photo_rays(), almanac_sun(scene))
     if kept is not None and path is not None:

@@ -54,6 +54,7 @@ MAX_ERROR = np.radians(8.0)
 MIN_HALF = 60  # pairs of each half of the photos
 TWO_SUNS, CLEAR_GAIN = np.radians(30.0), 0.03  # of suns that contradict each other
 ALMANAC_ERROR = np.radians(3.0)  # of the sun by date, time and place: north is that of GPS
+LEAST_SUN = 0.15  # light of a sun without sure shadows over that of the sky, on level ground
 MIN_SKY, MAX_SKY = 50, 1500  # pixels of the reduced photos that show sky
 MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
 CLOUDS = 60  # independent patches of the sky that photos show
@@ -147,7 +148,8 @@ def find_pairs(
     radiance = to_numpy(_surface_radiance(field, _sent(eye, field), _sent(d, field)))
     valid = (radiance.min(-1) > DARK) & (radiance.max(-1) < CLIPPED)
     pairs = Pairs(x, normal, radiance, late[chosen].reshape(-1))
-    return pairs.selected(np.flatnonzero(valid.reshape(-1, 2).all(1)))
+    usable = np.flatnonzero(valid.reshape(-1, 2).all(1))
+    return pairs.selected(usable) if len(usable) >= MIN_PAIRS // 2 else None
 
 
 @torch.no_grad()
@@ -431,7 +433,7 @@ def fit_sky(
         lobe: whether there is a lobe besides the base.
     """
     rgb = np.minimum(radiance, 1.0)
-    brightness = rgb @ LUMA
+    brightness = np.maximum(rgb @ LUMA, DARK)
     grid = gathering_directions()
     grid = grid[grid[:, 2] > 0]
     share = np.sqrt(CLOUDS / len(d)) / SKY_ERROR
@@ -526,17 +528,21 @@ def find_light(
     sun = hard_sun(field, gather_light(field, few), sky)
     if sun.halves is not None:
         return UnknownLight(_two_suns(photos, sun.halves))
-    known = [(sun.direction, sun.error)] if sun.gain > MIN_GAIN and sun.error < MAX_ERROR else []
-    known += [] if almanac is None or almanac[2] < LOWEST_SUN else [(almanac, ALMANAC_ERROR)]
-    for direction, error in known:
+    level = float(np.clip(gathering_directions()[:, 2], 0, 1) @ sky @ LUMA) * 4 * np.pi / DIRECTIONS
+    known = [(sun.direction, sun.error, 0.0)]
+    if sun.gain <= MIN_GAIN or sun.error >= MAX_ERROR:
+        known = []
+    if almanac is not None and almanac[2] > LOWEST_SUN:
+        known.append((almanac, ALMANAC_ERROR, LEAST_SUN * level / almanac[2]))
+    for direction, error, least in known:
         strength = sun_strength(field, pairs, direction, sky)
-        if strength.min() > 0:
+        if strength.min() > 0 and strength @ LUMA > least:
             model = SkyModel(plain.horizon, plain.zenith, direction, 0.0, strength)
             return _assembled(model, shown, error, almanac)
     if (seen.max(-1) >= CLIPPED).mean() > MIN_CLIPPED:
-        level = pairs.normal[:, 2] > 0.9
-        enough = level.sum() >= 2 * MIN_PAIRS // 3
-        ground = float((pairs.radiance[level] @ LUMA).mean()) if enough else 0.0
+        flat = pairs.normal[:, 2] > 0.9
+        enough = flat.sum() >= 2 * MIN_PAIRS // 3
+        ground = float((pairs.radiance[flat] @ LUMA).mean()) if enough else 0.0
         model = fit_sky(sky_d, seen, ground, lobe=True)
         return _assembled(model, shown, model.width / 3, almanac)
     return light
@@ -556,8 +562,8 @@ def _two_suns(
         for sun in suns
     ]
     return (
-        f"the photos contradict one sun: up to {second} it stands {places[0]}, from there on"
-        f" {places[1]}"
+        f"the photos contradict one sun: in the first half of them it stands {places[0]}, in the"
+        f" second half, from {second} on, {places[1]}; fit photos of one time of day"
     )
 
 

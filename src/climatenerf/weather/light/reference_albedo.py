@@ -19,6 +19,7 @@ from climatenerf.core.colour import luma
 from climatenerf.ops import relighting
 
 CELL = 2.0  # m, of the grid of means
+MOST_CELLS = 96  # along a side
 BLUR = 2  # passes of a filter over three cells
 SPREAD = (0.45, 0.25)  # first standard deviations of the logs of albedo and of red over blue
 LEAST_SPREAD, MOST_SPREAD = 0.15, 1.0  # of what is measured then
@@ -103,10 +104,11 @@ def estimate(
     visibility: Float[Tensor, "n"],
 ) -> ReferenceAlbedo:
     """Estimate mean albedos from surface points in photos; see `ReferenceAlbedo.sunlight`."""
-    origin = x.amin(0)
-    count = ((x.amax(0) - origin) / CELL).ceil().long().clamp(1, 96) + 1
+    middle = x.median(0).values  # what is far from it gets the values of the grid's border
+    origin = torch.maximum(x.amin(0), middle - CELL * MOST_CELLS / 2)
+    count = ((x.amax(0) - origin) / CELL).ceil().long().clamp(1, MOST_CELLS) + 1
     shape = tuple(count.flip(0).tolist())
-    node = ((x - origin) / CELL).round().long()
+    node = ((x - origin) / CELL).round().long().clamp_min(0)
     node = torch.minimum(node, count - 1)
     cell = (node[:, 2] * shape[1] + node[:, 1]) * shape[2] + node[:, 0]
     spread = torch.tensor(SPREAD, device=x.device).repeat(len(SOLID), 1)

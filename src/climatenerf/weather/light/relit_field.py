@@ -28,6 +28,7 @@ class RelitField(WrappedField):
         old: the light of its photos.
         new: the light that it is shown in.
         new_sky: whether the sky is the new light's; else the photographed one.
+        brighter: the new light in the open over the old one, by luma. Changes are bounded about it.
         albedo: the usual albedo of surfaces, by which photos tell the sun's light from its shadow;
             None: geometry alone tells.
     """
@@ -35,6 +36,7 @@ class RelitField(WrappedField):
     old: SceneLight
     new: SceneLight
     new_sky: bool
+    brighter: float = 1.0
     albedo: ReferenceAlbedo | None = None
 
     def colour(
@@ -73,7 +75,7 @@ class RelitField(WrappedField):
         old, new = SceneLight.shaded((self.old, self.new), x, normal)
         if self.old.sun is None:
             new = new + self.new.direct(x, normal)
-            return (new / old).clamp(1 / MOST, MOST)
+            return (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
         lit, full = self.old.visibility(x, normal), self.old.full_sun(normal)
         if self.albedo is None:
             direct = lit[:, None] * full
@@ -84,7 +86,7 @@ class RelitField(WrappedField):
             new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
         else:
             new = new + self.new.direct(x, normal)
-        return (new / (old + direct)).clamp(1 / MOST, MOST)
+        return (new / (old + direct)).clamp(self.brighter / MOST, self.brighter * MOST)
 
     def sky(
         self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None

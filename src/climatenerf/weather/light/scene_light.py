@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from climatenerf.core.colour import luma
 from climatenerf.field.spherical_harmonics import harmonics
 from climatenerf.ops import probes
 from climatenerf.ops.probes import ProbeGrid
@@ -165,6 +166,7 @@ def relit(
     photographed = gathered.radiance.reshape(-1, 3)
     before = old.irradiance(x, normal)
     brighter = new.open_irradiance() / old.open_irradiance()
+    usual = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
     light = replace(
         new, coefficients=project(gathered.directions, sky + brighter * gathered.radiance)
     )
@@ -172,7 +174,7 @@ def relit(
     cover = None if surfaces is None else surfaces.cover(normal[:, 2])[:, None]
     for _ in range(BOUNCES):
         now = light.irradiance(x, normal)
-        sent = photographed[hit] * (now / before).clamp(1 / MOST, MOST)
+        sent = photographed[hit] * (now / before).clamp(usual / MOST, usual * MOST)
         if surfaces is not None and cover is not None:
             white = opacity * (surfaces.albedo / math.pi) * now
             sent = (1 - cover) * sent + cover * white

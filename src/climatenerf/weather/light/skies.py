@@ -150,8 +150,8 @@ def dusk_sky(d: Float[Tensor, "n 3"], sun: tuple[float, float, float]) -> Float[
 def direct_sun(elevation: float) -> tuple[float, float, float]:
     """Irradiance of the sun across its rays on a clear day, in klx by luma.
 
-    127.5 exp(-.21/sin h) klx (IESNA RP-21), coloured by Beer-Lambert's law through air, haze and
-    ozone at the relative air mass of Kasten and Young (1989).
+    127.5 exp(-.21 m) klx (IESNA RP-21), coloured by Beer-Lambert's law through air, haze and
+    ozone at the relative air mass m of Kasten and Young (1989).
     """
     if elevation <= 0:
         return (0.0, 0.0, 0.0)

@@ -72,7 +72,7 @@ def almanac_sun(scene: Scene) -> Float[np.ndarray, "3"] | None:
     None where photos do not tell time, zone and place, or were taken too far apart in time.
     """
     place = scene.georeference
-    if not place:
+    if not {"latitude", "longitude"} <= place.keys():
         return None
     found = (time_taken(view.path) for view in scene.of_split("train"))
     times = [time for time in found if time is not None]

@@ -2,8 +2,8 @@
 
 A map is an orthographic picture from the sun (Williams 1978), two of them nested: one fine around
 the cameras, one four times as wide. Each texel has the depths at which the field lets three
-quarters and one quarter of the light pass, so leaves give partial shade. Between them visibility is
-linear in depth; between texels it is bilinear.
+quarters and one quarter of the light pass: half of it is left behind the first, so leaves give
+partial shade. Between texels visibility is bilinear.
 """
 
 from dataclasses import dataclass

@@ -178,10 +178,16 @@ def sun_transmittance(smog: Smog, sigma: float, elevation: float) -> tuple[float
 
     Args:
         smog: parameters.
-        sigma: extinction on the ground, 1/m.
+        sigma: extinction at the base and below it, 1/m.
         elevation: of the sun, rad.
     """
-    height = smog.top if smog.height_falloff is None else min(smog.height_falloff, smog.top)
+    if smog.height_falloff is None:
+        height = smog.top
+    else:  # even up to the base, falling off above it
+        base, scale = smog.base, smog.height_falloff
+        height = min(max(base, 0.0), smog.top)
+        above = math.exp(min(base, 0.0) / scale) - math.exp((base - smog.top) / scale)
+        height += scale * above if smog.top > base else 0.0
     path = height / max(math.sin(elevation), MIN_ELEVATION)
     red, green, blue = (math.exp(-sigma * path * k) for k in scaled_extinction(particles_of(smog)))
     return red, green, blue
