@@ -1,8 +1,8 @@
 """Irradiance of surfaces from a grid of light probes. No gradients.
 
 A probe has the coefficients of irradiance in spherical harmonics of degree 2. The eight probes
-around a position are averaged; those inside matter do not count, and those behind the surface count
-little, since they see what is on its other side. Beyond the grid its border counts.
+around a position are averaged; those inside matter do not count, unless all are, and those behind
+the surface count little: they see what is on its other side. Beyond the grid its border counts.
 """
 
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ from torch import Tensor
 from climatenerf.ops import dispatch
 
 TERMS = 9
+LEAST = 1e-6  # sum of weights
 BEHIND = 0.02  # weight of a probe straight behind the surface; one straight before it has 1.02
 
 
@@ -25,7 +26,7 @@ class ProbeGrid:
         origin: the lowest corner, world m.
         spacing: distances of neighbours along the axes, m.
         shape: number of nodes along x, y and z; 2 at least.
-        valid: nodes outside matter.
+        valid: nodes outside matter; the others have the light of the nearest of these.
     """
 
     origin: Float[Tensor, "3"]
@@ -82,8 +83,8 @@ def interpolated(
     place = torch.minimum(place, (size - 1).to(place) - 1e-4)
     corner = place.long()
     fraction = place - corner
-    total = torch.zeros(x.shape[0], TERMS, 3, dtype=x.dtype, device=x.device)
-    weights = torch.zeros(x.shape[0], dtype=x.dtype, device=x.device)
+    total = torch.zeros(2, x.shape[0], TERMS, 3, dtype=x.dtype, device=x.device)
+    weights = torch.zeros(2, x.shape[0], dtype=x.dtype, device=x.device)
     for k in range(8):
         step = torch.tensor([k & 1, k >> 1 & 1, k >> 2 & 1], device=x.device)
         node = corner + step
@@ -91,8 +92,10 @@ def interpolated(
         weight = torch.where(step == 1, fraction, 1 - fraction).prod(-1)
         towards = grid.origin + node * grid.spacing - x
         facing = (towards * normal).sum(-1) / towards.norm(dim=-1).clamp_min(1e-6)
-        weight = weight * (((facing + 1) / 2).square() + BEHIND) * grid.valid[index]
-        total += weight[:, None, None] * coefficients[index]
-        weights += weight
-    # 1e-6: all eight probes lie inside matter, 0/0; nothing is known there.
-    return total / weights.clamp_min(1e-6)[:, None, None]
+        weight = weight * (((facing + 1) / 2).square() + BEHIND)
+        for every, counts in enumerate((grid.valid[index], torch.ones_like(grid.valid[index]))):
+            total[every] += (counts * weight)[:, None, None] * coefficients[index]
+            weights[every] += counts * weight
+    every = (weights[0] <= LEAST).long()  # no probe outside matter counts
+    rows = torch.arange(x.shape[0], device=x.device)
+    return total[every, rows] / weights[every, rows][:, None, None]

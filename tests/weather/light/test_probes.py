@@ -11,7 +11,7 @@ from climatenerf.field.spherical_harmonics import harmonics
 from climatenerf.ops import probes
 from climatenerf.ops.probes import ProbeGrid
 from climatenerf.weather.light import scene_light
-from climatenerf.weather.light.probes import gather
+from climatenerf.weather.light.probes import gather, nearest_valid
 from climatenerf.weather.light.scene_light import SceneLight, Surfaces, light_of_photos, relit
 from climatenerf.weather.light.spherical import project, sphere_directions
 
@@ -50,6 +50,22 @@ def test_probes_inside_matter_do_not_count():
     x = torch.tensor([[1.3, 3.1, 2.2]])
     clean = probes.interpolated(grid, table, x, UP)
     torch.testing.assert_close(probes.interpolated(grid, poisoned, x, UP), clean)
+
+
+def test_between_probes_inside_matter_the_nearest_free_light_counts():
+    shape = (4, 2, 2)
+    valid = torch.zeros(2, 2, 4, dtype=torch.bool)
+    valid[:, :, 0] = True
+    grid = ProbeGrid(torch.zeros(3), torch.ones(3), shape, valid.flatten())
+    source = nearest_valid(grid)
+    torch.testing.assert_close(source, torch.arange(16) // 4 * 4)
+    table = torch.rand(16, 9, 3)[source]
+    x = torch.tensor([[2.5, 0.5, 0.5]])
+    basis = harmonics(UP).T[:9].contiguous()
+    (found,) = probes.irradiance(grid, (table,), x, UP, basis)
+    slow = torch.einsum("tn,ntc->nc", basis, probes.interpolated(grid, table, x, UP))
+    torch.testing.assert_close(found, slow.clamp_min(0), rtol=1e-4, atol=1e-5)
+    assert bool(torch.isfinite(found).all()) and float(slow.abs().sum()) > 0
 
 
 def test_irradiance_of_an_even_sky():

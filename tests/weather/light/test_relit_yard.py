@@ -92,6 +92,16 @@ def test_the_shadow_goes_with_the_sun(overcast):
     assert np.median(np.abs(ratio / np.median(ratio) - 1)) < 0.1
 
 
+def test_lit_ground_with_a_wrong_normal_does_not_turn_black(overcast):
+    """Its brightness shows that it is lit, so its normal cannot point down."""
+    field = overcast.world(0.0).field
+    x = torch.tensor([[-6.0, -5.0, 0.0], [-5.0, -4.0, 0.0]])
+    radiance, kind = sunlit_yard().colour(x, DOWN.expand_as(x)), torch.full((2,), 3)
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
+    right, wrong = (field.ratio(radiance, x, normal, kind) for normal in (up, -up))
+    torch.testing.assert_close(wrong, right, rtol=0.35, atol=0.0)
+
+
 def test_a_new_sun_casts_the_shadow_elsewhere():
     opposite = {"elevation": "45 deg", "azimuth": "315 deg"}
     world = session(sunlit_yard(), sky={"kind": "clear"}, sun=opposite).world(0.0)

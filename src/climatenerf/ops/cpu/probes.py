@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 BEHIND = np.float32(0.02)
+LEAST = np.float32(1e-6)  # sum of weights
 BLOCK = 256  # samples of one thread in turn
 
 
@@ -24,25 +25,30 @@ def irradiance(x, normal, basis, origin, spacing, shape, valid, coefficients, fo
             p2 = min(max((x[i, 2] - origin[2]) / spacing[2], 0.0), nz - 1.0001)
             c0, c1, c2 = int(p0), int(p1), int(p2)
             f0, f1, f2 = np.float32(p0 - c0), np.float32(p1 - c1), np.float32(p2 - c2)
-            mixed[:] = 0.0
             weights = np.float32(0.0)
-            for k in range(8):
-                a, b, h = k & 1, k >> 1 & 1, k >> 2 & 1
-                node = ((c2 + h) * ny + c1 + b) * nx + c0 + a
-                if not valid[node]:
-                    continue
-                weight = (f0 if a else 1 - f0) * (f1 if b else 1 - f1) * (f2 if h else 1 - f2)
-                tx = origin[0] + (c0 + a) * spacing[0] - x[i, 0]
-                ty = origin[1] + (c1 + b) * spacing[1] - x[i, 1]
-                tz = origin[2] + (c2 + h) * spacing[2] - x[i, 2]
-                length = max(math.sqrt(tx * tx + ty * ty + tz * tz), np.float32(1e-6))
-                facing = (tx * normal[i, 0] + ty * normal[i, 1] + tz * normal[i, 2]) / length
-                half = np.float32(0.5) * (facing + 1)
-                weight *= half * half + BEHIND
-                weights += weight
-                for j in range(width):
-                    mixed[j] += weight * coefficients[node, j]
-            scale = 1 / max(weights, np.float32(1e-6))
+            for every in range(2):  # the second time with the probes inside matter
+                if weights > LEAST:
+                    break
+                mixed[:] = 0.0
+                weights = np.float32(0.0)
+                for k in range(8):
+                    a, b, h = k & 1, k >> 1 & 1, k >> 2 & 1
+                    node = ((c2 + h) * ny + c1 + b) * nx + c0 + a
+                    if not (valid[node] or every):
+                        continue
+                    weight = (f0 if a else 1 - f0) * (f1 if b else 1 - f1)
+                    weight *= f2 if h else 1 - f2
+                    tx = origin[0] + (c0 + a) * spacing[0] - x[i, 0]
+                    ty = origin[1] + (c1 + b) * spacing[1] - x[i, 1]
+                    tz = origin[2] + (c2 + h) * spacing[2] - x[i, 2]
+                    length = max(math.sqrt(tx * tx + ty * ty + tz * tz), np.float32(1e-6))
+                    facing = (tx * normal[i, 0] + ty * normal[i, 1] + tz * normal[i, 2]) / length
+                    half = np.float32(0.5) * (facing + 1)
+                    weight *= half * half + BEHIND
+                    weights += weight
+                    for j in range(width):
+                        mixed[j] += weight * coefficients[node, j]
+            scale = 1 / weights
             for c in range(columns):
                 total = np.float32(0.0)
                 for t in range(9):

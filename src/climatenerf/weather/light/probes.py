@@ -10,15 +10,17 @@ et al. 2019). World axes, m.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
+from scipy import ndimage
 from torch import Tensor
 
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.protocol import RadianceField
 from climatenerf.ops.probes import ProbeGrid
 from climatenerf.weather.light.normals import normals_at
-from climatenerf.weather.light.spherical import sphere_directions
+from climatenerf.weather.light.spherical import project, sphere_directions
 
 RAYS = 64  # from each probe
 SPACING = (2.0, 2.0, 2.0)  # m
@@ -41,6 +43,7 @@ class GatheredLight:
         radiance: light that surfaces send in the photos, through all samples of a ray.
         x: middle of what a ray meets, world m.
         normal: its normal; 0 where a ray meets nothing.
+        source: for each probe the one whose light it has: the nearest one outside matter.
     """
 
     grid: ProbeGrid
@@ -49,6 +52,11 @@ class GatheredLight:
     radiance: Float[Tensor, "p k 3"]
     x: Float[Tensor, "p k 3"]
     normal: Float[Tensor, "p k 3"]
+    source: Int[Tensor, "p"]
+
+    def coefficients(self, arriving: Float[Tensor, "p k 3"]) -> Float[Tensor, "p 9 3"]:
+        """Coefficients of the irradiance by the radiance that arrives at the probes."""
+        return project(self.directions, arriving)[self.source]
 
 
 @torch.no_grad()
@@ -104,8 +112,21 @@ def gather(
     grid = ProbeGrid(low, spacing, (nx, ny, nz), ~inside)
     return GatheredLight(
         grid, directions, through.view(shape), radiance.view(*shape, 3), x.view(*shape, 3),
-        normal.view(*shape, 3),
+        normal.view(*shape, 3), nearest_valid(grid),
     )  # fmt: skip
+
+
+def nearest_valid(grid: ProbeGrid) -> Int[Tensor, "p"]:
+    """Index of the nearest probe outside matter; a probe's own where all lie inside."""
+    inside = ~grid.valid.view(grid.shape[::-1]).cpu().numpy()
+    if inside.all():
+        return torch.arange(inside.size, device=grid.valid.device)
+    spacing = grid.spacing.cpu().numpy()[::-1]
+    places = ndimage.distance_transform_edt(
+        inside, spacing, return_distances=False, return_indices=True
+    )
+    index = np.ravel_multi_index(tuple(places), inside.shape).ravel()
+    return torch.as_tensor(index, device=grid.valid.device)
 
 
 def _nodes(

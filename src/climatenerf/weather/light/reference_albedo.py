@@ -26,12 +26,13 @@ LEAST_SPREAD, MOST_SPREAD = 0.15, 1.0  # of what is measured then
 TRUST = 0.93  # probability that geometry is right
 PARTIAL = 0.06  # probability of a partial shadow
 MISJUDGED = 0.03  # probability that a surface's normal is wrong, and it faces the sun
+FACING = 0.6  # cosine to the sun of such a surface
 RIGHT, WRONG = (1 - PARTIAL - MISJUDGED) * TRUST, (1 - PARTIAL - MISJUDGED) * (1 - TRUST)
 CHOICES = (
     (0.0, 0.0, RIGHT, WRONG),
     *((part, 0.0, PARTIAL / 3, PARTIAL / 3) for part in (0.25, 0.5, 0.75)),
     (1.0, 0.0, WRONG, RIGHT),
-    (0.0, 0.6, MISJUDGED, MISJUDGED),
+    (0.0, FACING, MISJUDGED, MISJUDGED),
 )
 """Fractions of the sun that are compared, on the surface's slope and on one that faces the sun, and
 their probability in geometry's shadow and sun. A shadow's soft edge is rare: the fit blurs it.
@@ -69,8 +70,8 @@ class ReferenceAlbedo:
         sun: Float[Tensor, "n 3"],
         beam: Float[Tensor, "3"],
         visibility: Float[Tensor, "n"],
-    ) -> Float[Tensor, "n 3"]:
-        """Expected irradiance by the sun.
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+        """Expected irradiance by the sun, and the probability that a normal is wrong.
 
         Args:
             radiance: of the samples in the photos.
@@ -91,7 +92,8 @@ class ReferenceAlbedo:
             self.spread[kind],
             visibility,
         )
-        return fractions[:, :1] * sun + fractions[:, 1:] * beam
+        direct = fractions[:, :1] * sun + fractions[:, 1:] * beam
+        return direct, fractions[:, 1] / FACING
 
 
 def estimate(
@@ -127,7 +129,7 @@ def estimate(
             for j in range(2)
         ]
         found = ReferenceAlbedo(origin, torch.stack(grids), spread)
-        direct = found.sunlight(radiance, x, kind, shaded, sun, beam, visibility)
+        direct, _ = found.sunlight(radiance, x, kind, shaded, sun, beam, visibility)
         off = (albedo - found.at(x, kind)).abs()
         for k in range(len(SOLID)):
             if bool((kind == k).any()):

@@ -81,12 +81,31 @@ class RelitField(WrappedField):
             direct = lit[:, None] * full
         else:
             beam = self.old.sun_irradiance
-            direct = self.albedo.sunlight(radiance, x, kind, old, full, beam, lit)
+            direct, wrong = self.albedo.sunlight(radiance, x, kind, old, full, beam, lit)
+            normal, (old, new) = self._mended(x, normal, wrong, (old, new))
         if self.new.sun is self.old.sun:  # the sun of the photos keeps its shadows
             new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
         else:
             new = new + self.new.direct(x, normal)
         return (new / (old + direct)).clamp(self.brighter / MOST, self.brighter * MOST)
+
+    def _mended(
+        self,
+        x: Float[Tensor, "s 3"],
+        normal: Float[Tensor, "s 3"],
+        wrong: Float[Tensor, "s"],
+        shaded: tuple[Float[Tensor, "s 3"], ...],
+    ) -> tuple[Float[Tensor, "s 3"], tuple[Float[Tensor, "s 3"], ...]]:
+        """Turn normals that are probably wrong to the photos' sun, and look up their shade anew.
+
+        A lit leaf whose normal points down would otherwise get the light of an underside.
+        """
+        assert self.old.sun is not None
+        rows = (wrong > 0.5).nonzero()[:, 0]
+        normal = normal.clone()
+        normal[rows] = normal.new_tensor(self.old.sun.direction)
+        again = SceneLight.shaded((self.old, self.new), x[rows], normal[rows])
+        return normal, tuple(a.index_copy(0, rows, b) for a, b in zip(shaded, again, strict=True))
 
     def sky(
         self, d: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None = None

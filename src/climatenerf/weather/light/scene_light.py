@@ -14,7 +14,7 @@ from climatenerf.ops import probes
 from climatenerf.ops.probes import ProbeGrid
 from climatenerf.weather.light.captured import CapturedLight
 from climatenerf.weather.light.probes import GatheredLight
-from climatenerf.weather.light.spherical import TERMS, project, sphere_directions
+from climatenerf.weather.light.spherical import TERMS, sphere_directions
 from climatenerf.weather.light.sun_map import SunMap
 
 BOUNCES = 2  # repetitions in which surfaces are lit anew by the surfaces around them
@@ -128,7 +128,7 @@ def light_of_photos(
     """The light in which the photos were taken: surfaces send what photos show of them."""
     sky = _sky_in(gathered, radiance)
     arriving = gathered.through[..., None] * sky + gathered.radiance
-    coefficients = project(gathered.directions, arriving)
+    coefficients = gathered.coefficients(arriving)
     return SceneLight(gathered.grid, coefficients, radiance, sun_irradiance, sun)
 
 
@@ -167,9 +167,7 @@ def relit(
     before = old.irradiance(x, normal)
     brighter = new.open_irradiance() / old.open_irradiance()
     usual = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
-    light = replace(
-        new, coefficients=project(gathered.directions, sky + brighter * gathered.radiance)
-    )
+    light = replace(new, coefficients=gathered.coefficients(sky + brighter * gathered.radiance))
     opacity = (1 - gathered.through).reshape(-1)[hit, None]
     cover = None if surfaces is None else surfaces.cover(normal[:, 2])[:, None]
     for _ in range(BOUNCES):
@@ -181,7 +179,7 @@ def relit(
         bounced = photographed * brighter
         bounced[hit] = sent
         arriving = sky + bounced.view(gathered.radiance.shape)
-        light = replace(new, coefficients=project(gathered.directions, arriving))
+        light = replace(new, coefficients=gathered.coefficients(arriving))
     return light
 
 
