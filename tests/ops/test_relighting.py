@@ -39,7 +39,7 @@ def test_leaves_let_half_of_the_light_pass():
 
 def test_interpolation_equals_its_twin_and_a_linear_function():
     rng = np.random.default_rng(1)
-    grids = torch.from_numpy(rng.normal(size=(3, 4, 1, 6)).astype(np.float32))
+    grids = torch.from_numpy(rng.normal(size=(3, 4, 5, 6)).astype(np.float32))
     origin = torch.tensor([1.0, -2.0, 0.5])
     x = torch.from_numpy(rng.uniform(-6, 16, (1000, 3)).astype(np.float32))
     kind = torch.from_numpy(rng.integers(0, 3, 1000))

@@ -100,6 +100,17 @@ def test_two_halves_of_the_photos_under_two_suns_contradict_each_other():
     assert hard_sun(field, gather_light(field, pairs), sky).halves is None, "not by halves"
 
 
+def test_suns_that_explain_both_halves_do_not_contradict():
+    """Each half has another best candidate, but the other's lowers its deviations too."""
+    candidates = np.stack([direction(35, 110), direction(35, 250)])
+    late, none = np.arange(200) >= 100, np.ones(200)
+    own, other = 0.9 * none, {"agree": 0.95, "contradict": 1.05}
+    for name, cross in other.items():
+        found = np.stack([np.where(late, cross, own), np.where(late, own, cross)], axis=-1)
+        halves = finding._contradiction(candidates, found, none, late)
+        assert (halves is None) == (name == "agree")
+
+
 def lobe_sky(d, elevation=35.0, azimuth=100.0, width=20.0, peak=4.0):
     base = 0.6 * (1 + 0.2 * d[:, 2])
     angle = np.degrees(np.arccos(np.clip(d @ direction(elevation, azimuth), -1, 1)))
