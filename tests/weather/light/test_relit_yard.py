@@ -218,7 +218,8 @@ def test_a_sun_by_the_calendar_needs_shadows_or_strength(monkeypatch):
     light = finding.find_light(sunlit_yard(), photos, TO_SUN)
     np.testing.assert_array_equal(light.sun, TO_SUN)
     assert light.hard and light.almanac_difference == pytest.approx(0.0, abs=1e-6)
-    assert not finding.find_light(without_sun(), photos, TO_SUN).hard
+    for field in (without_sun(), sunlit_yard(0.15)):
+        assert not finding.find_light(field, photos, TO_SUN).hard
 
 
 def test_photos_without_sky_or_ground_say_so():
