@@ -125,7 +125,7 @@ def nearest_valid(grid: ProbeGrid) -> Int[Tensor, "p"]:
     places = ndimage.distance_transform_edt(
         inside, spacing, return_distances=False, return_indices=True
     )
-    index = np.ravel_multi_index(tuple(places), inside.shape).ravel()
+    index = np.ravel_multi_index(tuple(np.asarray(places)), inside.shape).ravel()
     return torch.as_tensor(index, device=grid.valid.device)
 
 
