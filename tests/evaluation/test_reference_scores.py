@@ -249,8 +249,12 @@ def test_snow_scores_of_a_known_thickness_error():
     assert found["thickness_error_cm"] == pytest.approx(2.0, abs=1e-6)
     assert found["snow_surface_error_cm"] == pytest.approx(2.0, rel=0.03)
     assert found["snow_iou"] == 1.0 and found["true_thickness_cm"] == pytest.approx(15.0)
+    kinds = [name for name in weather_scores.SNOWY_CLASSES if not np.isnan(found[f"snowy_{name}"])]
+    assert kinds and all(found[f"snowy_{k}"] == found[f"true_snowy_{k}"] > 0.9 for k in kinds)
     bare = thin | {"mask_snow": np.zeros(truth.depth.shape)}
-    assert weather_scores.snow_scores([bare], (truth,), [real], 1 / 50)["snow_iou"] == 0.0
+    none = weather_scores.snow_scores([bare], (truth,), [real], 1 / 50)
+    assert none["snow_iou"] == 0.0
+    assert all(none[f"snowy_{k}"] == 0 and none[f"true_snowy_{k}"] > 0.9 for k in kinds)
 
 
 def test_unknown_classes_count_as_wrong():

@@ -10,12 +10,13 @@ from support.holed_ground import GREY, HALF, POST, WIDE, LabelledField, holed, t
 from support.scene_builders import look_at
 
 from climatenerf.core.cameras import Camera
-from climatenerf.core.classes import ROAD, SOLID, TERRAIN, UNKNOWN
+from climatenerf.core.classes import ROAD, SOLID, SOLID_OF, TERRAIN, UNKNOWN
 from climatenerf.core.samples import COMPLETED
 from climatenerf.field.analytic import AnalyticField, Box
 from climatenerf.field.capabilities import APPEARANCE, COMPLETES, FUSED
 from climatenerf.field.compositing import composited
-from climatenerf.field.protocol import observed
+from climatenerf.field.normals import normals_at
+from climatenerf.field.protocol import ground_height, observed
 from climatenerf.render.completed_ground import DROP, CompletedField, continued
 from climatenerf.render.frame import traced_rays
 from climatenerf.render.integrator import trace
@@ -409,3 +410,26 @@ def test_one_known_value_is_continued_everywhere(shape):
 
 def test_nothing_known_is_black():
     assert (continued(np.full((9, 9, 3), 0.5), np.zeros((9, 9), bool)) == 0).all()
+
+
+def test_the_height_of_the_ground_is_known_up_to_a_gap():
+    terrain = terrain_of(lambda x, y: 0.1 * x, side=8.0, cell=0.25)
+    wide = np.zeros_like(terrain.seen)
+    wide[:, 40:] = True  # from x = 2 m on, photos contradict the terrain
+    field = CompletedField(holed(), replace(terrain, open=wide))
+    xy = torch.tensor([[-3.0, 0.0], [0.5, 1.0], [2.5, 0.0], [4.5, 0.0], [30.0, 0.0]])
+    found = field.ground_height(xy)
+    assert found[:3].numpy() == pytest.approx([-0.3, 0.05, 0.25], abs=1e-5)
+    assert torch.isnan(found[3:]).all()
+    assert torch.isnan(ground_height(holed(), xy)).all(), "a field without terrain"
+    assert torch.equal(ground_height(field, xy)[:3], found[:3])
+
+
+def test_normals_at_a_place_on_completed_ground_are_the_terrains():
+    field = CompletedField(holed(), terrain_of(lambda x, y: 0.2 * x))
+    x = torch.tensor([[0.5, 0.0, 0.1], [-0.8, 0.4, -0.16]])
+    down = torch.tensor([[0.0, 0.0, -1.0]]).expand(2, 3).contiguous()
+    normal, kind = normals_at(field, x, down)
+    expected = torch.nn.functional.normalize(torch.tensor([-0.2, 0.0, 1.0]), dim=0)
+    assert torch.allclose(normal, expected.expand(2, 3), atol=0.02)
+    assert (kind == int(SOLID_OF[ROAD])).all()

@@ -28,6 +28,7 @@ from climatenerf.weather.description import (
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.flood import surface as flood_module
 from climatenerf.weather.registry import EFFECTS
+from climatenerf.weather.snow import lattice as lattice_module
 from climatenerf.weather.snow import layer as snow_module
 from climatenerf.weather.units import LENGTH, number, quantity
 from climatenerf.weather.weather import Weather
@@ -102,6 +103,15 @@ def test_a_level_above_everything_is_refused_at_any_moment(session_of):
         session_of({"flood": {"level": {"0 s": "0 m", "4 s": "50 m"}}}, [0.0, 4.0])
 
 
+def test_snow_that_lies_nowhere_is_refused_and_a_trace_of_it_is_not(session_of, monkeypatch):
+    session_of({"snow": {"depth": "0.01 mm"}}, [0.0])
+    monkeypatch.setattr(lattice_module.Deposits, "any", lambda deposits: False)
+    with pytest.raises(UserError, match=r"no surface of this scene catches snow.*--snow.depth$"):
+        session_of({"snow": {"depth": "10 cm"}}, [0.0])
+    with pytest.raises(UserError, match=r"or a smaller --snow.fall-tilt"):
+        session_of({"snow": {"depth": "10 cm", "fall-tilt": "60 deg"}}, [0.0])
+
+
 # --- what a change prepares again ---------------------------------------------------------------
 
 
@@ -131,6 +141,8 @@ CHANGES = [
     ("flood.clarity", 2.0, {}),
     ("smog.visibility", 20.0, {}),
     ("snow.wrap", 1.0, {}),
+    ("snow.soot", 2000.0, {}),
+    ("snow.albedo", 0.5, {}),
     ("snow.depth", 0.25, {"grow": 1}),
     ("flood.wind_speed", 6.0, {"make_waves": 1}),
     ("snow.fall_tilt", 0.3, {"find_deposits": 1, "grow": 1}),
@@ -161,6 +173,7 @@ def test_a_change_prepares_only_what_it_invalidates(session_of, counted, name, v
         fresh.surfaces[0].level,
     )
     assert world.matters[0].snow == fresh.matters[0].snow
+    assert np.array_equal(world.matters[0].lattice.shade, fresh.matters[0].lattice.shade)
 
 
 def test_a_refused_change_keeps_the_weather(session_of):

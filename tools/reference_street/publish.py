@@ -39,6 +39,7 @@ from tools.reference_street.write import (
 )
 
 SNOW = {"snow-thin": 0.03, "snow-deep": 0.15}  # m
+SNOW_ALBEDO = 0.87  # of the paint "snow" of `textures`
 LEVELS = {
     "flood-low": 0.25,
     "flood-high": 0.6,
@@ -187,7 +188,9 @@ def weather_file(kind: str) -> list[str]:
             f"ior = {water.IOR}", "gloss = 1e9", *sun,
         ]  # fmt: skip
     depth = SNOW.get(kind, SNOW["snow-deep"])
-    return ["[snow]", f'depth = "{depth:g} m"', *([] if kind == "snow-overcast" else sun)]
+    # The true snow is a white sheet without a fraction that lets light through.
+    own = ["[snow]", f'depth = "{depth:g} m"', f"albedo = {SNOW_ALBEDO}", 'grain = "0.03 mm"']
+    return [*own, *([] if kind == "snow-overcast" else sun)]
 
 
 def write_list(

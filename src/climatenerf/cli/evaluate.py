@@ -88,7 +88,7 @@ def run(options: Evaluate) -> int:
         kept = Kept(options.run, hash_of_run(options.run))
         with progress.Bar("evaluate", len(names) + 8) as bar:
             scores = evaluate(
-                EvaluatedRun(field, scene, reference, kept),
+                EvaluatedRun(field, scene, reference, fitted.completed(), kept),
                 lambda step: bar.advance(1, {"now": step}),
             )
         write_report(scores, description, options.out, old)

@@ -34,6 +34,8 @@ class EvaluatedRun:
     field: RadianceField
     scene: Scene
     reference: Reference
+    completed: RadianceField | None = None
+    """The field with ground where no photo shows it, for renders in weather; None: `field`."""
     kept: Kept | None = None
     """The run folder, where light that was found is kept."""
     sessions: dict[bytes, RenderSession] = dataclasses.field(default_factory=dict, repr=False)
@@ -105,8 +107,9 @@ def prepare_weather(
         run.sessions[key].change(weather)
     else:
         moment = np.array([time])
+        field = run.completed or run.field
         run.sessions[key] = RenderSession(
-            run.field, run.scene, weather, positions, moment, effects=EFFECTS, kept=run.kept
+            field, run.scene, weather, positions, moment, effects=EFFECTS, kept=run.kept
         )
     return run.sessions[key]
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from climatenerf.core.classes import BUILDING, MERGED, VEGETATION
+from climatenerf.core.classes import BUILDING, CLASS_NAMES, MERGED, VEGETATION
 from climatenerf.core.srgb import to_linear
 from climatenerf.evaluation.geometry import ground_or_roof
 from climatenerf.evaluation.reference import Truth
@@ -16,6 +16,7 @@ MAX_GAP, RELATIVE_GAP = 0.5, 0.05  # m, and of the distance; closer neighbours a
 MAX_SNOW_DISTANCE = 30.0  # m, snow is compared up to here
 MAX_LINE_ERROR = 10.0  # m, error of a waterline that is missing, and upper bound of all errors
 MIN_SNOW = 0.005  # m, thinner snow counts as bare ground
+SNOWY_CLASSES = ("road", "terrain", "building", "vegetation", "vehicle")
 
 Layers = dict[str, np.ndarray]
 
@@ -117,7 +118,10 @@ def snow_scores(
         `snow_surface_error_cm`, the median distance between the surfaces along the true normal;
         `thickness_error_cm`, the median error of the thickness; `thickness_cm` and
         `true_thickness_cm`, medians. `snow_iou` of the snowy pixels on ground and roofs.
+        `snowy_CLASS` and `true_snowy_CLASS`: the fractions of a class's pixels within that
+        distance that show snow.
     """
+    shares = {name: [0, 0, 0] for name in SNOWY_CLASSES}  # snowy, truly snowy, all
     distance, error, thickness, true_thickness, intersection, union = [], [], [], [], 0, 0
     for rendered, truth, true in zip(layers, truths, snow, strict=True):
         thick = true["thickness"].astype(np.float64)
@@ -134,7 +138,17 @@ def snow_scores(
         snowy = level & (rendered["mask_snow"] > 0.5)
         intersection += (snowy & true_snow).sum()
         union += (snowy | true_snow).sum()
-    return {
+        label = MERGED[truth.label]
+        for name, counts in shares.items():
+            own = (label == CLASS_NAMES.index(name)) & (truth.depth < MAX_SNOW_DISTANCE)
+            counts[0] += int((own & (rendered["mask_snow"] > 0.5)).sum())
+            counts[1] += int((own & (thick > MIN_SNOW)).sum())
+            counts[2] += int(own.sum())
+    by_class = {}
+    for name, (snowy, truly, every) in shares.items():
+        by_class[f"snowy_{name}"] = snowy / every if every else float("nan")
+        by_class[f"true_snowy_{name}"] = truly / every if every else float("nan")
+    return by_class | {
         "snow_surface_error_cm": _median_cm(distance),
         "thickness_error_cm": _median_cm(error),
         "thickness_cm": _median_cm(thickness),

@@ -16,4 +16,5 @@ OBSERVED = "observed space"
 FUSED = "fused compositing"
 """`composite` marches, evaluates and composites rays in one launch."""
 COMPLETES = "completed ground"
-"""`march` marks samples on ground that no photo shows; see `core.samples.COMPLETED`."""
+"""`march` marks samples on ground that no photo shows, see `core.samples.COMPLETED`; and
+`ground_height` returns the height of the ground."""

@@ -6,7 +6,7 @@ first. Lengths are world metres, radiance is linear, and no method computes grad
 computes on one device, that of its bounds; rays come and results leave on it.
 """
 
-from typing import Protocol
+from typing import Protocol, cast
 
 import torch
 from jaxtyping import Float, Int
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
-from climatenerf.field.capabilities import OBSERVED
+from climatenerf.field.capabilities import COMPLETES, OBSERVED
 
 
 class RadianceField(Protocol):
@@ -125,6 +125,24 @@ class RadianceField(Protocol):
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
         """Radiance, transmittance and weighted sum of ray lengths (m). Needs `FUSED`."""
         ...
+
+
+class GroundedField(RadianceField, Protocol):
+    """A field with `COMPLETES`."""
+
+    def ground_height(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        """Height of the ground (world m) at horizontal positions (m); NaN where it is not known.
+
+        Matter on the ground, such as a house, does not count.
+        """
+        ...
+
+
+def ground_height(field: RadianceField, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    """Height of the ground (world m) at horizontal positions (m); NaN where it is not known."""
+    if COMPLETES in field.capabilities:
+        return cast(GroundedField, field).ground_height(xy)
+    return torch.full_like(xy[:, 0], torch.nan)
 
 
 def observed(field: RadianceField) -> RadianceField:

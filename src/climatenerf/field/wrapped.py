@@ -8,7 +8,7 @@ from torch import Tensor
 from climatenerf.core.samples import Samples
 from climatenerf.field.capabilities import FUSED
 from climatenerf.field.compositing import composited
-from climatenerf.field.protocol import RadianceField
+from climatenerf.field.protocol import RadianceField, ground_height
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,10 @@ class WrappedField:
     ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
         """Normals and class logits of some samples."""
         return self.field.surface_heads(rays_o, rays_d, samples, selected)
+
+    def ground_height(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        """Height of the ground, m; NaN where it is not known."""
+        return ground_height(self.field, xy)
 
     def observed_only(self) -> RadianceField:
         """The inner field without density that no photo shows."""

@@ -30,6 +30,7 @@ ON_GROUND = 0.05  # m; a position this near to the completed ground has its colo
 DROP = 0.1  # m, by which the raster passes below the edge of the ground that the field holds
 OVERLAP = 3  # nodes
 NO_ID = -1  # of samples of a field that gives none
+BRIDGED = 1.5  # m into a gap of the ground, up to which the terrain is used
 SMOOTHING = 20  # steps of diffusion at each level of a continuation
 
 
@@ -58,6 +59,12 @@ class CompletedField(WrappedField):
         # Overlaps the field's ground by some nodes, below it, so that no gap is left between them.
         widened = ndimage.binary_dilation(self.terrain.completed, iterations=OVERLAP)
         return self._tensor(widened.astype(np.float32))
+
+    @cached_property
+    def _bridged(self) -> Float[Tensor, "rows columns"]:
+        """1 where the ground is known, or lies in a narrow gap of what is known."""
+        distance, _ = nearest_known(~self.terrain.open, self.terrain.cell)
+        return self._tensor((distance < BRIDGED).astype(np.float32))
 
     @cached_property
     def _origin(self) -> Float[Tensor, "3"]:
@@ -185,6 +192,16 @@ class CompletedField(WrappedField):
         colour[own] = torch.stack([bilinear(raster[..., k], at) for k in range(3)], dim=-1)
         return colour
 
+    def ground_height(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        """Height of the terrain (world m) at horizontal positions (m).
+
+        NaN beyond the raster, and where the photos contradict it over more than `BRIDGED`.
+        """
+        at = (xy - self._origin[:2]) / self.terrain.cell
+        side = torch.tensor(self._surface.shape[::-1], device=xy.device) - 1
+        known = ((at >= 0) & (at <= side)).all(-1) & (bilinear(self._bridged, at) > 0.5)
+        return torch.where(known, bilinear(self._surface, at) * self.terrain.cell, torch.nan)
+
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Extinction at positions (m), 1/m."""
         own = self._on_ground(x)
@@ -199,12 +216,14 @@ class CompletedField(WrappedField):
     ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
         """Normals and class logits of some samples; of the raster on completed ground."""
         normal, logits = self.field.surface_heads(rays_o, rays_d, samples, selected)
+        ray = samples.ray_index()[selected]
+        x = rays_o[ray] + samples.t[selected, None] * rays_d[ray]
         if samples.ids is None:
-            return normal, logits
-        own = (samples.ids[selected] == COMPLETED).nonzero()[:, 0]
-        ray = samples.ray_index()[selected[own]]
-        x = rays_o[ray] + samples.t[selected[own], None] * rays_d[ray]
-        at = self._cells(x)[:, :2]
+            completed = self._on_ground(x)
+        else:
+            completed = samples.ids[selected] == COMPLETED
+        own = completed.nonzero()[:, 0]
+        at = self._cells(x[own])[:, :2]
         normal[own] = self._normal(at)
         rows, columns = self._label.shape
         column = at[:, 0].round().long().clamp(0, columns - 1)

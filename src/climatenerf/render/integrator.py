@@ -26,7 +26,7 @@ from climatenerf.field.compositing import (
 from climatenerf.ops import compositing
 from climatenerf.render.dry_rays import radiance_alone, trace_field
 from climatenerf.render.measurements import MIN_FRACTION, LightFractions, measure, total
-from climatenerf.render.merging import merged_samples, sample_colour
+from climatenerf.render.merging import merged_samples, sample_colour, with_covered
 from climatenerf.weather import media
 from climatenerf.weather.world import (
     RaySamples,
@@ -106,6 +106,8 @@ def _trace(
     samples, kind = merged_samples(world, rays_o, rays_d, t_min, step_scale)
     ray = samples.ray_index()
     weights, transmittance = compositing.render_weights(samples.sigma * samples.dt, samples.offsets)
+    of_field = kind == 0
+    kind = with_covered(world, samples, ray, kind, weights, rays_o, rays_d)
     along = RaySamples(samples, ray, weights)
     checkpoint()
 
@@ -171,7 +173,7 @@ def _trace(
 
     if not measured:
         return radiance_alone(rgb)
-    shares = LightFractions(along, kind, front, surface_weight, sky_weight, t_surface)
+    shares = LightFractions(along, kind, of_field, front, surface_weight, sky_weight, t_surface)
     return measure(world, rays_o, rays_d, rgb, shares, normal, layers)
 
 

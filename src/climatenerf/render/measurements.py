@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from climatenerf.core.samples import COMPLETED, MIN_WEIGHT, offsets_of
@@ -20,7 +20,9 @@ class LightFractions:
 
     along: RaySamples
     kind: Int[Tensor, "s"]
-    """Of each sample: 0 the field's, k the k-th matter's."""
+    """What each sample shows: 0 the field, k the k-th matter."""
+    of_field: Bool[Tensor, "s"]
+    """Whether a sample is the field's, though matter may cover it."""
     front: Float[Tensor, "s"]
     """Weight of each sample in front of the surface."""
     surface: Float[Tensor, "n"]
@@ -67,7 +69,7 @@ def measure(
     layers["seen"] = torch.ones_like(depth)
     if samples.ids is not None:
         # Of the dry scene, as the classes are: snow on completed ground rests on a guess.
-        dry = torch.where(shares.kind == 0, samples.sigma * samples.dt, 0.0)
+        dry = torch.where(shares.of_field, samples.sigma * samples.dt, 0.0)
         weights, _ = compositing.render_weights(dry, samples.offsets)
         completed = weights * (samples.ids == COMPLETED)
         layers["seen"] = (1 - total(completed, samples.offsets)).clamp(0, 1)

@@ -1,13 +1,18 @@
 """Samples of the field and of matter on the same rays, merged front to back."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from climatenerf.core.samples import Samples
+from climatenerf.core.samples import MIN_WEIGHT, Samples
+from climatenerf.field.capabilities import DENSITY, NORMALS
+from climatenerf.field.normals import normals_at
 from climatenerf.ops import compositing
 from climatenerf.weather.world import World
 
+FACES_UP = 0.5  # z of normals of what matter can lie on
 HIDDEN = 1e-3  # transmittance below which matter is not looked for
 
 
@@ -31,6 +36,31 @@ def merged_samples(
         kind = torch.cat([kind, torch.full_like(own.t, index, dtype=torch.long)])[order]
         merged = Samples(offsets, **both, ids=ids)
     return merged, kind
+
+
+def with_covered(
+    world: World,
+    samples: Samples,
+    ray: Int[Tensor, "s"],
+    kind: Int[Tensor, "s"],
+    weights: Float[Tensor, "s"],
+    rays_o: Tensor,
+    rays_d: Tensor,
+) -> Int[Tensor, "s"]:
+    """The kinds of samples, with those of the field that matter covers counted to that matter."""
+    if not world.field.capabilities & {NORMALS, DENSITY}:
+        return kind  # what faces up is unknown
+    for index, matter in enumerate(world.matters, start=1):
+        covers: Callable[[Tensor], Tensor] | None = getattr(matter, "covers", None)
+        if covers is None:
+            continue
+        own = ((kind == 0) & (weights > MIN_WEIGHT)).nonzero()[:, 0]
+        x = rays_o[ray[own]] + samples.t[own, None] * rays_d[ray[own]]
+        covered = covers(x)
+        own, x = own[covered], x[covered]
+        normal, _ = normals_at(world.field, x, rays_d[ray[own]])
+        kind = kind.index_fill(0, own[normal[:, 2] > FACES_UP], index)
+    return kind
 
 
 def opaque_from(samples: Samples) -> Float[Tensor, "n"]:

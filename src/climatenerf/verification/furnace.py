@@ -56,7 +56,7 @@ def checks(device: torch.device = CPU) -> Iterator[Check]:
     session.change(Weather(flood=muddy))
     yield water_furnace(clear, radiance(session.frame(VIEW.camera, VIEW.c2w)))
     # From nearer, as the edge of the snow is not level.
-    yield snow_furnace(radiance(frame_in(field, Weather(snow=Snow(depth=0.1)), NEAR)))
+    yield snow_furnace(radiance(frame_in(field, Weather(snow=Snow(depth=0.1, albedo=1.0)), NEAR)))
 
 
 def smog_furnace(measured: Float[np.ndarray, "h w 3"]) -> Check:
@@ -75,10 +75,10 @@ def water_furnace(clear: Float[np.ndarray, "h w 3"], muddy: Float[np.ndarray, "h
 def snow_furnace(measured: Float[np.ndarray, "h w 3"]) -> Check:
     """Compare snow on level white ground with 1.
 
-    The tolerance is wider because snow's brightness is stored in 8 bits, and its light is not
-    traced: only level snow under an open sky has to be white.
+    The tolerance is wider because the light between snow and its surroundings is stored in 8 bits,
+    and is not traced: only level snow under an open sky has to be white.
     """
-    compares = "level snow on white ground, in a scene of radiance 1, with 1"
+    compares = "level snow of albedo 1 on white ground, in a scene of radiance 1, with 1"
     return Check("white furnace snow", compares, _error(measured), 5e-3, "1", KIRCHHOFF)
 
 

@@ -61,7 +61,11 @@ class Medium(Protocol):
 
 
 class Matter(Protocol):
-    """Solid matter on the scene, such as snow: density and colour of its own."""
+    """Solid matter on the scene, such as snow: density and colour of its own.
+
+    Its method `covers`, if it has one, says at which positions (m, [n, 3]) upward surfaces of the
+    field belong below it: a fitted surface is rough, and would reach out of thin matter.
+    """
 
     @property
     def mask(self) -> str:
@@ -199,9 +203,18 @@ class Light(Protocol):
     """The light of the place at one moment."""
 
     def irradiance(
-        self, x: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]
+        self,
+        x: Float[Tensor, "n 3"],
+        normal: Float[Tensor, "n 3"],
+        diffuse: Float[Tensor, "n"] | None = None,
     ) -> Float[Tensor, "n 3"]:
-        """Irradiance of surfaces at positions x (m) with unit normals, linear."""
+        """Irradiance of surfaces at positions x (m) with unit normals, linear.
+
+        Args:
+            x: positions.
+            normal: unit normals.
+            diffuse: fraction of the light without the sun's own that arrives; None: all of it.
+        """
         ...
 
     def open_irradiance(self) -> Float[Tensor, "3"]:

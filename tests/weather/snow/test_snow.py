@@ -1,5 +1,6 @@
 """Snow on analytic scenes: thickness, coverage, shelter, brightness, wind and cascades."""
 
+import dataclasses
 import math
 
 import numba
@@ -7,10 +8,14 @@ import numpy as np
 import pytest
 import torch
 from support.analytic_fields import AnalyticField, Box, HalfSpace, ground, table
+from support.holed_ground import LabelledField
 
-from climatenerf.weather.snow.deposition import fall_directions
+from climatenerf.core.classes import BUILDING, ROAD
+from climatenerf.weather.snow.fall_rays import fall_directions
 from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
 from climatenerf.weather.snow.layer import bake_snow
+from climatenerf.weather.snow.openness import openness_of
+from climatenerf.weather.snow.optics import albedo_of
 from climatenerf.weather.snow.parameters import Snow
 
 CAMERAS = np.array([[0.0, 0.0, 1.6]])
@@ -18,9 +23,28 @@ WHITE = np.ones(3)
 GRID = SnowGrid((0.013, 0.027), (-1.0, 3.0), 0.05, 32)
 
 
-def bake(solids, depth=0.1, grid=GRID, light=WHITE, sun=None, seed=0, **snow):
+@dataclasses.dataclass(frozen=True)
+class Roof:
+    """The part of a box below a plane."""
+
+    box: Box
+    plane: HalfSpace
+    colour = (0.5, 0.2, 0.1)
+    checker = 0.0
+
+    def interval(self, origins, directions):
+        (enter, leave), (first, last) = (
+            part.interval(origins, directions) for part in (self.box, self.plane)
+        )
+        return torch.maximum(enter, first), torch.minimum(leave, last)
+
+    def distance(self, x):
+        return torch.maximum(self.box.distance(x), self.plane.distance(x))
+
+
+def bake(solids, depth=0.1, grid=GRID, illumination=WHITE, sun=None, seed=0, **snow):
     field = AnalyticField(solids, box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
-    return bake_snow(field, Snow(depth=depth, **snow), CAMERAS, light, sun, seed, grid)
+    return bake_snow(field, Snow(depth=depth, **snow), CAMERAS, illumination, sun, seed, grid)
 
 
 def on_plane(plane: HalfSpace, n: int, half: float = 1.3, seed: int = 0) -> torch.Tensor:
@@ -82,23 +106,32 @@ def test_thickness_over_planes(case):
     assert (normal @ torch.tensor(plane.normal)).min() > math.cos(math.radians(6))
 
 
-def test_coverage_is_a_logistic_of_the_slope():
-    for slope in (20.0, 30.0, 35.0, 37.0, 39.0, 45.0, 60.0):
+SHARES = ((20.0, 1.0), (35.0, 0.83), (42.0, 0.6), (50.0, 0.33), (65.0, 0.0))
+"""Slopes (deg) and the fraction of the snow that they keep, EN 1991-1-3, 5.3."""
+
+
+@pytest.mark.parametrize(("slope", "share"), SHARES)
+def test_slopes_keep_a_share_of_the_depth(slope, share):
+    plane = ground(math.radians(slope), 0.7)
+    box = ((-8.0, -8.0, -4.0), (8.0, 8.0, 4.0))
+    grid = SnowGrid((0.013, 0.027), (-3.0, 3.0), 0.05, 32)
+    snow = bake_snow(AnalyticField([plane], box=box), Snow(depth=0.1), CAMERAS, WHITE, grid=grid)
+    assert snow is not None
+    feet = on_plane(plane, 100, 0.5)
+    depth = depth_over(snow, feet).numpy()
+    assert depth == pytest.approx(np.full(100, share * 0.1), rel=0.1, abs=1e-3)
+    if share:
+        found = snow.thickness(feet + torch.tensor([0.0, 0.0, share * 0.1])).numpy()
+        assert found == pytest.approx(np.full(100, share * 0.1), abs=5e-3), "also the layer"
+
+
+def test_the_papers_slope_is_an_option():
+    logistic = 1 / (1 + math.exp(-50 * (math.cos(math.radians(35)) - math.cos(math.radians(37)))))
+    for slope, share in ((20.0, 1.0), (35.0, logistic), (45.0, 0.0)):
         plane = ground(math.radians(slope), 0.7)
-        snow = bake([plane], 0.1)
-        logistic = 1 / (
-            1 + math.exp(-50 * (math.cos(math.radians(slope)) - math.cos(math.radians(37))))
-        )
-        middle = np.abs(snow.deposits.position[:, :2]).max(1) < 0.8
-        if logistic > 0.01:
-            assert snow.deposits.weight[middle].mean() == pytest.approx(logistic, abs=0.02)
-        else:
-            assert snow.deposits.weight[middle].sum() == 0 or snow.deposits.weight.max() < 0.02
-        covered = float((depth_over(snow, on_plane(plane, 400, 0.6)) > 0).float().mean())
-        if slope < 36:
-            assert covered == 1
-        if slope > 38:
-            assert covered == 0
+        snow = bake([plane], 0.1, slope=math.radians(37))
+        depth = depth_over(snow, on_plane(plane, 100, 0.5)).numpy()
+        assert depth == pytest.approx(np.full(100, share * 0.1), rel=0.1, abs=4e-3)
 
 
 def test_ground_is_bare_under_a_roof_and_covered_in_the_open():
@@ -127,7 +160,7 @@ def test_no_snow_hangs_below_a_thin_table():
         for z in (0.69, 0.66, 0.6, 0.5):
             below = torch.cat([xy, torch.full((4000, 1), z)], -1)
             assert snow.density(below).max() == 0
-        on_top = torch.cat([xy, torch.full((4000, 1), 0.75)], -1)[(xy.abs() < 0.5).all(1)]
+        on_top = torch.cat([xy, torch.full((4000, 1), 0.75)], -1)[(xy.abs() < 0.3).all(1)]
         assert depth_over(snow, on_top).numpy() == pytest.approx(depth, rel=0.1)
 
 
@@ -167,11 +200,15 @@ def test_empty_scene_and_extreme_parameters_stay_finite():
         {"slope": math.pi / 2, "albedo_offset": 0.0, "wrap": 0.0},
     ):
         snow = bake([ground(), *table()], 2.0, sun=np.array([0.0, 0.8, 0.6]), **extreme)
-        assert np.isfinite(snow.deposits.position).all()
+        for catch in snow.deposits.cascades[0]:
+            used = catch.weight > 0
+            assert np.isfinite(catch.position[used]).all()
+            assert np.isfinite(catch.of_fall).all() and np.isfinite(catch.of_held).all()
         points = torch.rand(3000, 3) * torch.tensor([2.4, 2.4, 3.5]) - torch.tensor([1.2, 1.2, 0.5])
         for value in (snow.density(points), snow.colour(points), snow.normal(points)):
             assert torch.isfinite(value).all()
         assert (snow.colour(points) >= 0).all()
+        assert not torch.isnan(snow.thickness(points)).any()
 
 
 def test_snow_depends_on_the_seed_but_not_on_threads():
@@ -192,35 +229,146 @@ def test_snow_depends_on_the_seed_but_not_on_threads():
         assert np.array_equal(one, other)
     assert torch.equal(expected.t, again.t)
     assert torch.equal(expected.sigma, again.sigma)
-    assert not np.array_equal(first.deposits.weight, bake(scene, seed=4).deposits.weight)
+    other = bake(scene, seed=4).deposits.cascades[0][0]
+    assert not np.array_equal(first.deposits.cascades[0][0].position, other.position)
 
 
-def test_brightness_over_white_and_black_ground():
+def test_the_papers_brightness_over_white_and_black_ground():
     white = HalfSpace(colour=(1.0, 1.0, 1.0))
     feet = on_plane(white, 50)
     top = feet + torch.tensor([0.0, 0.0, 0.1])
     # Snow on white ground has the radiance of a white surface in the scene's light.
     light = np.array([0.02, 0.03, 0.05])
-    dim = bake([white], light=light / 10)
+    dim = bake([white], illumination=light / 10, light="paper")
     expected = np.broadcast_to(light / 10, (50, 3))
     assert dim.colour(top).numpy() == pytest.approx(expected, rel=0.02)
-    assert bake([white], light=light).colour(top).numpy() == pytest.approx(
+    assert bake([white], illumination=light, light="paper").colour(top).numpy() == pytest.approx(
         np.broadcast_to(light, (50, 3)), rel=0.02
     )
     # On black ground: (0 + c0)/(1 + c0).
-    dark = bake([HalfSpace(colour=(0.0, 0.0, 0.0))]).colour(top)
+    dark = bake([HalfSpace(colour=(0.0, 0.0, 0.0))], light="paper").colour(top)
     assert dark.numpy() == pytest.approx(0.8, rel=0.02)
 
 
-def test_sun_shadow_darkens_snow():
+def test_the_papers_sun_shadow_darkens_snow():
     wall = Box((0.5, -8.0, -1.0), (0.7, 8.0, 1.0))
     sun = np.array([math.sqrt(0.5), 0.0, math.sqrt(0.5)])
-    snow = bake([HalfSpace(colour=(1.0, 1.0, 1.0)), wall], sun=sun)
+    snow = bake([HalfSpace(colour=(1.0, 1.0, 1.0)), wall], sun=sun, light="paper")
     wrap = (math.sqrt(0.5) + 8) / 9
     shadowed = snow.colour(torch.tensor([[0.1, 0.0, 0.1], [-0.2, 0.3, 0.1]]))
     lit = snow.colour(torch.tensor([[-0.9, 0.0, 0.1], [1.2, 0.3, 0.1]]))
     assert shadowed.numpy() == pytest.approx(0.3 * wrap, rel=0.02)
     assert lit.numpy() == pytest.approx(wrap, rel=0.02)
+
+
+def test_the_colour_of_snow_is_its_albedo_in_the_light():
+    light = np.array([0.2, 0.3, 0.5])
+    top = on_plane(ground(), 50) + torch.tensor([0.0, 0.0, 0.3])
+    for snow in (Snow(depth=0.3), Snow(depth=0.3, albedo=0.6)):
+        colour = bake([ground()], 0.3, illumination=light, albedo=snow.albedo).colour(top)
+        expected = np.broadcast_to(light * albedo_of(snow), (50, 3))
+        assert colour.numpy() == pytest.approx(expected, rel=0.01)
+
+
+def test_thin_snow_lets_the_ground_through_and_deep_snow_hides_it():
+    """A board of squares, dark and light: its contrast fades with depth, monotonously."""
+    board = HalfSpace(colour=(0.8, 0.8, 0.8), checker=0.5)
+    field = AnalyticField([board], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
+    feet = on_plane(board, 400, 1.2)
+    down = torch.tensor([0.0, 0.0, -1.0]).expand(400, 3).contiguous()
+    bare = field.colour(feet, down)[:, 0]
+    dark, light = bare < 0.1, bare > 0.7
+    assert dark.any() and light.any()
+    deposits = bake([board], 0.1)
+    contrast, mean = [], []
+    for depth in (2.5e-4, 1e-3, 2e-3, 3e-3, 5e-3, 0.01, 0.02, 0.05, 0.1, 0.15):
+        snow = dataclasses.replace(deposits.with_depth(depth), ground=field)
+        seen = snow.colour(feet + torch.tensor([0.0, 0.0, depth]))[:, 0]
+        contrast.append(float((seen[light].mean() - seen[dark].mean()) / seen.mean()))
+        mean.append(float(seen[dark].mean()))
+    assert np.all(np.diff(contrast) < 0)
+    assert contrast[0] > 0.4
+    assert contrast[-1] < 0.01
+    assert np.all(np.diff(mean) >= 0)
+    assert mean[0] == pytest.approx(float(bare[dark].mean()), abs=0.12)
+
+
+def test_brightness_has_no_steps_in_depth():
+    ground_colour = HalfSpace(colour=(0.12, 0.12, 0.12))
+    field = AnalyticField([ground_colour], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
+    baked = dataclasses.replace(bake([ground_colour], 0.1), ground=field)
+    feet = on_plane(ground_colour, 40, 1.0)
+    seen = [0.12]
+    for depth in np.arange(1, 30) * 5e-4:
+        snow = dataclasses.replace(baked.with_depth(float(depth)), ground=field)
+        seen.append(float(snow.colour(feet + torch.tensor([0.0, 0.0, float(depth)])).mean()))
+    steps = np.diff(seen)
+    assert np.all(steps > -2e-3)
+    # Each is half a millimetre; the first millimetres of snow whiten dark ground fastest.
+    assert steps.max() < 0.12
+    assert steps[4:].max() < 0.05, "after two millimetres no more than a tenth a millimetre"
+
+
+def test_contact_shade_at_a_dark_wall():
+    """Next to a tall wall half of the sky is hidden. The factor is what probes do not see of it."""
+    wall = Box((1.0, -8.0, -1.0), (1.2, 8.0, 3.0), (0.05, 0.05, 0.05))
+    field = AnalyticField([ground(), wall], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5)))
+    x = np.array([[0.92, 0.0, 0.1], [0.7, 0.0, 0.1], [0.0, 0.0, 0.1], [-7.0, 0.0, 0.1]])
+    openness = openness_of(field, x.astype(np.float32))
+    assert 0.4 < openness[0] < 0.65
+    assert np.all(np.diff(openness) >= 0)
+    assert openness[3] == pytest.approx(1)
+    grid = SnowGrid((0.0, 0.0), (-1.0, 3.2), 0.06, 64)
+    snow = bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=grid)
+    assert snow is not None
+    near = snow.colour(torch.tensor([[0.85, y, 0.1] for y in (-0.5, 0.0, 0.5)]))
+    far = snow.colour(torch.tensor([[-3.0, y, 0.1] for y in (-0.5, 0.0, 0.5)]))
+    assert 0.8 < float(near.mean() / far.mean()) < 0.92, "the rest is in the probes"
+
+
+def test_a_steep_roof_sheds_its_snow_to_the_ground_below():
+    """A roof of 50 degrees keeps a third; two thirds lie before its eaves."""
+    slope = math.radians(50)
+    normal = (math.sin(slope), 0.0, math.cos(slope))
+    roof = Roof(Box((0.0, -8.0, 0.5), (1.0, 8.0, 2.6)), HalfSpace(normal, 2.2 * math.cos(slope)))
+    box = ((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5))
+    field = LabelledField([ground(), roof], classes=[ROAD, BUILDING], box=box)
+    grid = SnowGrid((0.0, 0.0), (-1.0, 3.2), 0.05, 64)
+    snow = bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=grid)
+    assert snow is not None
+    xs = torch.linspace(1.1, 2.6, 16)
+    rows = torch.linspace(-0.3, 0.3, 7)
+    feet = torch.stack([*torch.meshgrid(xs, rows, indexing="ij"), torch.zeros(16, 7)], -1)
+    before = depth_over(snow, feet.reshape(-1, 3)).view(16, 7).mean(1).numpy()
+    arrived = float(np.trapezoid(before - 0.1, xs.numpy()))
+    assert arrived == pytest.approx(2 / 3 * 0.1 * 1.0, rel=0.35)
+    behind = depth_over(snow, on_plane(ground(), 40, 0.2) - torch.tensor([2.5, 0.0, 0.0]))
+    assert behind.numpy() == pytest.approx(0.1, rel=0.1)
+
+
+def test_deep_snow_on_a_post_and_a_bench_slopes_at_the_angle_of_repose():
+    post = Box((-0.05, -0.05, -1.0), (0.05, 0.05, 0.8))
+    bench = Box((0.6, -0.4, -1.0), (1.4, 0.4, 0.5))
+    snow = bake([ground(), post, bench], 0.6, SnowGrid((0.013, 0.027), (-1.0, 2.0), 0.05, 48))
+    over_post = depth_over(snow, torch.tensor([[0.0, 0.0, 0.8]]))
+    assert float(over_post) < 0.25, "no tower"
+    x = torch.linspace(0.65, 1.35, 15)
+    top = torch.stack([x, 0 * x, torch.full_like(x, 0.5)], -1)
+    height = depth_over(snow, top).numpy()
+    assert height.max() > 0.3
+    steepest = np.abs(np.diff(height) / np.diff(x.numpy())).max()
+    assert steepest < math.tan(math.radians(60))
+
+
+def test_snow_melts_in_water_and_stays_on_dry_ground():
+    """Ground 5 cm under water shows none of 10 cm of snow; ground 5 cm above it shows all."""
+    step = Box((0.0, -8.0, -1.0), (8.0, 8.0, 0.1))
+    snow = bake([ground(), step]).above(0.05)
+    under = on_plane(ground(), 100, 0.4) - torch.tensor([0.8, 0.0, 0.0])
+    dry = on_plane(ground(height=0.1), 100, 0.4) + torch.tensor([0.8, 0.0, 0.0])
+    assert depth_over(snow, under).max() == 0
+    assert not snow.covers(under + torch.tensor([0.0, 0.0, 0.02])).any()
+    assert depth_over(snow, dry).numpy() == pytest.approx(0.1, rel=0.1)
 
 
 def test_tilted_fall_leaves_the_lee_of_a_wall_bare():

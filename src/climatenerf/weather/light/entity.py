@@ -17,6 +17,7 @@ from climatenerf.core.colour import luma
 from climatenerf.core.device import to_device
 from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import NORMALS
+from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import device_of, observed
 from climatenerf.weather.light import skies
 from climatenerf.weather.light.captured import (
@@ -25,7 +26,6 @@ from climatenerf.weather.light.captured import (
     elevation_azimuth,
 )
 from climatenerf.weather.light.file import light_of_photos_in
-from climatenerf.weather.light.normals import normals_at
 from climatenerf.weather.light.parameters import Sun
 from climatenerf.weather.light.probes import GatheredLight, gather
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo, estimate
@@ -40,11 +40,10 @@ from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.light.sun_map import SunMap, sun_map
 from climatenerf.weather.smog.medium import sigma_of
 from climatenerf.weather.smog.scattering import sun_transmittance
+from climatenerf.weather.snow.optics import albedo_of, slab_reflectance
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
 
-SNOW_ALBEDO = 0.87  # of fresh snow in the mean over visible light
-COVERING = 0.02  # m of snow that hide what lies below by 1 - 1/e
 STEEPEST, LEVEL = math.radians(60), math.radians(30)  # slopes that keep no snow, and all of it
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
@@ -173,10 +172,12 @@ class LightEntity:
             return world  # snow, water and smog are lit as in the open
         override = None if new_sky else self._sun_of_photos(weather)
         old = self._photographed(override)
-        cover = round((1 - math.exp(-snow / COVERING)) * COVER_STEPS) / COVER_STEPS
+        slab = float(slab_reflectance(torch.tensor(snow, device="cpu"), weather.snow.grain))
+        cover = round(slab * COVER_STEPS) / COVER_STEPS
         if not new_sky and cover == 0 and not (old.sun is not None and _lit_smog(weather)):
             return replace(world, light=old)
-        key = (weather.sky, weather.sun, cover, weather.smog if _lit_smog(weather) else None)
+        white = _whiteness(weather) if cover else ()
+        key = (weather.sky, weather.sun, cover, white, weather.smog if _lit_smog(weather) else None)
         if self._last is None or self._last[0] != key:
             new = self._new_light(weather, old, cover)
             brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
@@ -186,7 +187,8 @@ class LightEntity:
         return replace(world, field=field, light=new)
 
     def _new_light(self, weather: Weather, old: SceneLight, cover: float) -> SceneLight:
-        surfaces = Surfaces(functools.partial(snow_cover, cover), SNOW_ALBEDO) if cover else None
+        albedo = to_device(np.array(_whiteness(weather), np.float32), device_of(self._given.field))
+        surfaces = Surfaces(functools.partial(snow_cover, cover), albedo) if cover else None
         if weather.sky.kind == "captured":
             return relit(self._gathered, old, below_smog(weather, old), surfaces)
         sky = self._sky(weather)
@@ -326,6 +328,11 @@ def below_smog(weather: Weather, light: SceneLight) -> SceneLight:
         return light.radiance(d) + spread
 
     return replace(light, radiance=radiance, sun_irradiance=kept, captured=None)
+
+
+def _whiteness(weather: Weather) -> tuple[float, ...]:
+    """Reflectance of the snow in steps of a hundredth, in which light is computed anew."""
+    return tuple(np.round(albedo_of(weather.snow), 2).tolist())
 
 
 def _lit_smog(weather: Weather) -> bool:

@@ -17,9 +17,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from climatenerf.field.compositing import chunks, composited
+from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField
 from climatenerf.ops.probes import ProbeGrid
-from climatenerf.weather.light.normals import normals_at
 from climatenerf.weather.light.spherical import project, sphere_directions
 
 RAYS = 64  # from each probe

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import observed
 from climatenerf.field.wrapped import WrappedField
-from climatenerf.weather.light.normals import normals_at
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
 from climatenerf.weather.light.scene_light import MOST, SceneLight
 

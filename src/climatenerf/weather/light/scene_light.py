@@ -48,10 +48,19 @@ class SceneLight:
     captured: CapturedLight | None = None
 
     def irradiance(
-        self, x: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]
+        self,
+        x: Float[Tensor, "n 3"],
+        normal: Float[Tensor, "n 3"],
+        diffuse: Float[Tensor, "n"] | None = None,
     ) -> Float[Tensor, "n 3"]:
-        """Irradiance of surfaces at positions x (world m) with unit normals."""
-        return self.shaded((self,), x, normal)[0] + self.direct(x, normal)
+        """Irradiance of surfaces at positions x (world m) with unit normals.
+
+        `diffuse` is the fraction of the light of sky and surfaces that arrives; None: all.
+        """
+        (shaded,) = self.shaded((self,), x, normal)
+        if diffuse is not None:
+            shaded = shaded * diffuse[:, None]
+        return shaded + self.direct(x, normal)
 
     @staticmethod
     def shaded(
@@ -142,7 +151,7 @@ class Surfaces:
     """
 
     cover: Callable[[Float[Tensor, "*n"]], Float[Tensor, "*n"]]
-    albedo: float
+    albedo: Float[Tensor, "3"]
 
 
 def relit(

@@ -1,34 +1,55 @@
-"""Deposition of snow: rays along the fall direction, from the sky into the fitted field.
+"""Deposition of snow: what catches it below each ray along the fall direction.
 
 Snow stays where such a ray first meets a surface, so the ground under a roof or a table stays bare.
-The deposit of a ray lies where its transmittance is 1/2. Thin floaters and the blurred density of a
-fitted surface shift that point little or not at all.
+Crowns hold a part of the snow and let the rest through.
 """
 
-import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
+from scipy import ndimage
 from torch import Tensor
 
+from climatenerf.core.classes import GROUND, SOLID_OF, VEGETATION
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.srgb import LUMA
-from climatenerf.field.protocol import RadianceField, device_of
-from climatenerf.weather.snow.lattice import Deposits, SnowGrid
+from climatenerf.field.capabilities import CLASSES, NORMALS
+from climatenerf.field.normals import normals_at
+from climatenerf.field.protocol import RadianceField, device_of, ground_height
+from climatenerf.weather.snow.cover import (
+    WALL,
+    bridged,
+    cushions,
+    lumps,
+    slid,
+    slope_share,
+    to_edges,
+)
+from climatenerf.weather.snow.fall_rays import (
+    PASSES,
+    SINGLE_PASS,
+    FallRays,
+    cast,
+    fall_directions,
+    inner_side,
+)
+from climatenerf.weather.snow.lattice import SHADE_UNIT, Catch, Deposits, SnowGrid
+from climatenerf.weather.snow.openness import contact_shade
 from climatenerf.weather.snow.parameters import Snow
-from climatenerf.weather.snow.surface_fit import half_transmittance, smooth_ground
+from climatenerf.weather.snow.surface_fit import smooth_ground
 
-PASSES = 3
-"""Number of fall directions; three, so that no half-sheltered point is exactly at the threshold."""
-SLOPE_BASE = 0.4  # m; a fitted surface is rough, and slopes over a shorter base are noise
-_FIRST_SINGLE_PASS = 2  # cascades from this one on use one fall direction
-JITTER = 0.05
-"""Spread of the fall direction, rad."""
-_CHUNK = 1 << 14  # rays per march
-_STRETCH = 100.0  # spacings; a field's steps may grow along a ray, so rays restart after this
+LEAF = int(SOLID_OF[VEGETATION])
+GROUND_KINDS = SOLID_OF[list(GROUND)]
+UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
+STEPS = 8  # towards the ground below a slanted ray
+SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
+ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
+SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
+_CHUNK = 1 << 14  # positions per evaluation
 
 
 class Light(NamedTuple):
@@ -38,32 +59,6 @@ class Light(NamedTuple):
     """Linear radiance of a white, unoccluded horizontal surface."""
     sun_direction: Float[np.ndarray, "3"] | None
     """Unit vector towards the sun, world frame; None or below the horizon: diffuse light only."""
-
-
-def fall_directions(snow: Snow, seed: int) -> Float[np.ndarray, "p 3"]:
-    """Return the fall direction of each pass: the tilted mean direction plus a small spread.
-
-    Args:
-        snow: fall_tilt and wind_direction (where the wind comes from, clockwise from +y), rad.
-        seed: random seed of the rotation of the spread.
-
-    Returns:
-        Unit vectors that point downwards, world frame.
-    """
-    tilt, azimuth = snow.fall_tilt, snow.wind_direction
-    away = -np.array([math.sin(azimuth), math.cos(azimuth), 0.0])
-    fall = math.sin(tilt) * away - math.cos(tilt) * np.array([0.0, 0.0, 1.0])
-    across = np.array([away[1], -away[0], 0.0])
-    along = np.cross(across, fall)
-    # Evenly spaced on a circle with the same variance as a disc of radius JITTER.
-    phase = np.random.default_rng(seed).uniform(0, 2 * math.pi)
-    angles = phase + 2 * math.pi * np.arange(PASSES) / PASSES
-    spread = JITTER / math.sqrt(2)
-    directions = fall + spread * (
-        np.cos(angles)[:, None] * across + np.sin(angles)[:, None] * along
-    )
-    # Even at the largest tilt (80 deg) every direction points downwards.
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def find_deposits(
@@ -80,8 +75,8 @@ def find_deposits(
 
     Args:
         field: the fitted field.
-        snow: fall direction, slope and colour. Its depth only sets the height from which shadow
-            rays towards the sun start.
+        snow: fall direction, slope and colour. Its depth only sets the height from which the
+            paper's shadow rays towards the sun start.
         grid: extent and spacing of the search.
         light: illumination of the scene.
         cameras: camera positions, m. Colours of the ground are those seen from the nearest one.
@@ -93,13 +88,11 @@ def find_deposits(
         The deposits; empty where no surface catches snow.
     """
     directions = fall_directions(snow, seed)
-    passes = np.array([PASSES if k < _FIRST_SINGLE_PASS else 1 for k in range(grid.cascades)])
+    passes = np.array([PASSES if k < SINGLE_PASS else 1 for k in range(grid.cascades)])
     done, total = 0, int(passes.sum())
-    positions: list[np.ndarray] = []
-    weights: list[np.ndarray] = []
-    shades: list[np.ndarray] = []
-    ends = [0]
+    cascades: list[tuple[Catch, ...]] = []
     for k in range(grid.cascades):
+        catches: list[Catch] = []
         for p in range(passes[k]):
 
             def pass_progress(fraction: float, done: int = done) -> None:
@@ -107,155 +100,172 @@ def find_deposits(
                     progress((done + fraction) / total)
 
             random = np.random.default_rng([seed, k, p])
-            hits, weight = _run_pass(field, snow, grid, k, directions[p], random, pass_progress)
+            rays = cast(field, grid, k, directions[p], random, pass_progress)
+            found = _caught(field, snow, grid, k, rays)
             done += 1
-            shade = np.full(len(hits), np.nan, np.float32)
-            if p == 0:
-                shade = _shade(field, snow, hits, grid.spacing_of(k), light, cameras, appearance)
-            positions.append(hits)
-            weights.append(weight)
-            shades.append(shade)
-        ends.append(sum(map(len, positions)))
-    return Deposits(
-        grid,
-        np.concatenate(positions),
-        np.concatenate(weights),
-        np.concatenate(shades),
-        np.array(ends, np.int64),
-        passes,
+            if p == 0 and snow.light == "paper":
+                found = [
+                    replace(each, shade=_shade(field, snow, each, grid.spacing_of(k), light,
+                                               cameras, appearance))
+                    for each in found
+                ]  # fmt: skip
+            elif p == 0 and k < SINGLE_PASS:
+                found[0] = _in_contact_shade(field, found[0], grid.spacing_of(k))
+            catches += found
+        cascades.append(tuple(catches))
+    return Deposits(grid, tuple(cascades), passes)
+
+
+def _caught(
+    field: RadianceField, snow: Snow, grid: SnowGrid, cascade: int, rays: FallRays
+) -> list[Catch]:
+    """What catches the snow of one pass over one cascade: surfaces, and crowns above them if any.
+
+    The tent functions of `snow.lattice` on the rays' grid are a partition of unity, so level ground
+    receives exactly the same amount of snow everywhere.
+    """
+    h = grid.spacing_of(cascade)
+    normal_z, kind = _seen_from_above(field, rays)
+    ground = _ground_below(field, rays)
+    surface, leaves = surfaces_and_leaves(rays.surface, kind, ground)
+    on_ground = np.isin(kind, GROUND_KINDS) | (surface == ground)
+    surface = bridged(surface, on_ground, rays.reached, h)
+    crown = cushions(np.where(np.isfinite(leaves), rays.leaves, np.nan), h)
+    # Snow lies on a smoothed ground, since a fitted surface is rough by centimetres.
+    # Far ground is rougher in the field: its slopes are measured over more metres.
+    base = max(SLOPE_CELLS, round(SLOPE_BASE / h))
+    fall = rays.direction / -rays.direction[2]
+    smooth, cosine = smooth_ground(rays.at(surface), fall, 0.03 + 0.5 * h, base)
+    own = surface == rays.surface  # NaN compares False: elsewhere the terrain stands in
+    # Learned normals are more accurate at edges and on curved surfaces than heights on a raster. On
+    # far ground they are too noisy.
+    learned = own & np.isfinite(normal_z) & ~(on_ground & (cascade >= SINGLE_PASS))
+    cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
+    share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
+    wall = cosine < WALL
+    edged = to_edges(share, surface, h)
+    # In slanted snow walls are slopes of the raster; their cells are no edges.
+    share = np.where(wall & (-rays.direction[2] < SLANTED), share, edged)
+    # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there.
+    lost = np.where(wall, 0.0, 1 - share)
+    arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
+    caught = crown.complete * np.clip(rays.opacity, 0, 1)
+    weight = np.where(own, np.clip((rays.opacity - 0.5) / 0.1, 0, 1), 1.0)  # the terrain is whole
+    catches = [_catch(smooth, share + arrived, -share * caught, weight)]
+    if caught.any():
+        position = rays.at(crown.height)
+        cap = _catch(position, 0 * caught, caught, (caught > 0).astype(np.float64))
+        if snow.light == "scene":  # in the light of its place, as the probes see it
+            cap = replace(cap, shade=np.full_like(cap.shade, SHADE_UNIT))
+        catches.append(cap)
+    half, inner = grid.half_side(cascade) + 3 * h, inner_side(grid, cascade)
+    kept = []
+    for each in catches:
+        offset = np.abs(each.position[..., :2] - np.array(grid.centre, np.float32)).max(-1)
+        inside = (offset < half) & (offset >= inner)  # NaN compares False
+        kept.append(replace(each, weight=each.weight * inside))
+    return kept
+
+
+def _catch(
+    position: Float32[np.ndarray, "h w 3"],
+    of_fall: Float[np.ndarray, "h w"],
+    of_held: Float[np.ndarray, "h w"],
+    weight: Float[np.ndarray, "h w"],
+) -> Catch:
+    weight = np.where(np.isfinite(position[..., 2]) & (weight > 1e-3), weight, 0.0)
+    shade = np.full(weight.shape, np.nan, np.float32)
+    single = np.float32
+    return Catch(
+        position, of_fall.astype(single), of_held.astype(single), weight.astype(single), shade
     )
 
 
-def _run_pass(
-    field: RadianceField,
-    snow: Snow,
-    grid: SnowGrid,
-    cascade: int,
-    direction: Float[np.ndarray, "3"],
-    random: np.random.Generator,
-    progress: Callable[[float], None],
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n"]]:
-    """Run one pass over one cascade: parallel rays on a square grid, one per cell.
+def surfaces_and_leaves(
+    height: Float[np.ndarray, "h w"], kind: Int[np.ndarray, "h w"], ground: Float[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Separate leaves from what lies below, and put the terrain where the field has veils or holes.
 
-    The tent functions of `snow.lattice` on this grid are a partition of unity, so horizontal ground
-    receives exactly the same amount of snow everywhere.
+    Args:
+        height: world z at which fall rays end, m; NaN without an end.
+        kind: class there, as an index in `core.classes.SOLID`; -1: unknown, which is solid.
+        ground: height of the terrain, m; NaN where it is unknown.
 
     Returns:
-        Deposits (m, world frame) and their weights, 0 to 1.
+        Heights of solid surfaces and of leaves, m; NaN without one.
     """
-    h = grid.spacing_of(cascade)
-    half = grid.half_side(cascade) + 3 * h
-    bottom, top = grid.z_range
-    middle = (bottom + top) / 2
-    drift = direction[:2] / -direction[2]  # metres sideways per metre of fall
-    # Rays are indexed by where they cross the middle height. A ray that lands in the square may
-    # cross the middle height up to `margin` outside it; the margin is at most half a side.
-    margin = np.minimum(np.abs(drift) * (top - bottom) / 2, half)
-    count = np.ceil((2 * (half + margin)) / h).astype(int)
-    first = np.array(grid.centre) - half - margin + random.uniform(0, h, 2)
-    hits = np.full((count[1], count[0], 3), np.nan, np.float32)
-    opacity = np.zeros((count[1], count[0]), np.float32)
-    rows, device = max(1, _CHUNK // count[0]), device_of(field)
-    inner = grid.half_side(cascade - 1) - 3 * h if cascade > 0 else 0.0
-    for row in range(0, count[1], rows):
-        j = np.arange(row, min(row + rows, count[1]))
-        x = np.broadcast_to(first[0] + np.arange(count[0]) * h, (len(j), count[0]))
-        y = np.broadcast_to((first[1] + j * h)[:, None], x.shape)
-        crossing = np.stack([x, y], -1)
-        start = crossing - drift * (top - middle)
-        selected = _leaves_square(start, crossing + drift * (middle - bottom), grid.centre, inner)
-        rays_o = np.concatenate([start[selected], np.full((int(selected.sum()), 1), top)], -1)
-        length = (top - bottom) / -direction[2]
-        hit_t, hit_opacity = _first_hits(
-            field, rays_o, direction, length, _STRETCH * h, random, device
-        )
-        hits[row : row + len(j)][selected] = rays_o + hit_t[:, None] * direction
-        opacity[row : row + len(j)][selected] = hit_opacity
-        progress(min(row + rows, count[1]) / count[1])
-    # Snow lies on a smoothed ground, since a fitted surface is rough by centimetres.
-    base = max(2, round(SLOPE_BASE / h))
-    smooth, slope_cosine = smooth_ground(hits, direction / -direction[2], 0.03 + 0.5 * h, base)
-    weight = np.clip((opacity - 0.5) / 0.3, 0, 1)
-    logit = snow.slope_sharpness * (slope_cosine - math.cos(snow.slope))
-    weight = weight / (1 + np.exp(-np.clip(logit, -60, 60)))
-    offset = np.abs(smooth[..., :2] - np.array(grid.centre, np.float32)).max(-1)
-    keep = (weight > 1e-3) & (offset < half) & (offset >= inner)  # no hit: NaN compares False
-    return smooth[keep], weight[keep].astype(np.float32)
+    low = height < ground + UNDERGROWTH  # NaN compares False
+    leaf = (kind == LEAF) & ~low
+    surface = np.where(leaf, np.nan, height)
+    astray = lumps(surface, np.isin(kind, GROUND_KINDS), ground, ASTRAY)
+    surface = np.where((astray | leaf) & np.isfinite(ground), ground, surface)
+    return surface, np.where(leaf, height, np.nan)
 
 
-def _leaves_square(
-    start: Float[np.ndarray, "*n 2"],
-    end: Float[np.ndarray, "*n 2"],
-    centre: tuple[float, float],
-    inner: float,
-) -> np.ndarray:
-    """Return True for rays with an end outside the inner square.
+def _ground_below(field: RadianceField, rays: FallRays) -> Float[np.ndarray, "h w"]:
+    """Height of the terrain below the ends of fall rays, m; NaN where it is unknown."""
+    hit = np.isfinite(rays.surface)
+    usual = np.median(rays.surface[hit]) if hit.any() else 0.0
+    start = np.where(hit, rays.surface, usual)
+    ground, before = np.full(start.shape, np.nan), start
+    for _ in range(STEPS):  # a slanted ray shifts between its end and the ground below
+        before = start
+        xy = to_device(rays.at(start)[..., :2].reshape(-1, 2), device_of(field))
+        ground = to_numpy(ground_height(field, xy)).reshape(start.shape).astype(np.float64)
+        start = np.where(np.isfinite(ground), ground, start)
+    # On ground as steep as the rays the steps do not converge.
+    ground[~rays.reached | (np.abs(start - before) > 0.05)] = np.nan
+    return ground
 
-    The finer cascade handles the other rays.
+
+def _seen_from_above(
+    field: RadianceField, rays: FallRays
+) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
+    """The normals' z and the classes (indices in `core.classes.SOLID`) where fall rays end.
+
+    NaN and -1 where they do not, and where the field has learned none.
     """
-    if inner <= 0:
-        return np.ones(start.shape[:-1], bool)
-    offset = np.maximum(np.abs(start - np.array(centre)), np.abs(end - np.array(centre)))
-    return offset.max(-1) >= inner
+    hit = np.isfinite(rays.surface)
+    normal_z, kind = np.full(hit.shape, np.nan), np.full(hit.shape, -1)
+    if not field.capabilities & {NORMALS, CLASSES} or not hit.any():
+        return normal_z, kind
+    device = device_of(field)
+    d = to_device(rays.direction.astype(np.float32), device)
+    parts = []
+    for points in to_device(rays.at(rays.surface)[hit], device).split(_CHUNK):
+        parts.append(normals_at(field, points, d.expand_as(points).contiguous()))
+    if NORMALS in field.capabilities:
+        normal_z[hit] = np.concatenate([to_numpy(normal[:, 2]) for normal, _ in parts])
+    if CLASSES in field.capabilities:
+        kind[hit] = np.concatenate([to_numpy(each) for _, each in parts])
+    return normal_z, kind
 
 
-def _first_hits(
-    field: RadianceField,
-    rays_o: Float[np.ndarray, "n 3"],
-    direction: Float[np.ndarray, "3"],
-    length: float,
-    stretch: float,
-    random: np.random.Generator,
-    device: torch.device,
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Return the ray length of transmittance 1/2 (NaN: never reached) and the opacity.
-
-    Rays are marched in stretches of `stretch` metres, and the first stretch has a random length.
-    Otherwise the samples of neighbouring rays would lie at equal heights, and gently sloping ground
-    would get steps.
-    """
-    hit_t = np.full(len(rays_o), np.nan)
-    depth = np.zeros(len(rays_o))  # optical depth so far
-    next_start = -random.uniform(0, stretch, len(rays_o))
-    active = np.arange(len(rays_o))
-    heading = torch.tensor(direction, dtype=torch.float32, device=device)
-    while len(active):
-        start = next_start[active]
-        origins = (rays_o[active] + start[:, None] * direction).astype(np.float32)
-        origins = to_device(origins, device)
-        directions = heading.expand_as(origins).contiguous()
-        t_min = to_device(np.maximum(-start, 0).astype(np.float32), device)
-        t_max = to_device(np.minimum(length - start, stretch).astype(np.float32), device)
-        samples = field.march(origins, directions, t_min, t_max)
-        parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
-        found_t, found_depth = half_transmittance(
-            *(to_numpy(part) for part in parts), depth[active]
-        )
-        hit_t[active] = np.where(np.isnan(found_t), hit_t[active], found_t + start)
-        depth[active] = found_depth
-        next_start[active] += stretch
-        active = active[(found_depth < 7) & (next_start[active] < length)]
-    # A ray that starts inside a solid (a tower higher than the region) has no deposit.
-    hit_t[hit_t < 0.01] = np.nan
-    return hit_t, -np.expm1(-depth)
+def _in_contact_shade(field: RadianceField, catch: Catch, spacing: float) -> Catch:
+    """The same with the share of light that what stands close by leaves, in `SHADE_UNIT`."""
+    lift = max(0.1, 2 * spacing)  # for any depth, since deposits serve all depths
+    shade = contact_shade(field, catch.position, catch.weight > 0, spacing, lift)
+    return replace(catch, shade=np.clip(shade * SHADE_UNIT, 0, 1))
 
 
 def _shade(
     field: RadianceField,
     snow: Snow,
-    hits: Float32[np.ndarray, "n 3"],
+    catch: Catch,
     spacing: float,
     light: Light,
     cameras: Float[np.ndarray, "m 3"],
     appearance: Float[Tensor, "1 e"] | None,
-) -> Float32[np.ndarray, "n"]:
-    """Return the brightness (g + c0)/(1 + c0) (beta_s V_s + V_s0) of snow on the hits, 0 to 1.
+) -> Float32[np.ndarray, "h w"]:
+    """Return the brightness (g + c0)/(1 + c0) (beta_s V_s + V_s0) of snow, 0 to 1.
 
     g is the ground's luminance relative to a white surface, V_s the visibility of the sun; c0,
     beta_s and V_s0 are `albedo_offset`, `sun_share` and `shade` of the parameters.
     """
+    used = catch.weight > 0
+    hits = catch.position[used]
     if not len(hits):
-        return np.zeros(0, np.float32)
+        return catch.shade
     lower, upper = field.bounds
     device = lower.device
     luma = torch.tensor(LUMA, device=device)
@@ -284,4 +294,6 @@ def _shade(
             visible = torch.exp(-sun_depth).float()
         shade = shade * (snow.sun_share * visible + snow.shade)
         shades.append(to_numpy(shade.clamp(0, 1).float()))
-    return np.concatenate(shades)
+    found = catch.shade.copy()
+    found[used] = np.concatenate(shades)
+    return found

@@ -21,13 +21,16 @@ from climatenerf.ops.cpu.metaballs import (
     Lattice,
     occupied_cells,
 )
+from climatenerf.weather.snow.cover import REPOSE, held_by_crowns, settled
 
 _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 # A column that extends below the ground by the supports of kernel and prefilter gives the same
 # surface as a half-space.
 _BURIAL = SUPPORT + _BLUR
 _BELOW, _ABOVE = 20.0, 40.0  # m; ground up to this far below and above the cameras carries snow
-_FULL_COVER_DEPTH = 0.01  # m; thinner snow covers only part of the ground
+SHADE_UNIT = 0.5
+"""`Catch.shade` of snow that receives as much light as its surroundings."""
+_THINNEST = 2e-4  # m; thinner snow is no layer of grains
 
 
 @dataclass(frozen=True)
@@ -61,20 +64,36 @@ class SnowGrid:
 
 
 @dataclass(frozen=True)
+class Catch:
+    """What catches the snow of one pass: a raster of surfaces, or of crowns above them."""
+
+    position: Float32[np.ndarray, "h w 3"]
+    """Points on what catches the snow, world frame, m; NaN where there is nothing."""
+    of_fall: Float32[np.ndarray, "h w"]
+    """Depth of the snow over that on open level ground."""
+    of_held: Float32[np.ndarray, "h w"]
+    """Depth, in addition, over what a closed crown holds; negative below crowns."""
+    weight: Float32[np.ndarray, "h w"]
+    """Fraction of the cell that catches snow; 0 outside the raster's part of the scene."""
+    shade: Float32[np.ndarray, "h w"]
+    """0 to 1; NaN: unknown. In the light of the place: light over that around, by `SHADE_UNIT`. In
+    the paper's light: the brightness of the snow."""
+
+
+@dataclass(frozen=True)
 class Deposits:
-    """Points where snow lands. They depend on the scene, not on the depth of the snow."""
+    """Where snow lands. It depends on the scene, not on the depth of the snow."""
 
     grid: SnowGrid
-    position: Float32[np.ndarray, "n 3"]
-    """Points on the surface that catches the snow, world frame, m."""
-    weight: Float32[np.ndarray, "n"]
-    """Fraction of the snow that stays, 0 to 1."""
-    shade: Float32[np.ndarray, "n"]
-    """Brightness of the snow in the scene's light, 0 to 1; NaN: not computed for this deposit."""
-    cascade: Int[np.ndarray, "cascades+1"]
-    """Deposits of cascade k are cascade[k]:cascade[k + 1]."""
+    cascades: tuple[tuple[Catch, ...], ...]
+    """What catches snow in each cascade; every fall direction adds one or two rasters."""
     passes: Int[np.ndarray, "cascades"]
-    """Number of fall directions per cascade; each gives at most one deposit per cell."""
+    """Number of fall directions per cascade; each covers all cells once."""
+
+    def any(self) -> bool:
+        """Whether snow stays anywhere."""
+        catches = (catch for cascade in self.cascades for catch in cascade)
+        return any(bool(((c.weight > 0) & (c.of_fall + c.of_held > 0)).any()) for c in catches)
 
 
 def choose_grid(
@@ -115,20 +134,18 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
     """Build the lattice of snow of a given depth on the deposits.
 
     Args:
-        deposits: points where snow lands.
-        depth: thickness on open ground, m. Below 1 cm the cover becomes partial and then vanishes.
+        deposits: where snow lands.
+        depth: thickness on open level ground, m.
 
     Returns:
         The lattice; without bricks if there are no deposits.
     """
     grid = deposits.grid
-    fade = min(max(depth / _FULL_COVER_DEPTH, 0.0), 1.0)
-    cover = fade * fade * (3 - 2 * fade)
     lower, bricks, index, pool = [], [], [], []
     used = 0
     for k in range(grid.cascades):
-        part = slice(int(deposits.cascade[k]), int(deposits.cascade[k + 1]))
         h, half = grid.spacing_of(k), grid.half_side(k)
+        position, weight, shade, thickness = _columns(deposits.cascades[k], depth, h)
         # Margin for the columns below and above the ground, and one brick for the kernel support.
         bottom = grid.z_range[0] - (_BURIAL + _BLUR + BRICK) * h
         top = grid.z_range[1] + depth + (_BLUR + BRICK) * h
@@ -136,9 +153,8 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
         count = np.array([side, side, math.ceil((top - bottom) / (h * BRICK))], np.int64)
         margin = half + BRICK * h
         corner = np.array([grid.centre[0] - margin, grid.centre[1] - margin, bottom])
-        position = (deposits.position[part].astype(np.float64) - corner) / h
-        weight = deposits.weight[part] * np.float32(cover / deposits.passes[k])
-        sums, core = _fill(position, weight, deposits.shade[part], depth / h, count)
+        weight = weight / np.float32(deposits.passes[k])
+        sums, core = _fill((position - corner) / h, weight, shade, thickness / h, count)
         table, fill, height, shade = _assemble(sums, core)
         index.append(np.where(table >= 0, table + used, -1).astype(np.int32).reshape(-1))
         pool.append((fill, height, shade))
@@ -165,6 +181,25 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
     )
 
 
+def _columns(
+    catches: tuple[Catch, ...], depth: float, spacing: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return position (m), weight, brightness and thickness (m) of all columns of a cascade."""
+    held = held_by_crowns(depth)
+    parts = []
+    for catch in catches:
+        thickness = catch.of_fall * np.float64(depth) + catch.of_held * held
+        used = (catch.weight > 0) & (thickness > 0)
+        base = np.where(catch.weight > 0, catch.position[..., 2].astype(np.float64), np.nan)
+        thickness = settled(base, np.where(used, thickness, 0.0), REPOSE * spacing)
+        used &= thickness > _THINNEST
+        parts.append(
+            [each[used] for each in (catch.position, catch.weight, catch.shade, thickness)]
+        )
+    position, weight, shade, thickness = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return position.astype(np.float64), weight, shade, thickness
+
+
 @njit(cache=True)
 def _integrated_spline(u: float) -> float:
     """Return the integral of a quadratic B-spline (unit knots, centred on 0) up to u."""
@@ -178,7 +213,7 @@ def _fill(
     position: Float[np.ndarray, "n 3"],
     weight: Float32[np.ndarray, "n"],
     shade: Float32[np.ndarray, "n"],
-    depth: float,
+    depth: Float[np.ndarray, "n"],
     bricks: Int[np.ndarray, "3"],
 ) -> tuple[Float32[np.ndarray, "b 8 8 8 4"], Int[np.ndarray, "x y z"]]:
     """Accumulate the columns at the vertices; lengths in units of the spacing.
@@ -189,7 +224,7 @@ def _fill(
         position: deposits relative to the lattice's corner.
         weight: filled fraction per deposit.
         shade: brightness per deposit; NaN: unknown.
-        depth: depth of the snow.
+        depth: thickness of the snow per deposit.
         bricks: number of bricks along each axis.
 
     Returns:
@@ -207,7 +242,7 @@ def _fill(
                 continue
             x, y, z = position[r, 0], position[r, 1], position[r, 2]
             first = max(math.ceil(z - _BURIAL - _BLUR), 0)
-            last = min(math.floor(z + depth + _BLUR), size[2] - 1)
+            last = min(math.floor(z + depth[r] + _BLUR), size[2] - 1)
             for a in range(2):
                 i = math.floor(x) + a
                 if i < 0 or i >= size[0]:
@@ -228,7 +263,8 @@ def _fill(
                         continue
                     for m in range(first, last + 1):
                         fraction = tent * (
-                            _integrated_spline(z + depth - m) - _integrated_spline(z - _BURIAL - m)
+                            _integrated_spline(z + depth[r] - m)
+                            - _integrated_spline(z - _BURIAL - m)
                         )
                         row = sums[
                             core[i // BRICK, j // BRICK, m // BRICK],
@@ -258,8 +294,7 @@ def _assemble(
     from scipy import ndimage
 
     shaded = float(sums[..., 2].sum(dtype=np.float64))
-    # Without any shaded deposit in this cascade the default is never visible.
-    default_shade = float(sums[..., 3].sum(dtype=np.float64)) / shaded if shaded > 0 else 1.0
+    default_shade = float(sums[..., 3].sum(dtype=np.float64)) / shaded if shaded > 0 else SHADE_UNIT
     vertices = _quantise(sums, default_shade)
     near = ndimage.binary_dilation(core >= 0, np.ones((3, 3, 3), bool))
     cells = np.argwhere(near)

@@ -12,21 +12,29 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.device import to_device, to_numpy
+from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import RadianceField, observed
 from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu.metaballs import Lattice
 from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.snow.deposition import Light, find_deposits
-from climatenerf.weather.snow.lattice import Deposits, SnowGrid, choose_grid, grow
+from climatenerf.weather.snow.lattice import SHADE_UNIT, Deposits, SnowGrid, choose_grid, grow
+from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Light as PlaceLight
 from climatenerf.weather.world import Preparation, World
+
+LEVEL_Z, SIDE_Z = 0.5, 0.2  # z of normals of a layer's surface, and of its sides
+SIDE = 0.3  # m of snow behind a side
+SKIN = 0.15  # sum of the balls half a spacing above a level surface
+BURIED = 0.04  # m below the ground, to which roughness reaches
+OPAQUE = 0.97  # reflectance of a slab; of the ground below a thousandth of the light comes through
 
 
 @dataclass(frozen=True)
@@ -38,16 +46,18 @@ class BakedSnow:
         deposits: where snow landed, from which other depths grow.
         snow: its parameters.
         light: light of the scene.
-        floor_z: height below which there is no snow (a water level), m.
         place_light: light at each place; None: that of the open everywhere.
+        ground: what thin snow lets through, under the same light; None: nothing.
+        appearance: exposure and light of the ground's colours; None: the mean of all photos.
     """
 
     lattice: Lattice
     deposits: Deposits
     snow: Snow
     light: Light
-    floor_z: float | None = None
     place_light: PlaceLight | None = None
+    ground: RadianceField | None = None
+    appearance: Float[Tensor, "1 e"] | None = None
     mask = "mask_snow"
     thickness_layer = "snow_thickness"
 
@@ -57,13 +67,14 @@ class BakedSnow:
         return replace(self, lattice=grow(self.deposits, depth), snow=snow)
 
     def above(self, floor_z: float | None) -> "BakedSnow":
-        """The same snow, removed below a height (m)."""
-        return replace(self, floor_z=floor_z)
+        """The same snow, without what lies on ground below a height (m): snow melts in water."""
+        floor = -math.inf if floor_z is None else float(floor_z)
+        return replace(self, lattice=self.lattice._replace(floor=floor))
 
     @property
     def nbytes(self) -> int:
         """Memory of the lattice, bytes."""
-        return sum(part.nbytes for part in self.lattice)
+        return sum(part.nbytes for part in self.lattice if isinstance(part, np.ndarray))
 
     def march(
         self,
@@ -83,8 +94,8 @@ class BakedSnow:
         Returns:
             Samples with extinction in 1/m; a handful a ray.
         """
-        if self.floor_z is not None:
-            t_min, t_max = _cut(rays_o, rays_d, t_min, t_max, self.floor_z)
+        if self.lattice.floor > -math.inf:
+            t_min, t_max = _cut(rays_o, rays_d, t_min, t_max, self.lattice.floor)
         offsets, t, dt, sigma = metaballs.march(
             _array(rays_o), _array(rays_d), _array(t_min), _array(t_max), self.lattice
         )
@@ -93,36 +104,76 @@ class BakedSnow:
     def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Extinction O of the snow at points (m), 1/m."""
         density = to_device(metaballs.evaluate(_array(x), self.lattice)[2][:, 2], x.device)
-        return density if self.floor_z is None else density * (x[:, 2] >= self.floor_z)
+        return density * (x[:, 2] >= self.lattice.floor)
+
+    def covers(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether upward surfaces of the field at points (m) are roughness below this snow.
+
+        That is within half a spacing above the snow, which grows with the distance from the
+        cameras as the roughness does.
+        """
+        sums, _, rest = metaballs.evaluate(_array(x), self.lattice)
+        near = to_device((sums > SKIN) & (rest[:, 0] > -BURIED), x.device)
+        return near & (x[:, 2] - to_device(rest[:, 0], x.device) >= self.lattice.floor)
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Outward unit normal, from the analytic gradient of the sum; up where there is none."""
-        gradient = to_device(metaballs.evaluate(_array(x), self.lattice)[1], x.device)
-        return _normal(gradient)
+        """Outward unit normal, from the gradient of the sum; up where there is none."""
+        return to_device(metaballs.smooth_normals(_array(x), self.lattice), x.device)
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Linear radiance of the snow at points (m), the same in all directions.
 
-        Diffuse snow in the light that its place and its slope receive, a little darker over dark
-        ground. The paper's way (`Snow.light`) lights all snow as in the open, darkens it in the
+        Diffuse snow in the light that its place and its slope receive; thin snow lets the ground
+        through. The paper's way (`Snow.light`) lights all snow as in the open, darkens it in the
         sun's shadow, and shades it by wrap lighting (n.l + gamma)/(1 + gamma).
         """
-        _, gradient, rest = metaballs.evaluate(_array(x), self.lattice)
-        if self.snow.light == "scene" and self.place_light is not None:
-            reflectance = to_device(rest[:, 1], x.device)[:, None] / math.pi
-            return reflectance * self.place_light.irradiance(
-                x, _normal(to_device(gradient, x.device))
-            )
+        _, _, rest = metaballs.evaluate(_array(x), self.lattice)
+        normal = self.normal(x)
+        if self.snow.light == "scene":
+            height, shade = to_device(rest[:, :2], x.device).unbind(-1)
+            return self._in_light_of_place(x, normal, height, shade / SHADE_UNIT)
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
         towards = torch.tensor(towards, dtype=torch.float32, device=x.device)
-        facing = _normal(to_device(gradient, x.device)) @ towards
+        facing = normal @ towards
         # Negative only for a wrap below 1, on the side that faces away.
         wrap = ((facing + self.snow.wrap) / (1 + self.snow.wrap)).clamp(min=0)
         shade = to_device(rest[:, 1], x.device)
         white = self.light.irradiance_over_pi
         white = torch.tensor(white, dtype=torch.float32, device=x.device)
         return (shade * wrap)[:, None] * white
+
+    def _in_light_of_place(
+        self,
+        x: Float[Tensor, "n 3"],
+        normal: Float[Tensor, "n 3"],
+        height: Float[Tensor, "n"],
+        contact: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance of snow with unit normals, at heights (m) over the ground below.
+
+        What stands close by leaves the fraction `contact` of the diffuse light of the place.
+        """
+        if self.place_light is None:
+            white = to_device(self.light.irradiance_over_pi.astype(np.float32), x.device)
+            white = white * contact[:, None]
+        else:
+            white = self.place_light.irradiance(x, normal, contact) / math.pi
+        deep = torch.tensor(albedo_of(self.snow), dtype=torch.float32, device=x.device)
+        # The side of a layer is as thick as the layer is wide, whatever its height.
+        side = ((LEVEL_Z - normal[:, 2]) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
+        slab = slab_reflectance(height + SIDE * side, self.snow.grain)[:, None]
+        reflectance = torch.minimum(slab, deep)
+        thin = (slab[:, 0] < OPAQUE).nonzero()[:, 0]
+        if self.ground is not None and thin.numel():
+            below, down = x[thin].clone(), torch.zeros_like(x[thin])
+            below[:, 2] -= height[thin]
+            down[:, 2] = -1.0
+            seen = self.ground.colour(below, down, appearance=self.appearance)
+            # The ground is shown in the light that now falls on the snow. 1e-6: 0/0 in the dark.
+            ground = (seen / white[thin].clamp_min(1e-6)).clamp(0, 1)
+            reflectance[thin] = over_ground(slab[thin], deep, ground)
+        return reflectance * white
 
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
@@ -192,6 +243,12 @@ class SnowEntity:
             progress=lambda fraction: given.progress("snowfall", fraction),
             appearance=given.appearance,
         )
+        if self._baked is not None and not self._baked.deposits.any():
+            tilted = " or a smaller --snow.fall-tilt" if weather.snow.fall_tilt > 0 else ""
+            raise UserError(
+                "no surface of this scene catches snow: all are sheltered, too steep or missing;"
+                f" render without --snow.depth{tilted}"
+            )
 
     def place(self, world: World, weather: Weather, time: float) -> World:
         """The world with snow on it, down to the highest water level."""
@@ -204,9 +261,22 @@ class SnowEntity:
         if depth != self._grown.snow.depth:
             same = depth == self._baked.snow.depth
             self._grown = self._baked if same else self._baked.with_depth(depth)
-        look = replace(self._grown.snow, wrap=weather.snow.wrap)
+        asked = weather.snow
+        look = replace(
+            self._grown.snow,
+            wrap=asked.wrap,
+            grain=asked.grain,
+            soot=asked.soot,
+            albedo=asked.albedo,
+        )
         floor = max((surface.level for surface in world.surfaces), default=None)
-        snow = replace(self._grown, snow=look, floor_z=floor, place_light=world.light)
+        snow = replace(
+            self._grown.above(floor),
+            snow=look,
+            place_light=world.light,
+            ground=world.field,
+            appearance=world.appearance,
+        )
         return replace(world, matters=(*world.matters, snow))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
@@ -224,12 +294,6 @@ def prepare(preparation: Preparation) -> SnowEntity:
 
 def _array(x: Tensor) -> np.ndarray:
     return np.ascontiguousarray(to_numpy(x), np.float32)
-
-
-def _normal(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    length = gradient.norm(dim=-1, keepdim=True)
-    up = torch.tensor([0.0, 0.0, 1.0], device=gradient.device)
-    return torch.where(length > 1e-6, -gradient / length.clamp(min=1e-6), up)
 
 
 def _cut(

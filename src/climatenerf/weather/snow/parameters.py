@@ -23,12 +23,18 @@ class Snow:
     """Where tilted snow comes from, clockwise from +y."""
     light: Annotated[str, choice("scene", "paper")] = "scene"
     """scene: the light that falls on each place. paper: that of the open, with wrap lighting."""
-    slope: Annotated[float, quantity(ANGLE, 0.0, math.pi / 2)] = math.radians(37.0)
-    """Slope on which half of the snow stays."""
+    slope: Annotated[float | None, quantity(ANGLE, 0.0, math.pi / 2, optional=True)] = None
+    """Slope on which half of the snow stays. none: all up to 30 deg, none from 60 deg (EN 1991)."""
     slope_sharpness: Annotated[float, number(1.0, 1000.0)] = 50.0
-    """Steepness a' of the logistic in cos(slope)."""
+    """Steepness a' of the logistic in cos(slope), with a `slope`."""
+    grain: Annotated[float, quantity(LENGTH, 3e-5, 2e-3)] = 1e-4
+    """Optical radius of the grains. Fresh snow: 0.05 mm; wet: 1 mm; coarser is darker."""
+    soot: Annotated[float, number(0.0, 1e5)] = 300.0
+    """Soot in nanograms per gram of snow. Arctic: 10; near towns: 100 to 1000."""
+    albedo: Annotated[float | None, number(0.0, 1.0, optional=True)] = None
+    """Reflectance of deep snow. none: that of grain and soot."""
     albedo_offset: Annotated[float, number(0.0, 100.0)] = 4.0
-    """c0 of the snow's colour (g + c0)/(1 + c0); larger is whiter."""
+    """c0 of the paper's snow colour (g + c0)/(1 + c0); larger is whiter."""
     wrap: Annotated[float, number(0.0, 100.0)] = 8.0
     """Wrap lighting gamma of (n.l + gamma)/(1 + gamma); larger is flatter."""
     sun_share: Annotated[float, number(0.0, 1.0)] = 0.7

@@ -11,14 +11,15 @@ from numba import njit, prange
 
 
 @njit(cache=True, parallel=True)
-def half_transmittance(
+def depth_crossings(
     offsets: Int[np.ndarray, "n+1"],
     t: Float32[np.ndarray, "s"],
     dt: Float32[np.ndarray, "s"],
     sigma: Float32[np.ndarray, "s"],
     before: Float[np.ndarray, "n"],
-) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Find where the optical depth of each ray reaches ln 2, i.e. its transmittance 1/2.
+    levels: Float[np.ndarray, "k"],
+) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n"]]:
+    """Find where the optical depth of each ray reaches some levels; ln 2 is a transmittance of 1/2.
 
     Args:
         offsets: samples of ray r are offsets[r]:offsets[r + 1].
@@ -26,19 +27,21 @@ def half_transmittance(
         dt: length of each sample, m.
         sigma: extinction of each sample, 1/m.
         before: optical depth of each ray in front of its first sample.
+        levels: optical depths, above 0.
 
     Returns:
-        Ray length, m (NaN: not reached on this stretch), and the optical depth after the last
+        Ray lengths, m (NaN: not reached on this stretch), and the optical depth after the last
         sample.
     """
     n = offsets.shape[0] - 1
-    found = np.full(n, np.nan)
+    found = np.full((n, levels.shape[0]), np.nan)
     depth = before.copy()
     for r in prange(n):
         for q in range(offsets[r], offsets[r + 1]):
             sample_depth = sigma[q] * dt[q]
-            if depth[r] < math.log(2) <= depth[r] + sample_depth:
-                found[r] = t[q] - dt[q] / 2 + (math.log(2) - depth[r]) / sigma[q]
+            for k in range(levels.shape[0]):
+                if depth[r] < levels[k] <= depth[r] + sample_depth:
+                    found[r, k] = t[q] - dt[q] / 2 + (levels[k] - depth[r]) / sigma[q]
             depth[r] += sample_depth
     return found, depth
 

@@ -26,14 +26,17 @@ def normals_at(
     kind = torch.zeros(x.shape[0], dtype=torch.long, device=x.device)
     if not x.shape[0]:
         return torch.zeros_like(x), kind
-    if NORMALS in field.capabilities:
+    learned = torch.zeros_like(x)
+    if field.capabilities & {NORMALS, CLASSES}:
         count = x.shape[0]
         index = torch.arange(count + 1, device=x.device)
         zero = torch.zeros(count, device=x.device)
         samples = Samples(index, zero, zero, zero)
-        normal, logits = field.surface_heads(x, d, samples, index[:-1])
+        learned, logits = field.surface_heads(x, d, samples, index[:-1])
         if CLASSES in field.capabilities:
             kind = logits.argmax(-1)
+    if NORMALS in field.capabilities:
+        normal = learned
     elif DENSITY in field.capabilities:
         normal = torch.zeros_like(x)
         for axis in range(3):

@@ -1,0 +1,267 @@
+"""Where snow stays, and how much of it: slopes, crowns, lumps of a fitted field, angle of repose.
+
+Rasters have one node for each fall ray of a pass; heights are world z, m, NaN where nothing is.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from numba import njit
+from scipy import ndimage
+
+from climatenerf.weather.snow.parameters import Snow
+
+WALL = math.cos(math.radians(75))  # cosine of the slope from which on snow only passes by
+LEVEL, STEEPEST = math.radians(30), math.radians(60)  # slopes that keep all snow, and none
+REPOSE = math.tan(math.radians(50))  # slope of the angle of repose of fresh snow
+CROWN_HOLDS = 0.08  # m of snow that a crown can hold
+CROWN_RETAINS = 0.678  # fraction of it that stays for hours (Hedstrom and Pomeroy 1998)
+CUSHION = 0.1  # m, standard deviation of the smoothing of crowns
+ONE_LAYER = 0.6  # m below the highest leaf nearby; deeper leaves carry no part of a cushion
+CROWN_KEEPS, CROWN_SHEDS = 0.8, 1.7  # slopes (rise over run) of crowns that keep all and nothing
+CLOSED = (0.25, 0.6)  # fraction covered by leaves at which a cushion begins, and is complete
+HIGHEST_VEIL = 2.0  # m above the ground; what hangs higher may be a roof of a wrong class
+EDGE = 0.12  # m from the edge of a surface, within which its normals are blurred
+STEEPEST_EDGE = math.tan(math.radians(50))  # of a surface and its rounded edge
+GAP = 5.0  # m from ground, up to which a gap in it is bridged
+KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
+PILE = 0.35  # m, standard deviation of the heap of what slid
+MAX_SWEEPS = 40  # of `settled`; a metre of snow on a lattice of 5 cm takes 20
+
+
+def slope_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarray, "*n"]:
+    """Fraction of the depth that slopes keep, from the cosine of the slope.
+
+    All up to 30 degrees, none from 60 (EN 1991-1-3, 5.3); or the paper's logistic, if
+    `Snow.slope` says where half of it stays.
+    """
+    if snow.slope is None:
+        slope = np.arccos(np.clip(cosine, 0, 1))
+        return np.clip((STEEPEST - slope) / (STEEPEST - LEVEL), 0, 1)
+    logit = snow.slope_sharpness * (cosine - math.cos(snow.slope))
+    return 1 / (1 + np.exp(-np.clip(logit, -60, 60)))
+
+
+def held_by_crowns(depth: float) -> float:
+    """Depth of snow (m) that stays in a closed crown when `depth` (m) falls on open ground.
+
+    Interception saturates at what branches can hold (Hedstrom and Pomeroy 1998, equation 6).
+    """
+    return CROWN_RETAINS * CROWN_HOLDS * -math.expm1(-depth / CROWN_HOLDS)
+
+
+class Cushions(NamedTuple):
+    """Crowns as surfaces that snow can lie on."""
+
+    height: Float[np.ndarray, "h w"]
+    """Of the cushion's base, m; NaN without one."""
+    complete: Float[np.ndarray, "h w"]
+    """How closed the crown is, 0 to 1; 0 at a cushion's rim."""
+
+
+def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
+    """Smooth the heights of leaves: snow bridges leaves and the gaps between them.
+
+    Args:
+        crown: height of the highest leaf, m; NaN without one.
+        spacing: of the raster, m.
+    """
+    sigma = CUSHION / spacing
+    leaf = np.isfinite(crown)
+    lowest = -1e9  # below everything
+    filled = np.where(leaf, crown, lowest)
+    highest = ndimage.maximum_filter(filled, 2 * max(1, round(2 * sigma)) + 1)
+    top = leaf & (filled > highest - ONE_LAYER)
+    weight = ndimage.gaussian_filter(top.astype(np.float64), sigma)
+    moment = ndimage.gaussian_filter(np.where(top, filled, 0.0).astype(np.float64), sigma)
+    complete = np.clip((weight - CLOSED[0]) / (CLOSED[1] - CLOSED[0]), 0, 1)
+    # Where no leaf is near there is no cushion; the floor avoids 0/0.
+    height = np.where(complete > 0, moment / np.maximum(weight, 1e-6), np.nan)
+    slope = np.hypot(*np.gradient(height, spacing))  # NaN at the rim
+    keeps = (CROWN_SHEDS - slope) / (CROWN_SHEDS - CROWN_KEEPS)
+    return Cushions(height, complete * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
+
+
+def slid(
+    lost: Float[np.ndarray, "h w"],
+    share: Float[np.ndarray, "h w"],
+    height: Float[np.ndarray, "h w"],
+    spacing: float,
+) -> Float[np.ndarray, "h w"]:
+    """Depth that arrives from steeper surfaces above, over the depth that falls.
+
+    What a slope does not keep slides down, over edges as well, to the first surface that keeps all
+    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m. What slides
+    into a hollow of a slope is lost.
+
+    Args:
+        lost: depth that slides off each node, over the depth that falls.
+        share: fraction of the fall that stays.
+        height: of the surface, m; NaN without one.
+        spacing: of the raster, m.
+    """
+    known = np.isfinite(height)
+    weight = ndimage.gaussian_filter(known.astype(np.float64), 1.0)
+    smooth = ndimage.gaussian_filter(np.where(known, height, 0.0), 1.0)
+    smooth = np.where(known, smooth / np.maximum(weight, 1e-6), np.nan)
+    # Roughness would catch what slides; at edges the surfaces stay apart.
+    smooth = np.where(np.abs(smooth - height) < spacing, smooth, height)
+    order = np.argsort(np.where(known, -smooth, np.inf), axis=None, kind="stable")
+    arrived = _routed(lost, share, smooth, order[: int(known.sum())])
+    level = (share > KEEPS_ALL).astype(np.float64)
+    sigma = PILE / spacing
+    reach = np.maximum(ndimage.gaussian_filter(level, sigma), 1e-3)
+    return level * ndimage.gaussian_filter(arrived / reach, sigma)
+
+
+@njit(cache=True)
+def _routed(
+    lost: Float[np.ndarray, "h w"],
+    share: Float[np.ndarray, "h w"],
+    height: Float[np.ndarray, "h w"],
+    order: Int[np.ndarray, "n"],
+) -> Float[np.ndarray, "h w"]:
+    """Carry what does not stay to the lowest neighbours, from the highest node to the lowest."""
+    rows, columns = share.shape
+    carried = np.zeros((rows, columns))
+    arrived = np.zeros((rows, columns))
+    for q in order:
+        j, i = q // columns, q % columns
+        if share[j, i] > KEEPS_ALL:
+            arrived[j, i] = carried[j, i]
+            continue
+        best, to_j, to_i = 0.0, -1, -1
+        for dj in range(-1, 2):
+            for di in range(-1, 2):
+                jj, ii = j + dj, i + di
+                if jj < 0 or ii < 0 or jj >= rows or ii >= columns or (dj == 0 and di == 0):
+                    continue
+                fall = (height[j, i] - height[jj, ii]) / math.sqrt(dj * dj + di * di)
+                if fall > best:  # NaN compares False
+                    best, to_j, to_i = fall, jj, ii
+        if to_j >= 0:
+            carried[to_j, to_i] += carried[j, i] + lost[j, i]
+    return arrived
+
+
+@njit(cache=True)
+def settled(
+    base: Float[np.ndarray, "h w"], thickness: Float[np.ndarray, "h w"], rise: float
+) -> Float[np.ndarray, "h w"]:
+    """Thickness of snow whose surface nowhere falls more steeply than the angle of repose.
+
+    The surface over a node is at most `rise` for each cell above that over any neighbour, or above
+    the node's own base where that is higher: snow on a roof ends in a slope at its eaves. What
+    slides off is lost.
+
+    Args:
+        base: height of what the snow lies on, m; NaN where nothing is.
+        thickness: of the snow before it slides, m.
+        rise: of the surface over one cell at the angle of repose, m.
+    """
+    rows, columns = base.shape
+    top = base + thickness
+    for sweep in range(MAX_SWEEPS):
+        changed = False
+        for a in range(rows):
+            j = a if sweep % 2 == 0 else rows - 1 - a
+            for b in range(columns):
+                i = b if sweep % 4 < 2 else columns - 1 - b
+                own = top[j, i]
+                if not own - base[j, i] > 1e-6:  # NaN compares False
+                    continue
+                limit = own
+                for dj in range(-1, 2):
+                    for di in range(-1, 2):
+                        jj, ii = j + dj, i + di
+                        if jj < 0 or ii < 0 or jj >= rows or ii >= columns:
+                            continue
+                        other = top[jj, ii]
+                        if math.isnan(other):
+                            continue
+                        length = math.sqrt(dj * dj + di * di)
+                        limit = min(limit, max(other, base[j, i]) + rise * length)
+                if limit < own - 1e-5:
+                    top[j, i] = limit
+                    changed = True
+        if not changed:
+            break
+    return np.maximum(top - base, 0.0)
+
+
+def to_edges(
+    share: Float[np.ndarray, "h w"], height: Float[np.ndarray, "h w"], spacing: float
+) -> Float[np.ndarray, "h w"]:
+    """Continue shares over the last `EDGE` m of a surface, whose fitted edges are rounded.
+
+    The share of a node is the largest within that distance on ground that is no steeper than
+    `STEEPEST_EDGE` from here.
+
+    Args:
+        share: fraction of the depth that stays.
+        height: of the surface, m; NaN without one.
+        spacing: of the raster, m.
+    """
+    reach = round(EDGE / spacing)
+    if reach == 0:
+        return share
+    padded = np.pad(height, reach, constant_values=np.nan), np.pad(share, reach)
+    rows, columns = share.shape
+    result = share.copy()
+    for j in range(-reach, reach + 1):
+        for i in range(-reach, reach + 1):
+            part = slice(reach + j, reach + j + rows), slice(reach + i, reach + i + columns)
+            limit = STEEPEST_EDGE * spacing * math.hypot(j, i)
+            near = np.abs(padded[0][part] - height) <= limit  # NaN compares False
+            result = np.where(near, np.maximum(result, padded[1][part]), result)
+    return result
+
+
+def bridged(
+    surface: Float[np.ndarray, "h w"],
+    on_ground: Bool[np.ndarray, "h w"],
+    within: Bool[np.ndarray, "h w"],
+    spacing: float,
+) -> Float[np.ndarray, "h w"]:
+    """Continue the ground over gaps in which neither field nor terrain holds anything.
+
+    Photos show far ground at a grazing angle, and its field has gaps.
+
+    Args:
+        surface: heights, m; NaN in gaps.
+        on_ground: where they belong to the ground.
+        within: cells that may be filled.
+        spacing: of the raster, m.
+    """
+    known = on_ground & np.isfinite(surface)
+    if not known.any() or known.all():
+        return surface
+    found: Any = ndimage.distance_transform_edt(~known, return_indices=True)
+    distance, nearest = found
+    # Heights of the nearest ground, smoothed where they meet.
+    height = np.where(known, surface, 0.0)[tuple(nearest)]
+    smooth = ndimage.gaussian_filter(height, 0.5 / spacing)
+    gap = np.isnan(surface) & within & (distance * spacing < GAP)
+    return np.where(gap, smooth, surface)
+
+
+def lumps(
+    hits: Float32[np.ndarray, "h w"],
+    on_ground: Bool[np.ndarray, "h w"],
+    ground: Float[np.ndarray, "h w"],
+    tolerance: float,
+) -> Bool[np.ndarray, "h w"]:
+    """Where matter of a ground class hangs above the ground, or the ground has a hole.
+
+    A fitted field has veils and pits. Snow lies on the terrain there.
+
+    Args:
+        hits: height at which a fall ray ends, m; NaN without an end.
+        on_ground: whether it ends on a class of the ground.
+        ground: height of the terrain, m; NaN where it is unknown.
+        tolerance: m.
+    """
+    hanging = on_ground & (hits > ground + tolerance) & (hits < ground + HIGHEST_VEIL)
+    return hanging | (np.isnan(hits) & np.isfinite(ground)) | (hits < ground - tolerance)

@@ -1,0 +1,99 @@
+"""Contact shade: how much less light reaches snow close to walls and hedges than around there.
+
+Light probes stand metres apart. What they miss is found by short rays from the snow itself, and
+kept as a factor on the probes' irradiance, so that nothing is counted twice.
+"""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from scipy import ndimage
+
+from climatenerf.core.device import to_device, to_numpy
+from climatenerf.field.protocol import RadianceField, device_of
+
+RAYS = 12  # from each node
+REACH = 3.0  # m
+NODE = 0.18  # m between nodes
+PROBES = 1.0  # m, standard deviation of how probes 2 m apart blur the light
+REFLECTED = 0.25  # reflectance of what stands around
+DARKEST = 0.05  # openness; less is inside of matter
+CHUNK = 1 << 16
+
+
+def contact_shade(
+    field: RadianceField,
+    position: Float32[np.ndarray, "h w 3"],
+    used: np.ndarray,
+    spacing: float,
+    lift: float,
+) -> Float32[np.ndarray, "h w"]:
+    """Irradiance of level snow over that around it, at most 1; NaN where nothing is known.
+
+    With an openness A (the fraction of diffuse light from above that arrives) and surroundings of
+    reflectance r the light is A/(1 - r (1 - A)), which is exact in a round hollow.
+
+    Args:
+        field: the fitted field.
+        position: what the snow lies on, world m.
+        used: [h w] bool, where snow lies.
+        spacing: of the raster, m.
+        lift: height over `position` at which rays start, m.
+    """
+    step = max(1, round(NODE / spacing))
+    rows, columns = used.shape
+    coarse = used[::step, ::step]
+    points = position[::step, ::step][coarse]
+    found = np.full(used.shape, np.nan, np.float32)
+    if not len(points):
+        return found
+    openness = openness_of(field, points + np.array([0, 0, lift], np.float32))
+    light = openness / (1 - REFLECTED * (1 - openness))
+    raster = np.zeros(coarse.shape)
+    raster[coarse] = light
+    sigma = PROBES / (spacing * step)
+    weight = ndimage.gaussian_filter(coarse.astype(np.float64), sigma)
+    around = ndimage.gaussian_filter(raster, sigma) / np.maximum(weight, 1e-6)
+    # Where no node is near nothing is used.
+    ratio = np.where(coarse, np.minimum(raster / np.maximum(around, DARKEST), 1), 1.0)
+    # Between nodes: linear, over nodes with snow alone.
+    at = np.mgrid[:rows, :columns] / step
+    held = coarse.astype(np.float64)
+    kernel: np.ndarray = ndimage.map_coordinates(held, at, order=1, mode="nearest")
+    full: np.ndarray = ndimage.map_coordinates(ratio * coarse, at, order=1, mode="nearest")
+    known = used & (kernel > 1e-3)
+    found[known] = full[known] / kernel[known]
+    return found
+
+
+@torch.no_grad()
+def openness_of(field: RadianceField, x: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Fraction of even light from above that reaches level surfaces at x (world m).
+
+    What is further away than `REACH` does not count.
+    """
+    device = device_of(field)
+    directions = to_device(cosine_directions(RAYS), device)
+    total = np.zeros(len(x))
+    places = to_device(np.ascontiguousarray(x, np.float32), device)
+    for first in range(0, len(x), CHUNK // RAYS):
+        part = places[first : first + CHUNK // RAYS]
+        rays_o = part.repeat_interleave(RAYS, 0)
+        rays_d = directions.repeat(len(part), 1)
+        zero = torch.zeros(len(rays_o), device=device)
+        samples = field.march(rays_o, rays_d, zero, zero + REACH, 2.0, stop=1e-2)
+        depth = torch.zeros(len(rays_o), device=device)
+        depth.index_add_(0, samples.ray_index(), samples.sigma * samples.dt)
+        passed = torch.exp(-depth).view(-1, RAYS).mean(1)
+        total[first : first + len(part)] = to_numpy(passed)
+    return np.maximum(total, DARKEST)
+
+
+def cosine_directions(count: int) -> Float32[np.ndarray, "n 3"]:
+    """Directions above the horizon, as dense as the cosine to the vertical (a golden spiral)."""
+    k = np.arange(count) + 0.5
+    radius, turn = np.sqrt(k / count), k * math.pi * (3 - math.sqrt(5))
+    up = np.sqrt(1 - radius * radius)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), up], -1).astype(np.float32)

@@ -1,0 +1,288 @@
+"""Where snow stays: crowns, lumps and gaps of a fitted field, what slides, the angle of repose."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from support.holed_ground import LabelledField
+
+from climatenerf.core.classes import BUILDING, ROAD, SOLID_OF, TERRAIN, VEGETATION
+from climatenerf.field.analytic import Box, HalfSpace
+from climatenerf.field.capabilities import CLASSES, DENSITY, OBSERVED
+from climatenerf.render.completed_ground import CompletedField
+from climatenerf.render.integrator import trace
+from climatenerf.scene.terrain import Terrain
+from climatenerf.weather.snow.cover import (
+    CROWN_HOLDS,
+    REPOSE,
+    bridged,
+    cushions,
+    held_by_crowns,
+    settled,
+    slid,
+    slope_share,
+    to_edges,
+)
+from climatenerf.weather.snow.deposition import surfaces_and_leaves
+from climatenerf.weather.snow.lattice import SnowGrid
+from climatenerf.weather.snow.layer import bake_snow
+from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.world import World
+
+H = 0.05
+
+
+def test_shares_of_the_standard_and_of_the_paper():
+    degrees = np.array([0.0, 30.0, 45.0, 60.0, 80.0])
+    cosine = np.cos(np.radians(degrees))
+    assert slope_share(cosine, Snow()) == pytest.approx([1, 1, 0.5, 0, 0], abs=1e-6)
+    paper = slope_share(cosine, Snow(slope=math.radians(45)))
+    assert paper[2] == pytest.approx(0.5)
+    assert np.all(np.diff(paper) < 0)
+    assert slope_share(np.array([1.0 + 1e-7]), Snow()) == pytest.approx([1])
+
+
+def test_crowns_hold_little_of_deep_snow():
+    depths = np.array([0.0, 1e-3, 0.03, 0.15, 2.0])
+    held = np.array([held_by_crowns(depth) for depth in depths])
+    assert held[0] == 0
+    assert held[1] == pytest.approx(0.678e-3, rel=0.01), "the first snow mostly stays"
+    assert np.all(np.diff(held) > 0)
+    assert held[-1] == pytest.approx(0.678 * CROWN_HOLDS, rel=0.01)
+    assert np.all(held <= depths)
+
+
+def test_cushions_bridge_leaves_and_end_at_the_rim():
+    rng = np.random.default_rng(0)
+    crown = np.full((60, 60), np.nan)
+    inside = np.hypot(*(np.mgrid[:60, :60] - 30)) < 18
+    crown[inside] = 3.0 + 0.05 * rng.normal(size=inside.sum())
+    crown[inside & (rng.random(crown.shape) < 0.2)] = np.nan
+    found = cushions(crown, H)
+    middle = np.hypot(*(np.mgrid[:60, :60] - 30)) < 12
+    assert np.all(found.complete[middle] > 0.9)
+    assert found.height[middle] == pytest.approx(3.0, abs=0.08)
+    assert np.all(found.complete[np.hypot(*(np.mgrid[:60, :60] - 30)) > 22] == 0)
+    assert np.all(np.isfinite(found.complete))
+    nothing = cushions(np.full((20, 20), np.nan), H)
+    assert not nothing.complete.any()
+
+
+def test_the_steep_side_of_a_hedge_carries_no_cushion():
+    x = np.arange(60) * H
+    steep = np.broadcast_to(np.clip(3.0 * (2.0 - x), 0.5, 2.0), (60, 60))
+    found = cushions(steep, H)
+    face = (steep > 0.8) & (steep < 1.7)
+    assert found.complete[10:50][face[10:50]].max() < 0.1
+    assert found.complete[30, 10] == 1
+
+
+def test_what_slides_arrives_below_and_nothing_is_invented():
+    """A slope of 50 degrees between two level grounds."""
+    x = np.arange(80) * H
+    height = np.broadcast_to(np.clip((x - 1.5) * math.tan(math.radians(50)), 0, 1.5), (40, 80))
+    slope = (height > 0.01) & (height < 1.49)
+    share = np.where(slope, 1 / 3, 1.0)
+    arrived = slid(1 - share, share, height, H)
+    assert arrived.sum() == pytest.approx((2 / 3) * slope.sum(), rel=0.05)
+    assert arrived[:, :30].sum() > 0.85 * arrived.sum(), "at the foot"
+    assert not arrived[slope].any()
+    assert slid(np.zeros((20, 20)), np.ones((20, 20)), np.zeros((20, 20)), H).max() == 0
+    holed = height.copy()
+    holed[10:14, 5:9] = np.nan
+    assert np.isfinite(slid(1 - share, share, holed, H)).all()
+
+
+def test_settled_snow_is_nowhere_steeper_than_repose_and_never_thicker():
+    rng = np.random.default_rng(1)
+    base = 0.3 * rng.random((50, 50)) * (rng.random((50, 50)) < 0.2)
+    base[:, 40:] = np.nan
+    thickness = np.where(np.isnan(base), 0.0, 0.8)
+    found = settled(base, thickness, REPOSE * H)
+    assert np.all(found[:, :40] <= 0.8 + 1e-9) and np.all(found[:, :40] >= 0)
+    top = base + found
+    for axis in (0, 1):
+        step = np.diff(top[:, :40], axis=axis)
+        higher = np.maximum(np.delete(base[:, :40], 0, axis), np.delete(base[:, :40], -1, axis))
+        lower = np.minimum(np.delete(top[:, :40], 0, axis), np.delete(top[:, :40], -1, axis))
+        steepest = np.maximum(higher - lower, 0) + REPOSE * H + 1e-4
+        assert np.all(np.abs(step) <= steepest)
+
+
+def test_gaps_in_the_ground_are_bridged_up_to_some_metres():
+    surface = np.zeros((200, 200))
+    surface[50:70, 50:70] = np.nan
+    surface[:, 100:] = np.nan
+    everywhere = np.ones(surface.shape, bool)
+    found = bridged(surface, everywhere, everywhere, 0.1)
+    assert found[50:70, 50:70] == pytest.approx(0.0, abs=1e-6)
+    assert np.isfinite(found[100, 140]) and np.isnan(found[100, 160])
+    unknown = bridged(np.full((5, 5), np.nan), np.zeros((5, 5), bool), np.ones((5, 5), bool), 0.1)
+    assert np.isnan(unknown).all()
+
+
+def test_shares_reach_the_rounded_edge_of_a_roof_but_not_down_a_wall():
+    height = np.zeros((10, 20))
+    height[:, :10] = 3.0
+    height[:, 10] = 2.95  # a rounded edge
+    height[:, 11] = 1.5  # a wall
+    share = np.where(height == 3.0, 1.0, 0.0)
+    found = to_edges(share, height, H)
+    assert np.all(found[:, 10] == 1)
+    assert np.all(found[:, 11:] == 0)
+
+
+def test_lumps_of_the_ground_are_ignored_and_holes_filled():
+    nan = np.nan
+    road, leaf, wall = (int(SOLID_OF[kind]) for kind in (TERRAIN, VEGETATION, BUILDING))
+    #            ground, veil, hole, pit,  crown, grass, wall, roof labelled as ground
+    height = np.array([[0.02, 0.6, nan, -1.0, 3.0, 0.2, 2.0, 5.0]])
+    kind = np.array([[road, road, -1, road, leaf, leaf, wall, road]])
+    ground = np.zeros(height.shape)
+    surface, leaves = surfaces_and_leaves(height, kind, ground)
+    assert surface[0] == pytest.approx([0.02, 0, 0, 0, 0, 0.2, 2.0, 5.0])
+    assert np.isfinite(leaves[0]).tolist() == [False] * 4 + [True] + [False] * 3
+    surface, leaves = surfaces_and_leaves(height, kind, np.full(height.shape, nan))
+    assert surface[0] == pytest.approx([0.02, 0.6, nan, -1, nan, nan, 2, 5], nan_ok=True)
+
+
+BOX = ((-4.0, -4.0, -1.0), (4.0, 4.0, 3.0))
+GRID = SnowGrid((0.013, 0.027), (-1.0, 2.8), 0.05, 32)
+
+
+def flat_terrain() -> Terrain:
+    n = 41
+    zero = np.zeros((n, n), np.float32)
+    label = np.full((n, n), ROAD, np.uint8)
+    yes = np.ones((n, n), bool)
+    return Terrain((-4.0, -4.0), 0.2, zero, zero + 0.02, label, yes, ~yes)
+
+
+def snow_on(solids, classes, depth=0.15, **snow):
+    field = CompletedField(LabelledField(solids, classes=classes, box=BOX), flat_terrain())
+    baked = bake_snow(
+        field, Snow(depth=depth, **snow), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=GRID
+    )
+    assert baked is not None
+    return baked
+
+
+def columns(baked, which, attribute="position"):
+    catch = baked.deposits.cascades[0][which]
+    return catch, np.asarray(getattr(catch, attribute))
+
+
+def test_a_crown_carries_a_cap_and_lets_the_rest_through():
+    crown = Box((-0.5, -0.5, 1.5), (0.5, 0.5, 2.5))
+    baked = snow_on([HalfSpace(), crown], [ROAD, VEGETATION])
+    catch, position = columns(baked, 0)
+    below = (np.abs(position[..., :2]) < 0.3).all(-1) & (catch.weight > 0)
+    assert below.any()
+    assert position[below][:, 2] == pytest.approx(0.0, abs=0.02), "on the terrain"
+    assert catch.of_held[below] == pytest.approx(-1, abs=0.05)
+    cap, position = columns(baked, 1)
+    top = (np.abs(position[..., :2]) < 0.3).all(-1) & (cap.weight > 0)
+    assert position[top][:, 2] == pytest.approx(2.5, abs=0.02)
+    assert cap.of_fall[top].max() == 0 and cap.of_held[top] == pytest.approx(1, abs=0.05)
+    open_ground = (np.abs(position[..., :2]) > 1.0).any(-1) & (catch.weight > 0)
+    assert catch.of_held[open_ground] == pytest.approx(0, abs=1e-3)
+
+
+def test_a_house_shelters_the_ground_and_carries_all():
+    house = Box((-0.5, -0.5, 0.0), (0.5, 0.5, 2.5))
+    baked = snow_on([HalfSpace(), house], [ROAD, BUILDING])
+    catch, position = columns(baked, 0)
+    roof = (np.abs(position[..., :2]) < 0.3).all(-1) & (catch.weight > 0)
+    assert position[roof][:, 2] == pytest.approx(2.5, abs=0.02)
+    assert catch.of_fall[roof] == pytest.approx(1, abs=0.01)
+    assert len(baked.deposits.cascades[0]) == baked.deposits.passes[0], "no crowns"
+
+
+def test_snow_covers_roughness_that_faces_up_and_not_what_stands_in_it():
+    baked = snow_on([HalfSpace()], [ROAD], depth=0.03)
+    near = torch.tensor([[0.1, 0.1, 0.045], [0.2, 0.0, 0.02], [0.0, 0.3, 0.3]])
+    assert baked.covers(near).tolist() == [True, True, False]
+    wet = baked.above(0.1)
+    assert not wet.covers(near).any()
+
+
+def test_deposits_know_whether_any_snow_stays():
+    assert snow_on([HalfSpace()], [ROAD]).deposits.any()
+    slope = HalfSpace((math.sin(math.radians(75)), 0.0, math.cos(math.radians(75))), 0.0)
+    steep = LabelledField([slope], classes=[BUILDING], box=BOX)
+    baked = bake_snow(steep, Snow(depth=0.1), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=GRID)
+    assert baked is not None and not baked.deposits.any()
+
+
+@pytest.mark.parametrize("tilt", [0.0, 45.0])
+def test_a_wall_gets_no_heap_of_what_it_stops(tilt):
+    wall = Box((1.0, -4.0, 0.0), (1.2, 4.0, 2.8))
+    baked = snow_on([HalfSpace(), wall], [ROAD, BUILDING], 0.1, fall_tilt=math.radians(tilt),
+                    wind_direction=math.radians(270))  # fmt: skip
+    for catch in baked.deposits.cascades[0]:
+        near = (np.abs(catch.position[..., 1]) < 1) & (np.abs(catch.position[..., 0]) < 0.95)
+        near &= (catch.position[..., 2] < 0.1) & (catch.weight > 0)
+        assert near.any()
+        assert catch.of_fall[near].max() < 1.2
+
+
+def test_slanted_snow_falls_through_a_crown_to_the_ground_of_its_own_place():
+    crown = Box((-0.5, -0.5, 1.5), (0.5, 0.5, 2.5))
+    rise = 0.1
+    normal = np.array([-rise, 0.0, 1.0]) / math.hypot(rise, 1.0)
+    field = LabelledField([HalfSpace(tuple(normal)), crown], classes=[ROAD, VEGETATION], box=BOX)
+    x = np.linspace(-4, 4, 41, dtype=np.float32)
+    sloped = dataclasses.replace(flat_terrain(), height=np.tile(rise * x, (41, 1)))
+    snow = Snow(depth=0.1, fall_tilt=math.radians(45), wind_direction=math.radians(90))
+    baked = bake_snow(
+        CompletedField(field, sloped), snow, np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=GRID
+    )
+    assert baked is not None
+    catch = baked.deposits.cascades[0][0]
+    below = (catch.weight > 0) & (catch.of_held < -0.5) & (np.abs(catch.position[..., 0]) < 3.5)
+    assert below.any()
+    error = catch.position[below][:, 2] - rise * catch.position[below][:, 0]
+    assert np.abs(error).max() < 0.05
+
+
+def test_classes_count_without_learned_normals():
+    crown = Box((-0.5, -0.5, 1.5), (0.5, 0.5, 2.5))
+    plain = LabelledField(
+        [HalfSpace(), crown],
+        classes=[ROAD, VEGETATION],
+        box=BOX,
+        capabilities=frozenset({DENSITY, CLASSES, OBSERVED}),
+    )
+    baked = bake_snow(
+        CompletedField(plain, flat_terrain()),
+        Snow(depth=0.1),
+        np.array([[0.0, 0.0, 1.6]]),
+        np.ones(3),
+        grid=GRID,
+    )
+    assert baked is not None
+    assert len(baked.deposits.cascades[0]) == 2 * baked.deposits.passes[0], "with crowns"
+
+
+def test_bumps_of_the_ground_are_white_under_thin_snow_and_a_wall_is_not():
+    bump = Box((-0.3, 0.9, -0.5), (0.3, 1.4, 0.05), (0.8, 0.1, 0.1))
+    wall = Box((-1.5, 2.0, -0.5), (1.5, 2.3, 1.5), (0.8, 0.1, 0.1))
+    field = LabelledField([HalfSpace(), bump, wall], classes=[ROAD, ROAD, BUILDING], box=BOX)
+    flat = LabelledField([HalfSpace(), wall], classes=[ROAD, BUILDING], box=BOX)
+    snow = bake_snow(flat, Snow(depth=0.03), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=GRID)
+    assert snow is not None
+    eye = torch.tensor([0.0, -1.0, 1.6])
+    aims = torch.tensor([[0.0, 1.1, 0.05], [0.1, 1.2, 0.05], [0.0, 2.0, 0.6], [0.4, 2.0, 1.0]])
+    d = torch.nn.functional.normalize(aims - eye, dim=-1)
+    o = eye.expand(4, 3).contiguous()
+    seen = trace(World(field, matters=(snow,)), o, d, torch.full((4,), 1e-3))
+    assert (seen.layers["mask_snow"][:2] > 0.99).all()
+    assert (seen.layers["mask_snow"][2:] < 0.01).all()
+    assert seen.rgb[:2].min() > 0.5 and seen.rgb[2:, 1].max() < 0.3
+    assert (seen.layers["seen"] == 1).all()
+    # A field that does not know what faces up keeps its bump.
+    bare = dataclasses.replace(field, capabilities=frozenset())
+    blind = trace(World(bare, matters=(snow,)), o, d, torch.full((4,), 1e-3))
+    assert (blind.layers["mask_snow"][:2] < 0.01).all()
