@@ -8,6 +8,7 @@ python benchmarks/gallery.py street-busy RUN --passers-by
 python benchmarks/gallery.py ditch RUN --ground --level=-1.5m --columns 2
 python benchmarks/gallery.py street-hard RUN --before EARLIER --columns 2
 python benchmarks/gallery.py street-sun RUN --light --columns 3
+python benchmarks/gallery.py street-sun RUN --depths --columns 2
 
 Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
 smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
@@ -16,7 +17,8 @@ shows the most masked photos, the mask in red, and the field from the same camer
 NAME-ground.jpg shows photos' cameras turned down by 15 degrees, clean and flooded, without and with
 completed ground. With --before, NAME-before-after.jpg shows each weather in an earlier run and in
 this one; levels count from the datum of each. With --light, NAME-light.jpg shows the place in the
-light of the photos, under other skies, in fog and under snow.
+light of the photos, under other skies, in fog and under snow. With --depths, NAME-snow.jpg shows
+2, 10 and 30 cm of snow in the light of the photos and under an overcast sky.
 """
 
 import argparse
@@ -77,6 +79,15 @@ def light(run: Path, options: argparse.Namespace) -> Rows:
         "fog": ["--smog.kind", "fog", "--smog.visibility", options.visibility],
         "snow, overcast": ["--snow.depth", options.snow, *overcast],
     }
+    return along_path(run, options, flags)
+
+
+def depths(run: Path, options: argparse.Namespace) -> Rows:
+    """Render frames along the path under more and more snow."""
+    flags = {}
+    for depth in ("2 cm", "10 cm", "30 cm"):
+        flags[depth] = ["--snow.depth", depth]
+        flags[f"{depth}, overcast"] = ["--snow.depth", depth, "--sky.kind", "overcast"]
     return along_path(run, options, flags)
 
 
@@ -192,6 +203,7 @@ def main() -> None:
     kinds.add_argument("--passers-by", action="store_true")
     kinds.add_argument("--ground", action="store_true")
     kinds.add_argument("--light", action="store_true")
+    kinds.add_argument("--depths", action="store_true")
     kinds.add_argument("--before", type=Path, metavar="RUN", help="an earlier run")
     options = parser.parse_args()
     name = options.name
@@ -203,12 +215,15 @@ def main() -> None:
         name, rows = f"{name}-ground", ground(options.run, options)
     elif options.light:
         name, rows = f"{name}-light", light(options.run, options)
+    elif options.depths:
+        name, rows = f"{name}-snow", depths(options.run, options)
     elif options.before:
         name += "-before-after"
         rows = before_after(options.before, options.run, options)
     else:
         rows = weathers(options.run, options)
-    width = 480 if options.ground or options.before or options.light else 320
+    wide = options.ground or options.before or options.light or options.depths
+    width = 480 if wide else 320
     sheet = contact_sheet(rows, options.columns, cell_width=width)
     path = options.out / f"{name}.jpg"
     size = write_jpeg(path, sheet, max_bytes=150_000)

@@ -20,6 +20,7 @@ NODE = 0.18  # m between nodes
 PROBES = 1.0  # m, standard deviation of how probes 2 m apart blur the light
 REFLECTED = 0.25  # reflectance of what stands around
 DARKEST = 0.05  # openness; less is inside of matter
+LEAST = 0.6  # of that ratio; less comes from rays that start inside of matter
 CHUNK = 1 << 16
 
 
@@ -57,7 +58,7 @@ def contact_shade(
     weight = ndimage.gaussian_filter(coarse.astype(np.float64), sigma)
     around = ndimage.gaussian_filter(raster, sigma) / np.maximum(weight, 1e-6)
     # Where no node is near nothing is used.
-    ratio = np.where(coarse, np.minimum(raster / np.maximum(around, DARKEST), 1), 1.0)
+    ratio = np.where(coarse, np.clip(raster / np.maximum(around, DARKEST), LEAST, 1), 1.0)
     # Between nodes: linear, over nodes with snow alone.
     at = np.mgrid[:rows, :columns] / step
     held = coarse.astype(np.float64)
