@@ -34,7 +34,9 @@ LEVEL_Z, SIDE_Z = 0.5, 0.2  # z of normals of a layer's surface, and of its side
 SIDE = 0.3  # m of snow behind a side
 SKIN = 0.15  # sum of the balls half a spacing above a level surface
 BURIED = 0.04  # m below the ground, to which roughness reaches
-OPAQUE = 0.97  # reflectance of a slab; of the ground below a thousandth of the light comes through
+OPAQUE, CLEAN_OPAQUE = 0.95, 0.99
+"""Reflectance of a slab from which on the ground below is left out, which then has less than a
+hundredth of the light; the second is for snow that is whiter than the first."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,8 @@ class BakedSnow:
         side = ((LEVEL_Z - normal[:, 2]) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
         slab = slab_reflectance(height + SIDE * side, self.snow.grain)[:, None]
         reflectance = torch.minimum(slab, deep)
-        thin = (slab[:, 0] < OPAQUE).nonzero()[:, 0]
+        opaque = OPAQUE if float(deep.max()) < OPAQUE else CLEAN_OPAQUE
+        thin = (slab[:, 0] < opaque).nonzero()[:, 0]
         if self.ground is not None and thin.numel():
             below, down = x[thin].clone(), torch.zeros_like(x[thin])
             below[:, 2] -= height[thin]
