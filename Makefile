@@ -3,7 +3,7 @@
 #   make demo    set up, fit the embedded street, render its movies
 #   make test    set up, run the tests
 #
-# Everything is installed into .venv inside the checkout.
+# Everything is installed into .venv inside the checkout. `make test-slow` passes ARGS to pytest.
 
 PYTHON ?= python3
 VENV   := .venv
@@ -37,7 +37,7 @@ test: $(SETUP)
 	$(BIN)/python -m pytest
 
 test-slow: $(SETUP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow $(ARGS)
 
 lint: $(SETUP)
 	$(BIN)/ruff check .
