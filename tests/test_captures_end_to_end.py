@@ -173,7 +173,7 @@ def test_snow_has_the_requested_depth(fitted, rendered):
     assert (layers["snow_thickness"][layers["mask_snow"] == 0] == 0).all()
     snowy = layers["mask_snow"] > 0.5  # surfaces of a short fit are partly transparent
     if fitted[0] == WALL:
-        assert snowy.mean() < 0.02, "hardly any surface is horizontal"
+        assert snowy.mean() < 0.05, "hardly any surface is level enough"
         return
     assert snowy.mean() > CAPTURES[fitted[0]]["min_snow"]
     # Planes are within 10 % (test_snow.py); the ground here is rough and partly transparent.
