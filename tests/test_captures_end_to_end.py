@@ -173,7 +173,9 @@ def test_snow_has_the_requested_depth(fitted, rendered):
     assert (layers["snow_thickness"][layers["mask_snow"] == 0] == 0).all()
     snowy = layers["mask_snow"] > 0.5  # surfaces of a short fit are partly transparent
     if fitted[0] == WALL:
-        assert snowy.mean() < 0.05, "hardly any surface is level enough"
+        # The muzzle and the brow are level enough; what is steeper than 72 degrees is not.
+        steep = rendered["clean"]["normal"][..., 2] < 0.3
+        assert (snowy & steep).mean() < 0.02 and snowy.mean() < 0.05
         return
     assert snowy.mean() > CAPTURES[fitted[0]]["min_snow"]
     # Planes are within 10 % (test_snow.py); the ground here is rough and partly transparent.
