@@ -25,6 +25,7 @@ def small(monkeypatch):
     monkeypatch.setattr(demo, "Fit", functools.partial(demo.Fit, downscale=6, steps=250))
 
 
+@pytest.mark.slow
 def test_the_demo_writes_four_movies_and_a_contact_sheet(tmp_path, capsys):
     out = tmp_path / "demo"
     # The number of steps ends the fit, independent of the speed of the machine.

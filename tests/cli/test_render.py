@@ -63,10 +63,10 @@ def test_ground_is_completed_unless_a_flag_says_no(run_folder, tmp_path, capsys)
 
 def test_flags_of_an_absent_effect_give_a_warning(run_folder, tmp_path, capsys):
     args = ["render", str(run_folder), *map(str, SMALL), "--frames", "1", "-o", str(tmp_path)]
-    assert cli.main([*args, "--flood.wind-speed", "4 m/s", "--snow.depth", "1 cm"]) == 0
+    assert cli.main([*args, "--flood.wind-speed", "4 m/s", "--smog.visibility", "9 m"]) == 0
     err = capsys.readouterr().err
     assert "--flood.wind-speed changes nothing without --flood.level" in err
-    assert "--snow" not in err
+    assert "--smog" not in err
     film = tmp_path / "film.toml"
     film.write_text('[flood]\nlevel = { "0 s" = "1 cm", "1 s" = "2 cm" }\n')
     given = ["--weather", str(film), "--flood.wind-speed", "4 m/s"]

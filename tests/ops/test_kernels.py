@@ -135,7 +135,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, fraction
     blocks = occupied.unfold(1, skip, skip).unfold(2, skip, skip).unfold(3, skip, skip)
     cells = marching.cells_of(occupied)
     assert torch.equal(cells[1], blocks.amax((-3, -2, -1)))
-    n = 60
+    n = 40
     o = torch.randn(n, 3, generator=generator)
     d = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
     d[0] = torch.tensor([0.0, 0.0, 1.0])  # along an axis
@@ -144,7 +144,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, fraction
     near, far = torch.full((n,), 0.05), torch.full((n,), 1e9)
     far[2] = 0.5
     steps = (0.05, 0.02, threshold)
-    monkeypatch.setattr(marching, "CPU_RAYS", 32)  # two parts
+    monkeypatch.setattr(marching, "CPU_RAYS", 16)  # two parts
     offsets, found = marching.march(
         (o, d),
         torch.stack([near, far, jitter], dim=-1),
@@ -172,7 +172,7 @@ def test_marching_matches_the_twin(generator, monkeypatch, side, skips, fraction
         )
         equal += same
     # Rounding can move a step that ends on a cell face into either cell.
-    assert equal >= n - 3
+    assert equal >= n - 2
     assert counts.sum() > 30
 
 

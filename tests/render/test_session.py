@@ -53,6 +53,9 @@ def session_of(monkeypatch):
     views = tuple(View(f"{i}.png", Path(f"{i}.png"), 0, C2W) for i in range(3))
     scene = Scene(Path("."), "test", (CAMERA,), views)
     monkeypatch.setattr(module, "scene_irradiance", lambda *_: torch.full((3,), 2.0))
+    # Coarser and smaller than `choose_grid` makes it, which would take seconds for each session.
+    coarse = lattice_module.SnowGrid((0.0, 0.0), (-3.0, 4.0), 0.06, 64, 2)
+    monkeypatch.setattr(snow_module, "choose_grid", lambda *_: coarse)
 
     def make(table, times):
         weather = weather_from_table(table)

@@ -48,6 +48,9 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
         and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
     }
     result_annotation = signature.return_annotation
+    checks_result = _mentions_arrays(result_annotation)
+    if not annotations and not checks_result:
+        return function
 
     def verify(values: list[tuple[str, Any, Any]]) -> None:
         """Check (name, value, annotation) triples."""
@@ -71,7 +74,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
         ]
         verify(values)
         result = function(*args, **kwargs)
-        if _mentions_arrays(result_annotation):
+        if checks_result:
             verify([*values, ("result", result, result_annotation)])
         return result
 

@@ -1,5 +1,7 @@
 """Free-space constraint: empties the air above the ground, keeps the obstacles on it."""
 
+import copy
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -63,6 +65,18 @@ def tower_and_ground(c2w, n=300):
 
 
 def free_space(change=None, **settings):
+    """One of its own for each caller, since tests change its field."""
+    if change is None and not settings:
+        return copy.deepcopy(usual_free_space())
+    return make_free_space(change, **settings)
+
+
+@functools.cache
+def usual_free_space():
+    return make_free_space()
+
+
+def make_free_space(change=None, **settings):
     c2w = poses(12, height=1.5)
     maps = [ground_labels(pose) for pose in c2w]
     maps = change(maps) if change else maps
