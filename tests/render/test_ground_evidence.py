@@ -177,7 +177,7 @@ class Mislabelled(LabelledField):
         return normal, torch.where(wrong[:, None], swapped, logits)
 
 
-@pytest.mark.parametrize("known", [{NORMALS, CLASSES}, {CLASSES}], ids=str)
+@pytest.mark.parametrize("known", [{NORMALS, CLASSES}, {CLASSES}], ids=["both", "classes"])
 def test_labels_that_are_wrong_by_half_do_not_tilt_the_ground(known):
     right = field(capabilities=frozenset({DENSITY, *known}))
     wrong = Mislabelled(
