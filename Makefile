@@ -34,7 +34,7 @@ demo: $(SETUP)
 	$(BIN)/climatenerf demo
 
 test: $(SETUP)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: $(SETUP)
 	$(BIN)/python -m pytest -m slow $(ARGS)

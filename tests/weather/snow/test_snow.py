@@ -14,7 +14,6 @@ from climatenerf.core.classes import BUILDING, ROAD
 from climatenerf.weather.snow.fall_rays import fall_directions
 from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
 from climatenerf.weather.snow.layer import bake_snow
-from climatenerf.weather.snow.openness import openness_of
 from climatenerf.weather.snow.optics import albedo_of
 from climatenerf.weather.snow.parameters import Snow
 
@@ -307,23 +306,6 @@ def test_brightness_has_no_steps_in_depth():
     # Each is half a millimetre; the first millimetres of snow whiten dark ground fastest.
     assert steps.max() < 0.12
     assert steps[4:].max() < 0.05, "after two millimetres no more than a tenth a millimetre"
-
-
-def test_contact_shade_at_a_dark_wall():
-    """Next to a tall wall half of the sky is hidden. The factor is what probes do not see of it."""
-    wall = Box((1.0, -8.0, -1.0), (1.2, 8.0, 3.0), (0.05, 0.05, 0.05))
-    field = AnalyticField([ground(), wall], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5)))
-    x = np.array([[0.92, 0.0, 0.1], [0.7, 0.0, 0.1], [0.0, 0.0, 0.1], [-7.0, 0.0, 0.1]])
-    openness = openness_of(field, x.astype(np.float32))
-    assert 0.4 < openness[0] < 0.65
-    assert np.all(np.diff(openness) >= 0)
-    assert openness[3] == pytest.approx(1)
-    grid = SnowGrid((0.0, 0.0), (-1.0, 3.2), 0.06, 64)
-    snow = bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=grid)
-    assert snow is not None
-    near = snow.colour(torch.tensor([[0.85, y, 0.1] for y in (-0.5, 0.0, 0.5)]))
-    far = snow.colour(torch.tensor([[-3.0, y, 0.1] for y in (-0.5, 0.0, 0.5)]))
-    assert 0.8 < float(near.mean() / far.mean()) < 0.92, "the rest is in the probes"
 
 
 def test_a_steep_roof_sheds_its_snow_to_the_ground_below():

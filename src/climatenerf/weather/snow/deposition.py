@@ -29,6 +29,7 @@ from climatenerf.weather.snow.cover import (
     slope_share,
     to_edges,
 )
+from climatenerf.weather.snow.drift import drifted
 from climatenerf.weather.snow.fall_rays import (
     PASSES,
     SINGLE_PASS,
@@ -149,9 +150,11 @@ def _caught(
     # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there.
     lost = np.where(wall, 0.0, 1 - share)
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
+    shelter = np.where(np.isfinite(leaves), leaves, smooth[..., 2])
+    moved = drifted(smooth[..., 2], shelter, snow.drift, snow.wind_direction, h)
     caught = crown.complete * np.clip(rays.opacity, 0, 1)
     weight = np.where(own, np.clip((rays.opacity - 0.5) / 0.1, 0, 1), 1.0)  # the terrain is whole
-    catches = [_catch(smooth, share + arrived, -share * caught, weight)]
+    catches = [_catch(smooth, moved * share + arrived, -share * caught, weight)]
     if caught.any():
         position = rays.at(crown.height)
         cap = _catch(position, 0 * caught, caught, (caught > 0).astype(np.float64))

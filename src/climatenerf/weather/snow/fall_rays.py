@@ -40,7 +40,7 @@ class FallRays:
         middle: world z, m.
         leaves: height at which rays meet leaves, if they meet any, m; NaN: they meet nothing.
         surface: height at which they end, m; NaN: nowhere.
-        opacity: of all that they meet.
+        opacity: fraction of light that is lost along each whole ray.
         reached: rays that were traced; the finer cascade handles the others.
     """
 

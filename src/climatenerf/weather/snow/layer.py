@@ -162,7 +162,7 @@ class BakedSnow:
         else:
             white = self.place_light.irradiance(x, normal, contact) / math.pi
         deep = torch.tensor(albedo_of(self.snow), dtype=torch.float32, device=x.device)
-        # The side of a layer is as thick as the layer is wide, whatever its height.
+        # A side shows the snow behind it, however thin the layer is there.
         side = ((LEVEL_Z - normal[:, 2]) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
         slab = slab_reflectance(height + SIDE * side, self.snow.grain)[:, None]
         reflectance = torch.minimum(slab, deep)

@@ -12,13 +12,16 @@ from jaxtyping import Float, Float32
 from scipy import ndimage
 
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.field.protocol import RadianceField, device_of
+from climatenerf.field.protocol import RadianceField, device_of, ground_height
+from climatenerf.weather.snow.surface_fit import depth_crossings
 
 RAYS = 12  # from each node
 REACH = 3.0  # m
 NODE = 0.18  # m between nodes
 PROBES = 1.0  # m, standard deviation of how probes 2 m apart blur the light
 REFLECTED = 0.25  # reflectance of what stands around
+SNOWY = 0.9  # that of ground, which carries the same snow
+ON_GROUND = 0.3  # m above the terrain, up to which a ray ends on the ground
 DARKEST = 0.05  # openness; less is inside of matter
 LEAST = 0.6  # of that ratio; less comes from rays that start inside of matter
 CHUNK = 1 << 16
@@ -34,7 +37,8 @@ def contact_shade(
     """Irradiance of level snow over that around it, at most 1; NaN where nothing is known.
 
     With an openness A (the fraction of diffuse light from above that arrives) and surroundings of
-    reflectance r the light is A/(1 - r (1 - A)), which is exact in a round hollow.
+    reflectance r the light is A/(1 - r (1 - A)), which is exact in a round hollow. What ground
+    hides is snow: hollows of the ground stay nearly as bright as the open.
 
     Args:
         field: the fitted field.
@@ -50,8 +54,9 @@ def contact_shade(
     found = np.full(used.shape, np.nan, np.float32)
     if not len(points):
         return found
-    openness = openness_of(field, points + np.array([0, 0, lift], np.float32))
-    light = openness / (1 - REFLECTED * (1 - openness))
+    openness, ground = openness_of(field, points + np.array([0, 0, lift], np.float32))
+    returned = SNOWY * ground + REFLECTED * np.maximum(1 - openness - ground, 0)
+    light = openness / (1 - returned)
     raster = np.zeros(coarse.shape)
     raster[coarse] = light
     sigma = PROBES / (spacing * step)
@@ -70,14 +75,18 @@ def contact_shade(
 
 
 @torch.no_grad()
-def openness_of(field: RadianceField, x: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """Fraction of even light from above that reaches level surfaces at x (world m).
+def openness_of(
+    field: RadianceField, x: Float32[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Fractions of even light from above at level surfaces: what arrives, and what ground hides.
 
-    What is further away than `REACH` does not count.
+    Args:
+        field: the fitted field.
+        x: positions, world m. What is further away than `REACH` does not count.
     """
     device = device_of(field)
     directions = to_device(cosine_directions(RAYS), device)
-    total = np.zeros(len(x))
+    total, hidden = np.zeros(len(x)), np.zeros(len(x))
     places = to_device(np.ascontiguousarray(x, np.float32), device)
     for first in range(0, len(x), CHUNK // RAYS):
         part = places[first : first + CHUNK // RAYS]
@@ -85,11 +94,16 @@ def openness_of(field: RadianceField, x: Float32[np.ndarray, "n 3"]) -> Float[np
         rays_d = directions.repeat(len(part), 1)
         zero = torch.zeros(len(rays_o), device=device)
         samples = field.march(rays_o, rays_d, zero, zero + REACH, 2.0, stop=1e-2)
-        depth = torch.zeros(len(rays_o), device=device)
-        depth.index_add_(0, samples.ray_index(), samples.sigma * samples.dt)
-        passed = torch.exp(-depth).view(-1, RAYS).mean(1)
-        total[first : first + len(part)] = to_numpy(passed)
-    return np.maximum(total, DARKEST)
+        parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
+        ends, depth = depth_crossings(
+            *(to_numpy(each) for each in parts), np.zeros(len(rays_o)), np.array([math.log(2)])
+        )
+        end = rays_o + to_device(np.float32(ends), device) * rays_d  # NaN where a ray goes on
+        low = end[:, 2] < ground_height(field, end[:, :2].nan_to_num(0.0)) + ON_GROUND
+        stopped = -np.expm1(-depth)
+        total[first : first + len(part)] = 1 - stopped.reshape(-1, RAYS).mean(1)
+        hidden[first : first + len(part)] = (stopped * to_numpy(low)).reshape(-1, RAYS).mean(1)
+    return np.maximum(total, DARKEST), np.minimum(hidden, 1 - DARKEST)
 
 
 def cosine_directions(count: int) -> Float32[np.ndarray, "n 3"]:

@@ -20,7 +20,9 @@ class Snow:
     fall_tilt: Annotated[float, quantity(ANGLE, 0.0, math.radians(80))] = 0.0
     """Angle between the fall direction and the vertical."""
     wind_direction: Annotated[float, quantity(ANGLE, -_TURN, _TURN)] = 0.0
-    """Where tilted snow comes from, clockwise from +y."""
+    """Where the wind comes from, for tilted snow and drifts, clockwise from +y."""
+    drift: Annotated[float, number(0.0, 1.0)] = 0.0
+    """How much the wind moves, from what is exposed to the lee. 1: crests may be blown bare."""
     light: Annotated[str, choice("scene", "paper")] = "scene"
     """scene: the light that falls on each place. paper: that of the open, with wrap lighting."""
     slope: Annotated[float | None, quantity(ANGLE, 0.0, math.pi / 2, optional=True)] = None
@@ -60,6 +62,7 @@ SNOW = Effect(
     prepared_from=(
         "snow.fall_tilt",
         "snow.wind_direction",
+        "snow.drift",
         "snow.light",
         "snow.slope",
         "snow.slope_sharpness",
