@@ -94,11 +94,15 @@ def openness_of(
         rays_d = directions.repeat(len(part), 1)
         zero = torch.zeros(len(rays_o), device=device)
         samples = field.march(rays_o, rays_d, zero, zero + REACH, 2.0, stop=1e-2)
-        parts = (samples.offsets, samples.t, samples.dt, samples.sigma)
         ends, depth = depth_crossings(
-            *(to_numpy(each) for each in parts), np.zeros(len(rays_o)), np.array([math.log(2)])
+            to_numpy(samples.offsets),
+            to_numpy(samples.t),
+            to_numpy(samples.dt),
+            to_numpy(samples.sigma),
+            np.zeros(len(rays_o)),
+            np.array([math.log(2)]),
         )
-        end = rays_o + to_device(np.float32(ends), device) * rays_d  # NaN where a ray goes on
+        end = rays_o + to_device(ends.astype(np.float32), device) * rays_d  # NaN where a ray goes on
         low = end[:, 2] < ground_height(field, end[:, :2].nan_to_num(0.0)) + ON_GROUND
         stopped = -np.expm1(-depth)
         total[first : first + len(part)] = 1 - stopped.reshape(-1, RAYS).mean(1)
