@@ -102,7 +102,9 @@ def openness_of(
             np.zeros(len(rays_o)),
             np.array([math.log(2)]),
         )
-        end = rays_o + to_device(ends.astype(np.float32), device) * rays_d  # NaN where a ray goes on
+        end = (
+            rays_o + to_device(ends.astype(np.float32), device) * rays_d
+        )  # NaN where a ray goes on
         low = end[:, 2] < ground_height(field, end[:, :2].nan_to_num(0.0)) + ON_GROUND
         stopped = -np.expm1(-depth)
         total[first : first + len(part)] = 1 - stopped.reshape(-1, RAYS).mean(1)
