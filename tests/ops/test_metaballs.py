@@ -70,10 +70,15 @@ def test_gradients_of_the_twin_pass_gradcheck():
 
 
 def slope_bias(gradient):
-    """How far the mean height of filled vertices lies below that of a position, in spacings."""
-    up = -gradient[:, 2] / np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
+    """How far the mean height of filled vertices lies below that of a position, in spacings.
+
+    From the gradient of the sum per spacing.
+    """
+    length = np.linalg.norm(gradient, axis=1)
+    up = -gradient[:, 2] / np.maximum(length, 1e-9)
     slope = np.arccos(np.clip(up, 0.5, 1))
-    return np.clip((up - 0.5) / 0.15, 0, 1) * 0.56 * np.sin(slope) * np.tan(slope)
+    fade = np.clip((up - 0.4) / 0.1, 0, 1) * np.clip((length - 0.3) / 0.15, 0, 1)
+    return fade * 0.56 * np.sin(slope) * np.tan(slope)
 
 
 def test_sums_and_gradients_equal_the_twin(random_lattice):
@@ -94,7 +99,7 @@ def test_sums_and_gradients_equal_the_twin(random_lattice):
     expected.sum().backward()
     assert sums == pytest.approx(expected.detach().numpy(), abs=2e-5)
     assert gradients == pytest.approx(x.grad.numpy(), abs=2e-3)  # of about 10 per metre
-    height = points[:, 2] - means[:, 0].detach().numpy() + SPACING * slope_bias(x.grad.numpy())
+    height = points[:, 2] - means[:, 0].detach().numpy() + SPACING * slope_bias(SPACING * x.grad.numpy())
     assert rest[:, 0] == pytest.approx(height, abs=2e-4)
     assert rest[:, 1] == pytest.approx(means[:, 1].detach().numpy(), abs=1e-4)
 

@@ -150,15 +150,17 @@ def _slope_bias(gx, gy, gz):
     """Return by how much `_means` underestimates a height on a slope, from the sum's gradient.
 
     The mean is over filled vertices, which lie uphill of a position on a slope, on higher ground:
-    c sin(slope) tan(slope) spacings, with c measured on planes of 10 to 55 degrees (a test does).
-    0 on the sides of the snow, which are no slopes.
+    c sin(slope) tan(slope) spacings, with c measured on planes of 10 to 60 degrees (a test does).
+    0 on the sides of the snow, which are no slopes, and inside of it, where the gradient is short.
     """
     length = math.sqrt(gx * gx + gy * gy + gz * gz)
     if length < 1e-9:  # no gradient: 0/0
         return 0.0
     up = -gz / length
-    fade = min(max((up - 0.5) / 0.15, 0.0), 1.0)
-    return fade * _SLOPE_BIAS * (1 / max(up, 0.5) - up)
+    surface = min(max((length - 0.3) / 0.15, 0.0), 1.0)  # at a half-space's it is 1/2
+    slope = min(max((up - 0.4) / 0.1, 0.0), 1.0)
+    up = max(up, 0.5)
+    return surface * slope * _SLOPE_BIAS * (1 / up - up)
 
 
 @njit(cache=True, fastmath=_FAST, inline="always")

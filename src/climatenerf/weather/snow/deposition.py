@@ -139,8 +139,9 @@ def _caught(
     smooth, cosine = smooth_ground(rays.at(surface), fall, 0.03 + 0.5 * h, base)
     own = surface == rays.surface  # NaN compares False: elsewhere the terrain stands in
     # Learned normals are more accurate at edges and on curved surfaces than heights on a raster. On
-    # far ground they are too noisy.
-    learned = own & np.isfinite(normal_z) & ~(on_ground & (cascade >= SINGLE_PASS))
+    # the ground and on grass they are those of each clump.
+    low = on_ground | (surface < ground + UNDERGROWTH)  # NaN compares False
+    learned = own & np.isfinite(normal_z) & ~low
     cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
     share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
     wall = cosine < WALL
