@@ -99,7 +99,8 @@ def test_sums_and_gradients_equal_the_twin(random_lattice):
     expected.sum().backward()
     assert sums == pytest.approx(expected.detach().numpy(), abs=2e-5)
     assert gradients == pytest.approx(x.grad.numpy(), abs=2e-3)  # of about 10 per metre
-    height = points[:, 2] - means[:, 0].detach().numpy() + SPACING * slope_bias(SPACING * x.grad.numpy())
+    bias = SPACING * slope_bias(SPACING * x.grad.numpy())
+    height = points[:, 2] - means[:, 0].detach().numpy() + bias
     assert rest[:, 0] == pytest.approx(height, abs=2e-4)
     assert rest[:, 1] == pytest.approx(means[:, 1].detach().numpy(), abs=1e-4)
 

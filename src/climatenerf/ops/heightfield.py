@@ -39,8 +39,8 @@ def first_crossing(
         from climatenerf.ops.cpu import heightfield as kernels
 
         found = torch.empty_like(span[:, 0])
-        given = [dispatch.kernel_array(each) for each in (height, rays_o, rays_d, span)]
-        kernels.first_crossing(given[0], given[1], given[2], given[3], slope, found.numpy())
+        given = dispatch.kernel_arrays(height, rays_o, rays_d, span, found)
+        kernels.first_crossing(given[0], given[1], given[2], given[3], slope, given[4])
         return found
     return _first_crossing(height, rays_o, rays_d, span, slope)
 

@@ -62,7 +62,7 @@ def irradiance(
             grid.shape,
             dispatch.kernel_array(grid.valid),
             dispatch.kernel_array(rows),
-            found.numpy(),
+            dispatch.kernel_array(found),
         )
         return found.split(3, dim=-1)
     return tuple(

@@ -36,8 +36,8 @@ def visibility(
         from climatenerf.ops.cpu import relighting as kernel
 
         found = torch.empty_like(at[:, 0])
-        arrays = dispatch.kernel_arrays(depths, at)
-        kernel.visibility(arrays[0], half, bias, arrays[1], found.numpy())
+        arrays = dispatch.kernel_arrays(depths, at, found)
+        kernel.visibility(arrays[0], half, bias, *arrays[1:])
         return found
     side = depths.shape[1] - 1
     result = torch.ones_like(at[:, 0])
@@ -88,8 +88,8 @@ def interpolated(
         from climatenerf.ops.cpu import relighting as kernel
 
         found = torch.empty_like(x[:, 0])
-        arrays = dispatch.kernel_arrays(grids, origin, x, kind)
-        kernel.interpolated(arrays[0], arrays[1], cell, arrays[2], arrays[3], found.numpy())
+        arrays = dispatch.kernel_arrays(grids, origin, x, kind, found)
+        kernel.interpolated(arrays[0], arrays[1], cell, *arrays[2:])
         return found
     last = torch.tensor(grids.shape[:0:-1], device=x.device) - 1
     place = torch.minimum(((x - origin) / cell).clamp_min(0), last.to(x))

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 from torch import Tensor
 
+from climatenerf.core.device import to_numpy
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField
@@ -84,7 +85,7 @@ def gather(
     spacing = torch.tensor([wide, wide, SPACING[2]], device=device)
     low = torch.stack([middle[0] - half, middle[1] - half, middle.new_tensor(lowest + HEIGHT[0])])
     high = torch.stack([middle[0] + half, middle[1] + half, middle.new_tensor(lowest + HEIGHT[1])])
-    nx, ny, nz = (int(n) + 1 for n in ((high - low) / spacing).round().tolist())
+    nx, ny, nz = (int(n) + 1 for n in to_numpy(((high - low) / spacing).round()))
     nodes = _nodes(low, spacing, (nx, ny, nz))
     directions = sphere_directions(RAYS).to(device)
     count = nodes.shape[0] * RAYS

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from climatenerf.core.classes import SOLID
 from climatenerf.core.colour import luma
+from climatenerf.core.device import to_numpy
 from climatenerf.ops import relighting
 
 CELL = 2.0  # m, of the grid of means
@@ -109,7 +110,8 @@ def estimate(
     middle = x.median(0).values  # what is far from it gets the values of the grid's border
     origin = torch.maximum(x.amin(0), middle - CELL * MOST_CELLS / 2)
     count = ((x.amax(0) - origin) / CELL).ceil().long().clamp(1, MOST_CELLS) + 1
-    shape = tuple(count.flip(0).tolist())
+    nx, ny, nz = (int(n) for n in to_numpy(count))
+    shape = nz, ny, nx
     node = ((x - origin) / CELL).round().long().clamp_min(0)
     node = torch.minimum(node, count - 1)
     cell = (node[:, 2] * shape[1] + node[:, 1]) * shape[2] + node[:, 0]
