@@ -299,6 +299,55 @@ class Choice(Parameter):
         return [value]
 
 
+class Folder(Parameter):
+    """A folder of the user's, as metadata of a dataclass field's annotation; "none" without one."""
+
+    def __init__(self) -> None:
+        super().__init__(None, -math.inf, math.inf, optional=True)
+        object.__setattr__(self, "metavar", "FOLDER")
+
+    def check(self, value: Any, name: str) -> None:
+        """Check that a value is a path or None; see `Parameter.check`.
+
+        Raises:
+            UserError: it is empty or something else.
+        """
+        if value is not None and not (isinstance(value, str) and value.strip()):
+            raise UserError(f"--{name.replace('_', '-')} must be a folder; got {excerpt(value)}")
+
+    def read(self, raw: Any, where: str) -> str | None:
+        """A value of a weather file.
+
+        Raises:
+            UserError: no text.
+        """
+        if not isinstance(raw, str) or not raw.strip():
+            raise UserError(f"{where} must be a folder; got {excerpt(raw)}")
+        return None if raw.strip().lower() == "none" else raw
+
+    def write(self, value: str | None) -> str:
+        """The path itself."""
+        return "none" if value is None else value
+
+    def text(self, value: Any) -> str:
+        """The path itself."""
+        return str(value)
+
+    def _from_words(self, words: list[str]) -> str | None:
+        return None if words[0].strip().lower() == "none" else words[0]
+
+    def _is_instance(self, value: Any) -> bool:
+        return value is None or isinstance(value, str)
+
+    def _to_words(self, value: Any) -> list[str]:
+        return ["none" if value is None else value]
+
+
+def folder() -> Folder:
+    """A folder, or none."""
+    return Folder()
+
+
 def choice(*words: str) -> Choice:
     """One of several words."""
     return Choice(*words)

@@ -60,6 +60,8 @@ class Light(NamedTuple):
     """Linear radiance of a white, unoccluded horizontal surface."""
     sun_direction: Float[np.ndarray, "3"] | None
     """Unit vector towards the sun, world frame; None or below the horizon: diffuse light only."""
+    sunlit: Callable[[np.ndarray], np.ndarray] | None = None
+    """Fraction of the sun at positions [n, 3] (world m), NaN where unknown; None: by geometry."""
 
 
 def find_deposits(
@@ -296,8 +298,12 @@ def _shade(
             sun_depth = samples.sigma.new_zeros(len(points))
             sun_depth.index_add_(0, samples.ray_index(), (samples.sigma * samples.dt).detach())
             visible = torch.exp(-sun_depth).float()
+        if light.sunlit is not None:
+            photographed = light.sunlit(to_numpy(points).astype(np.float64)).astype(np.float32)
+            found = to_device(photographed, device)
+            visible = torch.where(found.isnan(), visible, found)
         shade = shade * (snow.sun_share * visible + snow.shade)
         shades.append(to_numpy(shade.clamp(0, 1).float()))
-    found = catch.shade.copy()
-    found[used] = np.concatenate(shades)
-    return found
+    shade = catch.shade.copy()
+    shade[used] = np.concatenate(shades)
+    return shade

@@ -9,6 +9,7 @@ sparse grid (`lattice`), filled by rays along the fall direction (`deposition`).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Deposits, SnowGrid, choose_grid, grow
 from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.snow.shadow_masks import ShadowMasks
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Light as PlaceLight
 from climatenerf.weather.world import Preparation, World
@@ -194,6 +196,7 @@ def bake_snow(
     grid: SnowGrid | None = None,
     progress: Callable[[float], None] | None = None,
     appearance: Float[Tensor, "1 e"] | None = None,
+    sunlit: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> BakedSnow | None:
     """Let snow fall on a scene. World frame: metres, z up.
 
@@ -207,6 +210,7 @@ def bake_snow(
         grid: where snow is simulated and how finely; None: chosen from bounds and cameras.
         progress: called with the fraction that is done, 0 to 1.
         appearance: exposure and light of the field's colours; None: the mean of all photos.
+        sunlit: see `Light.sunlit`.
 
     Returns:
         The snow; None where the depth asks for none.
@@ -214,7 +218,7 @@ def bake_snow(
     if snow.depth is None or snow.depth <= 0:
         return None
     cameras = np.asarray(cameras, np.float64).reshape(-1, 3)
-    light = Light(np.asarray(irradiance_over_pi, np.float64), sun_direction)
+    light = Light(np.asarray(irradiance_over_pi, np.float64), sun_direction, sunlit)
     if grid is None:
         lower, upper = (to_numpy(b).astype(np.float64) for b in field.bounds)
         grid = choose_grid(lower, upper, cameras)
@@ -245,6 +249,7 @@ class SnowEntity:
             weather.seed,
             progress=lambda fraction: given.progress("snowfall", fraction),
             appearance=given.appearance,
+            sunlit=self._photographed_shadows(weather.snow),
         )
         if self._baked is not None and not self._baked.deposits.any():
             tilted = " or a smaller --snow.fall-tilt" if weather.snow.fall_tilt > 0 else ""
@@ -252,6 +257,16 @@ class SnowEntity:
                 "no surface of this scene catches snow: all are sheltered, too steep or missing;"
                 f" render without --snow.depth{tilted}"
             )
+
+    def _photographed_shadows(self, snow: Snow) -> Callable[[np.ndarray], np.ndarray] | None:
+        if snow.shadows is None:
+            return None
+        if snow.light != "paper":
+            raise UserError("--snow.shadows belongs to the paper's shading; add --snow.light paper")
+        if self._preparation.photo_rays is None:
+            raise UserError("--snow.shadows needs a field that knows its surfaces; leave it out")
+        photos = self._preparation.photo_rays()
+        return ShadowMasks(Path(snow.shadows), photos).sunlight
 
     def place(self, world: World, weather: Weather, time: float) -> World:
         """The world with snow on it, down to the highest water level."""

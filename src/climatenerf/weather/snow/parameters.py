@@ -6,7 +6,7 @@ from typing import Annotated
 
 from climatenerf.core.layer_table import Layer
 from climatenerf.weather.effect import Effect, Measure
-from climatenerf.weather.units import ANGLE, LENGTH, choice, number, quantity
+from climatenerf.weather.units import ANGLE, LENGTH, choice, folder, number, quantity
 
 _TURN = 2 * math.pi
 
@@ -43,6 +43,8 @@ class Snow:
     """beta_s: brightness that the sun's shadow takes away."""
     shade: Annotated[float, number(0.0, 1.0)] = 0.3
     """V_s0: brightness that is left in shadow."""
+    shadows: Annotated[str | None, folder()] = None
+    """Masks of the photos, white in shadow, for `light` = paper. none: shadows by geometry."""
 
 
 SNOW = Effect(
@@ -69,6 +71,7 @@ SNOW = Effect(
         "snow.albedo_offset",
         "snow.sun_share",
         "snow.shade",
+        "snow.shadows",
         "sun.elevation",
         "sun.azimuth",
         "seed",

@@ -1,0 +1,97 @@
+"""The photos' own shadows, from masks that the user brings: for the paper's snow shading.
+
+ClimateNeRF bakes two-dimensional shadow masks of the photos into a volume, by least squares over
+the rays of all photos. The value with the least squares at a place is the mean over the rays that
+end there, which is what this module takes.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from climatenerf.core.errors import UserError, excerpt
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
+from climatenerf.scene.images import read_grey
+from climatenerf.scene.photo_rays import PhotoRays
+
+NEAREST = 12  # rays of which the mean is taken
+REACH = 0.5  # m from a place, up to which rays count
+
+
+class ShadowMasks:
+    """Sunlight of places, by masks of the photos."""
+
+    def __init__(self, folder: Path, photos: Sequence[PhotoRays]):
+        """Read the masks.
+
+        Args:
+            folder: a mask for each photo, with its name and any suffix; white in shadow. Photos
+                without one do not count.
+            photos: where the rays of the photos end.
+
+        Raises:
+            UserError: there is no such folder, no mask of any photo in it, or one cannot be read.
+        """
+        if not folder.is_dir():
+            raise UserError(
+                f"--snow.shadows: there is no folder {excerpt(str(folder))}; give one with a mask"
+                " for each photo, white in shadow"
+            )
+        ends, values = [], []
+        for photo in photos:
+            path = _mask_of(folder, photo.view.name)
+            if path is None:
+                continue
+            mask = read_grey(path)
+            if abs(mask.shape[1] / mask.shape[0] / photo.t.shape[1] * photo.t.shape[0] - 1) > 0.05:
+                raise UserError(
+                    f"--snow.shadows: {path.name} has other proportions than its photo; masks show"
+                    " what their photos show"
+                )
+            known = np.isfinite(photo.t)
+            ends.append(photo.x[known])
+            values.append(_resized(mask, photo.t.shape)[known])
+        if not ends:
+            example = Path(photos[0].view.name).with_suffix(".png") if photos else "photo.png"
+            raise UserError(
+                f"--snow.shadows: {excerpt(str(folder))} has no mask of any photo; name them after"
+                f" the photos, such as {example}"
+            )
+        self._values = np.concatenate(values)
+        self._tree = KDTree(np.concatenate(ends))
+
+    def sunlight(self, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Fraction of the sun at positions (world m), 0 to 1; NaN where no photo with a mask sees.
+
+        The mean over the `NEAREST` rays that end within `REACH`.
+        """
+        count = min(NEAREST, len(self._values))
+        found = self._tree.query(x, count, distance_upper_bound=REACH)
+        distance, index = (np.reshape(each, (len(x), count)) for each in found)
+        near = np.isfinite(distance)
+        shadow = np.where(near, self._values[np.where(near, index, 0)], 0.0).sum(1)
+        # 1: no ray is near, and the result is replaced.
+        return np.where(near.any(1), 1 - shadow / np.maximum(near.sum(1), 1), np.nan)
+
+
+def _mask_of(folder: Path, name: str) -> Path | None:
+    """The mask of the photo with a name, if there is one."""
+    stem = Path(Path(name).name) if Path(name).is_absolute() else Path(name)
+    candidates = [stem, *(stem.with_suffix(suffix) for suffix in sorted(PHOTO_SUFFIXES))]
+    flat = [Path(each.name) for each in candidates]
+    return next((folder / each for each in (*candidates, *flat) if (folder / each).is_file()), None)
+
+
+def _resized(mask: Float[np.ndarray, "h w"], shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
+    """The mask at another size, averaged; 1/2 lies between light and shadow."""
+    sizes, at = list(zip(mask.shape, shape, strict=True)), []
+    for axis, (old, new) in enumerate(sizes):
+        mask = ndimage.uniform_filter1d(mask, max(round(old / new), 1), axis, mode="nearest")
+        at.append((np.arange(new) + 0.5) * old / new - 0.5)
+    at = np.meshgrid(*at, indexing="ij")
+    found: np.ndarray = ndimage.map_coordinates(mask, at, order=1, mode="nearest")
+    return found
