@@ -286,3 +286,53 @@ def test_bumps_of_the_ground_are_white_under_thin_snow_and_a_wall_is_not():
     bare = dataclasses.replace(field, capabilities=frozenset())
     blind = trace(World(bare, matters=(snow,)), o, d, torch.full((4,), 1e-3))
     assert (blind.layers["mask_snow"][:2] < 0.01).all()
+
+
+@dataclasses.dataclass(frozen=True)
+class Grass(LabelledField):
+    """A field whose learned normals are those of clumps, tilted by 35 degrees to and fro."""
+
+    def surface_heads(self, rays_o, rays_d, samples, selected):
+        normal, logits = super().surface_heads(rays_o, rays_d, samples, selected)
+        ray = samples.ray_index()[selected]
+        x = rays_o[ray] + samples.t[selected, None] * rays_d[ray]
+        turn = math.radians(35) * torch.sin(x[:, 0] * 12).sign()
+        across, up = normal[:, 1], normal[:, 2]
+        tilted = [normal[:, 0], across * turn.cos() - up * turn.sin(),
+                  across * turn.sin() + up * turn.cos()]  # fmt: skip
+        return torch.stack(tilted, -1), logits
+
+
+@pytest.mark.parametrize("kind", [TERRAIN, VEGETATION])
+def test_clumps_of_grass_on_a_bank_keep_what_the_bank_keeps(kind):
+    slope = math.radians(40)
+    bank = HalfSpace((0.0, -math.sin(slope), math.cos(slope)))
+    y = np.linspace(-4, 4, 41, dtype=np.float32)
+    terrain = dataclasses.replace(
+        flat_terrain(), height=np.tile(math.tan(slope) * y[:, None], (1, 41))
+    )
+    box = ((-4.0, -4.0, -4.0), (4.0, 4.0, 4.0))
+    grid = SnowGrid((0.013, 0.027), (-3.0, 3.0), 0.05, 32)
+    field = CompletedField(Grass([bank], classes=[kind], box=box), terrain)
+    baked = bake_snow(field, Snow(depth=0.1), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=grid)
+    assert baked is not None
+    for catch in baked.deposits.cascades[0]:
+        inside = (np.abs(catch.position[..., :2]) < 1).all(-1) & (catch.weight > 0)
+        assert catch.of_fall[inside] == pytest.approx(2 / 3, abs=0.05)
+
+
+def test_snow_on_a_steep_slope_hides_it_without_gaps():
+    """Where the slope is nearly too steep, the snow is thin, and still closed."""
+    slope = math.radians(54)
+    bank = HalfSpace((0.0, -math.sin(slope), math.cos(slope)))
+    box = ((-4.0, -4.0, -4.0), (4.0, 4.0, 4.0))
+    grid = SnowGrid((0.013, 0.027), (-3.0, 3.0), 0.05, 32)
+    field = LabelledField([bank], classes=[TERRAIN], box=box)
+    baked = bake_snow(field, Snow(depth=0.1), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=grid)
+    assert baked is not None
+    x = 1.6 * torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) - 0.8
+    feet = torch.cat([x, (x[:, 1] * math.tan(slope))[:, None]], -1)
+    d = -torch.tensor([0.0, -math.sin(slope), math.cos(slope)]).expand(500, 3).contiguous()
+    samples = baked.march(feet - 0.5 * d, d, torch.zeros(500), torch.full((500,), 0.5))
+    depth = torch.zeros(500).index_add_(0, samples.ray_index(), samples.sigma * samples.dt)
+    assert (torch.exp(-depth) < 0.5).float().mean() > 0.99
