@@ -257,6 +257,20 @@ def test_snow_scores_of_a_known_thickness_error():
     assert all(none[f"snowy_{k}"] == 0 and none[f"true_snowy_{k}"] > 0.9 for k in kinds)
 
 
+def test_radiance_of_snow_on_terrain_over_that_on_roads():
+    truth = truth_of()
+    truth.label[:, :32] = np.where(truth.label[:, :32] == SKY, SKY, TERRAIN)
+    ours = np.full((*truth.depth.shape, 3), 0.5)
+    ours[:, :32] *= 0.6
+    true = np.rint(255 * to_display(np.where(np.arange(64)[:, None] < 32, 0.4, 0.5)))
+    picture = np.broadcast_to(true, ours.shape).astype(np.uint8)
+    scores = weather_scores.ground_scores([ours], [picture], (truth,))
+    assert scores["terrain_over_road"] == pytest.approx(0.6)
+    assert scores["true_terrain_over_road"] == pytest.approx(0.8, abs=0.01)
+    alone = weather_scores.ground_scores([ours], [picture], (truth_of(),))
+    assert np.isnan(list(alone.values())).all()
+
+
 def test_unknown_classes_count_as_wrong():
     truth = truth_of()
     right = geometry.MERGED[truth.label]

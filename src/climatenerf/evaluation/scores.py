@@ -329,6 +329,7 @@ def score_weather(
         ours = [linear for linear, _ in renders]
         dry = [view.linear for view in views]
         scores.table["walls"][case.name] = weather_scores.wall_scores(ours, dry, true, truths)
+        found |= weather_scores.ground_scores(ours, true, truths)
     if SMOG.present(weather.smog) and weather.smog.light == "paper":
         found |= weather_scores.transmittance_scores(
             [each["transmittance"] for each in layers],

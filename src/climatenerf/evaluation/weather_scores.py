@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from climatenerf.core.classes import BUILDING, CLASS_NAMES, MERGED, VEGETATION
+from climatenerf.core.classes import BUILDING, CLASS_NAMES, MERGED, ROAD, TERRAIN, VEGETATION
 from climatenerf.core.srgb import to_linear
 from climatenerf.evaluation.geometry import ground_or_roof
 from climatenerf.evaluation.reference import Truth
@@ -210,6 +210,32 @@ def wall_scores(
         return {"ratio": nothing, "true_ratio": nothing, "ratio_error": nothing}
     ratio, other = float(sums[0] / sums[1]), float(sums[2] / sums[3])
     return {"ratio": ratio, "true_ratio": other, "ratio_error": abs(ratio / other - 1)}
+
+
+def ground_scores(
+    ours: list[Float[np.ndarray, "h w 3"]],
+    true: list[UInt8[np.ndarray, "h w 3"]],
+    truths: tuple[Truth, ...],
+) -> dict[str, float]:
+    """Score how bright snow on terrain is beside snow on roads, as bushes and houses shade both.
+
+    Returns:
+        `terrain_over_road`: mean radiance of the one over that of the other, and
+        `true_terrain_over_road`. NaN where one of the two is not in view.
+    """
+    sums = np.zeros((2, 2))
+    counts = np.zeros(2)
+    for linear, picture, truth in zip(ours, true, truths, strict=True):
+        label = MERGED[truth.label]
+        for k, kind in enumerate((TERRAIN, ROAD)):
+            own = (label == kind) & (truth.depth < MAX_SNOW_DISTANCE)
+            counts[k] += own.sum()
+            sums[k] += linear[own].sum(), to_linear(picture[own] / 255.0).sum()
+    if not counts.all() or not sums[1].all():
+        return dict.fromkeys(("terrain_over_road", "true_terrain_over_road"), float("nan"))
+    mean = sums / counts[:, None]
+    found, other = mean[0] / mean[1]
+    return {"terrain_over_road": float(found), "true_terrain_over_road": float(other)}
 
 
 def water_visible(truth: Truth, level: float) -> Bool[np.ndarray, "h w"]:
