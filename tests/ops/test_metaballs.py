@@ -78,7 +78,7 @@ def slope_bias(gradient):
     up = -gradient[:, 2] / np.maximum(length, 1e-9)
     slope = np.arccos(np.clip(up, 0.5, 1))
     fade = np.clip((up - 0.4) / 0.1, 0, 1) * np.clip((length - 0.3) / 0.15, 0, 1)
-    return fade * 0.56 * np.sin(slope) * np.tan(slope)
+    return fade * 0.545 * np.sin(slope) * np.tan(slope)
 
 
 def test_sums_and_gradients_equal_the_twin(random_lattice):

@@ -40,7 +40,7 @@ MAX_SAMPLES = 24
 LOW = 0.42
 """Sum below which the density is less than a thousandth of that inside."""
 _SLOPE_BOUND = 0.75  # upper bound of a sum's slope per spacing (measured by a test)
-_SLOPE_BIAS = 0.56  # c of `_slope_bias`, spacings
+_SLOPE_BIAS = 0.545  # c of `_slope_bias`, spacings
 _SAMPLE_DEPTH = 0.5  # optical depth that is merged into one sample
 _OPAQUE = 7.0  # optical depth at which a ray ends: exp(-7) < 1e-3
 # Without nnan and ninf: t_max may be infinite.
