@@ -311,17 +311,6 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     return (mask if mask.ndim == 2 else mask[..., :3].max(axis=-1)) > 0
 
 
-def read_grey(path: Path) -> Float[np.ndarray, "h w"]:
-    """Read an image as grey, 0 black to 1 white.
-
-    Raises:
-        UserError: The file cannot be read.
-    """
-    image = _read_image(path)
-    image = image.convert("RGB") if image.mode in ("P", "PA") else image
-    return np.asarray(image.convert("L"), np.float64) / 255
-
-
 def read_depth(path: Path, scale: float = MILLIMETRES) -> Float[np.ndarray, "h w"]:
     """Read z-depths: NPY or NPZ (one array) in metres, a 16-bit PNG of integers, or floats as RGBA.
 

@@ -10,16 +10,18 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy import ndimage
+from PIL import Image
 from scipy.spatial import KDTree
 
 from climatenerf.core.errors import UserError, excerpt
+from climatenerf.scene.file_names import FileNames
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
-from climatenerf.scene.images import read_grey
+from climatenerf.scene.images import read_rgb
 from climatenerf.scene.photo_rays import PhotoRays
 
 NEAREST = 12  # rays of which the mean is taken
 REACH = 0.5  # m from a place, up to which rays count
+PROPORTIONS = 0.05  # relative difference of those of a reduced photo and its mask
 
 
 class ShadowMasks:
@@ -41,21 +43,23 @@ class ShadowMasks:
                 f"--snow.shadows: there is no folder {excerpt(str(folder))}; give one with a mask"
                 " for each photo, white in shadow"
             )
-        ends, values = [], []
+        files, ends, values = FileNames(folder), [], []
         for photo in photos:
-            path = _mask_of(folder, photo.view.name)
+            path = files.find_any(_names(photo.view.name))
             if path is None:
                 continue
-            mask = read_grey(path)
-            if abs(mask.shape[1] / mask.shape[0] / photo.t.shape[1] * photo.t.shape[0] - 1) > 0.05:
+            mask, (rows, columns) = read_rgb(path).max(-1), photo.t.shape
+            if abs(mask.shape[1] / mask.shape[0] * rows / columns - 1) > PROPORTIONS:
                 raise UserError(
                     f"--snow.shadows: {path.name} has other proportions than its photo; masks show"
                     " what their photos show"
                 )
             known = np.isfinite(photo.t)
             ends.append(photo.x[known])
-            values.append(_resized(mask, photo.t.shape)[known])
-        if not ends:
+            # As many rays as the reduced photo has pixels: each is the mean of its part.
+            reduced = Image.fromarray(mask).resize((columns, rows), Image.Resampling.BOX)
+            values.append(np.asarray(reduced, np.float64)[known] / 255)
+        if not any(len(each) for each in ends):
             example = Path(photos[0].view.name).with_suffix(".png") if photos else "photo.png"
             raise UserError(
                 f"--snow.shadows: {excerpt(str(folder))} has no mask of any photo; name them after"
@@ -78,20 +82,8 @@ class ShadowMasks:
         return np.where(near.any(1), 1 - shadow / np.maximum(near.sum(1), 1), np.nan)
 
 
-def _mask_of(folder: Path, name: str) -> Path | None:
-    """The mask of the photo with a name, if there is one."""
-    stem = Path(Path(name).name) if Path(name).is_absolute() else Path(name)
-    candidates = [stem, *(stem.with_suffix(suffix) for suffix in sorted(PHOTO_SUFFIXES))]
-    flat = [Path(each.name) for each in candidates]
-    return next((folder / each for each in (*candidates, *flat) if (folder / each).is_file()), None)
-
-
-def _resized(mask: Float[np.ndarray, "h w"], shape: tuple[int, ...]) -> Float[np.ndarray, "h w"]:
-    """The mask at another size, averaged; 1/2 lies between light and shadow."""
-    sizes, at = list(zip(mask.shape, shape, strict=True)), []
-    for axis, (old, new) in enumerate(sizes):
-        mask = ndimage.uniform_filter1d(mask, max(round(old / new), 1), axis, mode="nearest")
-        at.append((np.arange(new) + 0.5) * old / new - 0.5)
-    at = np.meshgrid(*at, indexing="ij")
-    found: np.ndarray = ndimage.map_coordinates(mask, at, order=1, mode="nearest")
-    return found
+def _names(photo: str) -> list[str]:
+    """Names that the mask of a photo may have: its own, or that before its suffix; PNG first."""
+    suffixes = sorted(PHOTO_SUFFIXES, key=lambda suffix: (suffix != ".png", suffix))
+    stems = (Path(photo).with_suffix("").as_posix(), Path(photo).as_posix())
+    return [f"{stem}{suffix}" for suffix in suffixes for stem in stems]
