@@ -78,11 +78,14 @@ def contact_shade(
 def openness_of(
     field: RadianceField, x: Float32[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Fractions of even light from above at level surfaces: what arrives, and what ground hides.
+    """Fractions of even light from above at level surfaces.
 
     Args:
         field: the fitted field.
         x: positions, world m. What is further away than `REACH` does not count.
+
+    Returns:
+        The fraction that arrives, `DARKEST` at least, and the fraction that the ground hides.
     """
     device = device_of(field)
     directions = to_device(cosine_directions(RAYS), device)
@@ -102,14 +105,13 @@ def openness_of(
             np.zeros(len(rays_o)),
             np.array([math.log(2)]),
         )
-        end = (
-            rays_o + to_device(ends.astype(np.float32), device) * rays_d
-        )  # NaN where a ray goes on
+        # NaN where a ray goes on.
+        end = rays_o + to_device(ends.astype(np.float32), device) * rays_d
         low = end[:, 2] < ground_height(field, end[:, :2].nan_to_num(0.0)) + ON_GROUND
         stopped = -np.expm1(-depth)
         total[first : first + len(part)] = 1 - stopped.reshape(-1, RAYS).mean(1)
         hidden[first : first + len(part)] = (stopped * to_numpy(low)).reshape(-1, RAYS).mean(1)
-    return np.maximum(total, DARKEST), np.minimum(hidden, 1 - DARKEST)
+    return np.maximum(total, DARKEST), hidden
 
 
 def cosine_directions(count: int) -> Float32[np.ndarray, "n 3"]:

@@ -22,7 +22,7 @@ class Snow:
     wind_direction: Annotated[float, quantity(ANGLE, -_TURN, _TURN)] = 0.0
     """Where the wind comes from, for tilted snow and drifts, clockwise from +y."""
     drift: Annotated[float, number(0.0, 1.0)] = 0.0
-    """How much the wind moves, from what is exposed to the lee. 1: crests may be blown bare."""
+    """Drifts: deeper in the lee, thinner where exposed. 1: slopes towards the wind may be bare."""
     light: Annotated[str, choice("scene", "paper")] = "scene"
     """scene: the light that falls on each place. paper: that of the open, with wrap lighting."""
     slope: Annotated[float | None, quantity(ANGLE, 0.0, math.pi / 2, optional=True)] = None
