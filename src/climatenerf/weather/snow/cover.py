@@ -3,6 +3,7 @@
 Rasters have one node for each fall ray of a pass; heights are world z, m, NaN where nothing is.
 """
 
+import heapq
 import math
 from typing import Any, NamedTuple
 
@@ -20,14 +21,15 @@ CROWN_HOLDS = 0.08  # m of snow that a crown can hold
 CROWN_RETAINS = 0.678  # fraction of it that stays for hours (Hedstrom and Pomeroy 1998)
 CUSHION = 0.1  # m, standard deviation of the smoothing of crowns
 ONE_LAYER = 0.6  # m below the highest leaf nearby; deeper leaves carry no part of a cushion
-CROWN_KEEPS, CROWN_SHEDS = 0.8, 1.7  # slopes (rise over run) of crowns that keep all and nothing
-CLOSED = (0.25, 0.6)  # fraction covered by leaves at which a cushion begins, and is complete
+CROWN_KEEPS, CROWN_SHEDS = 0.9, 2.0  # slopes (rise over run) of crowns that keep all and nothing
+CLOSED = (0.2, 0.45)  # fraction covered by leaves at which a cushion begins, and is complete
 HIGHEST_VEIL = 2.0  # m above the ground; what hangs higher may be a roof of a wrong class
 EDGE = 0.12  # m from the edge of a surface, within which its normals are blurred
 STEEPEST_EDGE = math.tan(math.radians(50))  # of a surface and its rounded edge
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.35  # m, standard deviation of the heap of what slid
+DESCENT = 1e-6  # m a node, of filled hollows, so that a way leads out of them
 MAX_SWEEPS = 40  # of `settled`; a metre of snow on a lattice of 5 cm takes 20
 
 
@@ -57,8 +59,10 @@ class Cushions(NamedTuple):
 
     height: Float[np.ndarray, "h w"]
     """Of the cushion's base, m; NaN without one."""
-    complete: Float[np.ndarray, "h w"]
-    """How closed the crown is, 0 to 1; 0 at a cushion's rim."""
+    closed: Float[np.ndarray, "h w"]
+    """How closed the crown is, 0 to 1."""
+    keeps: Float[np.ndarray, "h w"]
+    """Fraction that its slope keeps of what a closed and level crown holds; 0 without a cushion."""
 
 
 def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
@@ -76,12 +80,12 @@ def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
     top = leaf & (filled > highest - ONE_LAYER)
     weight = ndimage.gaussian_filter(top.astype(np.float64), sigma)
     moment = ndimage.gaussian_filter(np.where(top, filled, 0.0).astype(np.float64), sigma)
-    complete = np.clip((weight - CLOSED[0]) / (CLOSED[1] - CLOSED[0]), 0, 1)
+    closed = np.clip((weight - CLOSED[0]) / (CLOSED[1] - CLOSED[0]), 0, 1)
     # Where no leaf is near there is no cushion; the floor avoids 0/0.
-    height = np.where(complete > 0, moment / np.maximum(weight, 1e-6), np.nan)
+    height = np.where(closed > 0, moment / np.maximum(weight, 1e-6), np.nan)
     slope = np.hypot(*np.gradient(height, spacing))  # NaN at the rim
     keeps = (CROWN_SHEDS - slope) / (CROWN_SHEDS - CROWN_KEEPS)
-    return Cushions(height, complete * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
+    return Cushions(height, closed, closed * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
 
 
 def slid(
@@ -93,8 +97,8 @@ def slid(
     """Depth that arrives from steeper surfaces above, over the depth that falls.
 
     What a slope does not keep slides down, over edges as well, to the first surface that keeps all
-    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m. What slides
-    into a hollow of a slope is lost.
+    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m. Hollows of a
+    slope are filled first, and what slides passes over them.
 
     Args:
         lost: depth that slides off each node, over the depth that falls.
@@ -108,12 +112,47 @@ def slid(
     smooth = np.where(known, smooth / np.maximum(weight, 1e-6), np.nan)
     # Roughness would catch what slides; at edges the surfaces stay apart.
     smooth = np.where(np.abs(smooth - height) < spacing, smooth, height)
-    order = np.argsort(np.where(known, -smooth, np.inf), axis=None, kind="stable")
-    arrived = _routed(lost, share, smooth, order[: int(known.sum())])
+    filled = _without_hollows(smooth, share > KEEPS_ALL)
+    order = np.argsort(np.where(known, -filled, np.inf), axis=None, kind="stable")
+    arrived = _routed(lost, share, filled, order[: int(known.sum())])
     level = (share > KEEPS_ALL).astype(np.float64)
     sigma = PILE / spacing
     reach = np.maximum(ndimage.gaussian_filter(level, sigma), 1e-3)
     return level * ndimage.gaussian_filter(arrived / reach, sigma)
+
+
+@njit(cache=True)
+def _without_hollows(
+    height: Float[np.ndarray, "h w"], outlet: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w"]:
+    """Raise nodes until each has a descending way to an outlet or to the border of the raster.
+
+    The priority flood of Barnes, Lehman and Mulla (2014), algorithm 3. Nodes that no way joins to
+    an outlet keep their height.
+    """
+    rows, columns = height.shape
+    filled = height.copy()
+    reached = np.isnan(height)
+    queue: Any = [(0.0, 0)]
+    queue.pop()  # Numba takes the type of an empty list from what was in it
+    for j in range(rows):
+        for i in range(columns):
+            border = j == 0 or i == 0 or j == rows - 1 or i == columns - 1
+            if (outlet[j, i] or border) and not reached[j, i]:
+                reached[j, i] = True
+                heapq.heappush(queue, (height[j, i], j * columns + i))
+    while len(queue) > 0:
+        level, q = heapq.heappop(queue)
+        j, i = q // columns, q % columns
+        for dj in range(-1, 2):
+            for di in range(-1, 2):
+                jj, ii = j + dj, i + di
+                if jj < 0 or ii < 0 or jj >= rows or ii >= columns or reached[jj, ii]:
+                    continue
+                reached[jj, ii] = True
+                filled[jj, ii] = max(height[jj, ii], level + DESCENT)
+                heapq.heappush(queue, (filled[jj, ii], jj * columns + ii))
+    return filled
 
 
 @njit(cache=True)

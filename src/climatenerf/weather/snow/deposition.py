@@ -50,6 +50,7 @@ STEPS = 8  # towards the ground below a slanted ray
 SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
 ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
+BETWEEN_LEAVES = 0.026  # m of snow that an open crown takes before any bridges its leaves
 _CHUNK = 1 << 14  # positions per evaluation
 
 
@@ -155,12 +156,13 @@ def _caught(
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
     shelter = np.where(np.isfinite(leaves), leaves, smooth[..., 2])
     moved = drifted(smooth[..., 2], shelter, snow.drift, snow.wind_direction, h)
-    caught = crown.complete * np.clip(rays.opacity, 0, 1)
+    caught = crown.keeps * np.clip(rays.opacity, 0, 1)
     weight = np.where(own, np.clip((rays.opacity - 0.5) / 0.1, 0, 1), 1.0)  # the terrain is whole
-    catches = [_catch(smooth, moved * share + arrived, -share * caught, weight)]
+    catches = [_catch(smooth, moved * share + arrived, -share * caught, 0 * share, weight)]
     if caught.any():
         position = rays.at(crown.height)
-        cap = _catch(position, 0 * caught, caught, (caught > 0).astype(np.float64))
+        gaps = BETWEEN_LEAVES * (1 - crown.keeps)
+        cap = _catch(position, 0 * caught, caught, gaps, (caught > 0).astype(np.float64))
         if snow.light == "scene":  # in the light of its place, as the probes see it
             cap = replace(cap, shade=np.full_like(cap.shade, SHADE_UNIT))
         catches.append(cap)
@@ -177,14 +179,14 @@ def _catch(
     position: Float32[np.ndarray, "h w 3"],
     of_fall: Float[np.ndarray, "h w"],
     of_held: Float[np.ndarray, "h w"],
+    hidden: Float[np.ndarray, "h w"],
     weight: Float[np.ndarray, "h w"],
 ) -> Catch:
     weight = np.where(np.isfinite(position[..., 2]) & (weight > 1e-3), weight, 0.0)
     shade = np.full(weight.shape, np.nan, np.float32)
     single = np.float32
-    return Catch(
-        position, of_fall.astype(single), of_held.astype(single), weight.astype(single), shade
-    )
+    parts = of_fall.astype(single), of_held.astype(single), hidden.astype(single)
+    return Catch(position, *parts, weight.astype(single), shade)
 
 
 def surfaces_and_leaves(

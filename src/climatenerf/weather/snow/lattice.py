@@ -73,6 +73,8 @@ class Catch:
     """Depth of the snow over that on open level ground."""
     of_held: Float32[np.ndarray, "h w"]
     """Depth, in addition, over what a closed crown holds; negative below crowns."""
+    hidden: Float32[np.ndarray, "h w"]
+    """Depth that lies between leaves and does not show, m."""
     weight: Float32[np.ndarray, "h w"]
     """Fraction of the cell that catches snow; 0 outside the raster's part of the scene."""
     shade: Float32[np.ndarray, "h w"]
@@ -188,7 +190,7 @@ def _columns(
     held = held_by_crowns(depth)
     parts = []
     for catch in catches:
-        thickness = catch.of_fall * np.float64(depth) + catch.of_held * held
+        thickness = catch.of_fall * np.float64(depth) + catch.of_held * held - catch.hidden
         used = (catch.weight > 0) & (thickness > 0)
         base = np.where(catch.weight > 0, catch.position[..., 2].astype(np.float64), np.nan)
         thickness = settled(base, np.where(used, thickness, 0.0), REPOSE * spacing)
