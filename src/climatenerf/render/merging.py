@@ -82,6 +82,7 @@ def sample_colour(
     keep: Int[Tensor, "k"],
     rays_o: Tensor,
     rays_d: Tensor,
+    pixel_angle: Float[Tensor, "n"],
 ) -> Float[Tensor, "k 3"]:
     """Linear radiance of the samples `keep`."""
     x = rays_o[ray[keep]] + samples.t[keep, None] * rays_d[ray[keep]]
@@ -92,6 +93,10 @@ def sample_colour(
     for index, matter in enumerate(world.matters, start=1):
         mine = kind[keep] == index
         colour[mine] = matter.colour(x[mine])
+        glints: Callable[[Tensor, Tensor, Tensor], Tensor] | None = getattr(matter, "glints", None)
+        if glints is not None:
+            own = ray[keep[mine]]
+            colour[mine] += glints(x[mine], rays_d[own], pixel_angle[own] * samples.t[keep[mine]])
     own = kind[keep] == 0
     ids = None if ids is None else ids[own]
     colour[own] = world.field.colour(

@@ -64,7 +64,8 @@ class Matter(Protocol):
     """Solid matter on the scene, such as snow: density and colour of its own.
 
     Its method `covers`, if it has one, says at which positions (m, [n, 3]) upward surfaces of the
-    field belong below it: a fitted surface is rough, and would reach out of thin matter.
+    field belong below it: a fitted surface is rough, and would reach out of thin matter. Its method
+    `glints`, if it has one, gives radiance that depends on the eye; see `snow.layer`.
     """
 
     @property
@@ -236,6 +237,12 @@ class Light(Protocol):
 
     def mean_radiance(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Mean over all directions of the radiance that arrives at x (m), without a hard sun."""
+        ...
+
+    def visibility(
+        self, x: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n"]:
+        """Fraction of a hard sun that surfaces at x (m) with unit normals see; 0 without one."""
         ...
 
     def beam(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]] | None:

@@ -28,6 +28,7 @@ from climatenerf.weather.snow.lattice import SHADE_UNIT, Deposits, SnowGrid, cho
 from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.shadow_masks import ShadowMasks
+from climatenerf.weather.snow.sparkle import glints
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Light as PlaceLight
 from climatenerf.weather.world import Preparation, World
@@ -180,6 +181,29 @@ class BakedSnow:
             reflectance[thin] = over_ground(slab[thin], deep, ground)
         return reflectance * white
 
+    def glints(
+        self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance that crystal faces add in a hard sun.
+
+        Args:
+            x: positions, m.
+            d: unit directions from the eye to these.
+            width: of a pixel there, m.
+        """
+        added = torch.zeros_like(x)
+        beam = None if self.place_light is None else self.place_light.beam()
+        if beam is None or self.place_light is None or self.snow.sparkle == 0:
+            return added
+        sun, irradiance = beam
+        found = glints(x, d, width, sun, self.snow.sparkle)
+        lit = (found > 0).nonzero()[:, 0]
+        if lit.numel():
+            normal = self.normal(x[lit])
+            visible = self.place_light.visibility(x[lit], normal) * (normal @ sun > 0)
+            added[lit] = (found[lit] * visible)[:, None] * irradiance
+        return added
+
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
         height = metaballs.evaluate(_array(x), self.lattice)[2][:, 0]
@@ -286,6 +310,7 @@ class SnowEntity:
             grain=asked.grain,
             soot=asked.soot,
             albedo=asked.albedo,
+            sparkle=asked.sparkle,
         )
         floor = max((surface.level for surface in world.surfaces), default=None)
         snow = replace(

@@ -35,6 +35,8 @@ class Snow:
     """Soot in nanograms per gram of snow. Arctic: 10; near towns: 100 to 1000."""
     albedo: Annotated[float | None, number(0.0, 1.0, optional=True)] = None
     """Reflectance of deep snow. none: that of grain and soot."""
+    sparkle: Annotated[float, number(0.0, 1.0)] = 0.3
+    """Area of crystal faces that sparkle in a hard sun, over that of the snow. 0: none."""
     albedo_offset: Annotated[float, number(0.0, 100.0)] = 4.0
     """c0 of the paper's snow colour (g + c0)/(1 + c0); larger is whiter."""
     wrap: Annotated[float, number(0.0, 100.0)] = 8.0
