@@ -8,8 +8,10 @@ Snow, from the truth alone: each row says what is known. `snow` has the true pic
 and the true dry one elsewhere; `snow and gains` multiplies the dry one by the best gain of each
 class and channel. In the rows of vegetation all else is the truth, and vegetation is the dry
 picture, the best mixture of it with white, or the truth blurred by some pixels. `no_vegetation`
-leaves out vegetation's pixels. With a run `ours` is its picture; floods have it with the dry part
-or the water from the truth too. All in dB of display values, the mean of all views.
+leaves out vegetation's pixels. With a run `ours` is its picture, and in `ours, edges true` the
+truth stands within some pixels of edges: of classes, of depth and of what is snowed on. Floods have
+it with the dry part or the water from the truth too. All in dB of display values, the mean of all
+views.
 """
 
 import argparse
@@ -31,6 +33,7 @@ from climatenerf.scene import load_scene
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 BLURS = (2.0, 4.0)  # px
+EDGES = (1, 2)  # px from an edge
 LEAST_SNOW = 1e-3  # m of thickness
 Picture = Float[np.ndarray, "h w 3"]
 
@@ -79,10 +82,26 @@ def snow_ceilings(
     if folder is not None:
         ours, _ = rendered(reference, case, folder)
         rows["ours"] = scores(lambda k: ours[k], everywhere)
+        for reach in EDGES:
+            edges = [near_edges(view, case, reach) for view in reference.truths]
+            inner = [~each for each in edges]
+            rows[f"ours, edges true within {reach} px"] = scores(lambda k: ours[k], inner) | {
+                "pixels": float(np.mean(edges))
+            }
     for blur in BLURS:
         soft = [ndimage.gaussian_filter(each, (blur, blur, 0)) for each in true]
         rows[f"vegetation blurred by {blur:g} px"] = scores(lambda k, s=soft: s[k], leaves)
     return rows
+
+
+def near_edges(view: Truth, case: WeatherTruth, reach: int) -> Bool[np.ndarray, "h w"]:
+    """Pixels within `reach` of an edge between classes, depths or bare and snowed pixels."""
+    layers = case.layers(view.name)
+    depth = np.where(np.isfinite(layers["depth"]), layers["depth"], 1e3)
+    edge = ndimage.maximum_filter(depth, 3) > 1.1 * ndimage.minimum_filter(depth, 3) + 0.1
+    for kind in (MERGED[view.label], (layers["thickness"] > LEAST_SNOW).astype(np.uint8)):
+        edge |= ndimage.maximum_filter(kind, 3) != ndimage.minimum_filter(kind, 3)
+    return ndimage.binary_dilation(edge, iterations=reach)
 
 
 def gains(
