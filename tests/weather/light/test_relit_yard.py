@@ -155,6 +155,17 @@ def test_the_photos_own_sun_keeps_its_shadows_under_snow(snowy):
     assert 1.05 < float(brighter[0, 0]) < 2.0
 
 
+def test_what_keeps_no_snow_sends_no_more_light():
+    """By the paper's rule with half of the snow at 0 degrees, level ground carries half."""
+    field = sunlit_yard()
+    half = session(field, snow={"depth": "10 cm", "slope": "0 deg"}).world(0.0)
+    whole = session(field, snow={"depth": "10 cm"}).world(0.0)
+    wall = torch.tensor([[-4.0, 5.99, 1.0]])
+    ahead = torch.tensor([[0.0, 1.0, 0.0]])
+    dry, some, most = (each.colour(wall, ahead)[0, 0] for each in (field, half.field, whole.field))
+    assert 0.3 < float((some - dry) / (most - dry)) < 0.7
+
+
 def test_snow_and_mud_receive_the_light_of_their_place(snowy):
     field = sunlit_yard()
     (snow,) = snowy.matters

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.colour import luma
-from climatenerf.core.device import to_device
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import NORMALS
 from climatenerf.field.normals import normals_at
@@ -40,11 +40,12 @@ from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.light.sun_map import SunMap, sun_map
 from climatenerf.weather.smog.medium import sigma_of
 from climatenerf.weather.smog.scattering import sun_transmittance
+from climatenerf.weather.snow.cover import slope_share
 from climatenerf.weather.snow.optics import albedo_of, slab_reflectance
+from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
 
-STEEPEST, LEVEL = math.radians(60), math.radians(30)  # slopes that keep no snow, and all of it
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
@@ -177,7 +178,9 @@ class LightEntity:
         if not new_sky and cover == 0 and not (old.sun is not None and _lit_smog(weather)):
             return replace(world, light=old)
         white = _whiteness(weather) if cover else ()
-        key = (weather.sky, weather.sun, cover, white, weather.smog if _lit_smog(weather) else None)
+        smog = weather.smog if _lit_smog(weather) else None
+        slopes = weather.snow.slope, weather.snow.slope_sharpness
+        key = weather.sky, weather.sun, cover, white, slopes, smog
         if self._last is None or self._last[0] != key:
             new = self._new_light(weather, old, cover)
             brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
@@ -188,7 +191,8 @@ class LightEntity:
 
     def _new_light(self, weather: Weather, old: SceneLight, cover: float) -> SceneLight:
         albedo = to_device(np.array(_whiteness(weather), np.float32), device_of(self._given.field))
-        surfaces = Surfaces(functools.partial(snow_cover, cover), albedo) if cover else None
+        hidden = functools.partial(snow_cover, weather.snow, cover)
+        surfaces = Surfaces(hidden, albedo) if cover else None
         if weather.sky.kind == "captured":
             return relit(self._gathered, old, below_smog(weather, old), surfaces)
         sky = self._sky(weather)
@@ -301,13 +305,9 @@ class LightEntity:
         return found
 
 
-def snow_cover(cover: float, up: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Fraction of surfaces with normals of z `up` that snow hides; `cover` on level ground.
-
-    Slopes keep (60 deg - slope)/30 deg of the snow (EN 1991-1-3, 5.3).
-    """
-    slope = torch.acos(up.clamp(-1, 1))
-    return cover * ((STEEPEST - slope) / (STEEPEST - LEVEL)).clamp(0, 1)
+def snow_cover(snow: Snow, cover: float, up: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Fraction of surfaces with normals of z `up` that snow hides; `cover` on level ground."""
+    return cover * to_device(slope_share(to_numpy(up), snow), up.device)
 
 
 def below_smog(weather: Weather, light: SceneLight) -> SceneLight:
