@@ -81,7 +81,7 @@ def test_smog_equals_the_sum_over_samples(kind, tmp_path):
     frame = session(field, tmp_path, smog=Smog(visibility=20.0, colour=(1.0, 1.0, 1.0))).frame(
         CAMERA, C2W
     )
-    o, d, _, _ = traced_rays(CAMERA, C2W)
+    o, d, _ = traced_rays(CAMERA, C2W)
     near, far = torch.zeros(len(o)), torch.full((len(o),), 1e9)
     samples = field.march(o, d, near, far)
     expected = torch.empty(len(o), 3)
@@ -103,7 +103,7 @@ def test_smog_equals_the_sum_over_samples(kind, tmp_path):
 def test_compositing_of_gaussians_equals_dense_sampling():
     """One sample per Gaussian against fine steps through the sum of their densities."""
     field = plain_with_stones()
-    o, d, _, _ = traced_rays(CAMERA, C2W)
+    o, d, _ = traced_rays(CAMERA, C2W)
     _, transmittance, _ = composited(field, o, d, torch.zeros(len(o)))
     steps = torch.linspace(0, 20, 8001)
     for r in range(0, len(o), 97):

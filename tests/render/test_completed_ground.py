@@ -40,7 +40,7 @@ def completed(field=None, **terrain):
 
 
 def camera_rays():
-    o, d, angle, _ = traced_rays(CAMERA, C2W)
+    o, d, angle = traced_rays(CAMERA, C2W)
     return o, d, angle
 
 

@@ -18,7 +18,7 @@ from climatenerf.render.depth_normals import plane_normals
 from climatenerf.render.heads import see_surface
 from climatenerf.render.integrator import trace
 from climatenerf.render.progressive import trace_coarse_first
-from climatenerf.render.volume import camera_rays, pixel_rotation
+from climatenerf.render.volume import camera_rays
 from climatenerf.weather.registry import layer_table
 from climatenerf.weather.world import World
 
@@ -55,23 +55,16 @@ def encoded_8bit(linear: Float[Tensor, "h w 3"]) -> Picture:
 
 def traced_rays(
     camera: Camera, c2w: Float[np.ndarray, "4 4"], device: torch.device = CPU
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"]]:
     """The arguments of `trace` for a camera's pixels (c2w: world m), row by row, on `device`.
 
     Returns:
-        Origins (world m), unit directions, the angle that each pixel spans, and the angle that
-        rotates its glossy sample set (both rad).
+        Origins (world m), unit directions and the angle that each pixel spans (rad).
     """
     rays_o, rays_d = camera_rays(camera, c2w, device)
     # Side of the solid angle at the image centre; towards the corners pixels span a little less.
     angle = torch.full((rays_o.shape[0],), 1.0 / camera.fx, device=device)
-    row, column = torch.meshgrid(
-        torch.arange(camera.height, device=device),
-        torch.arange(camera.width, device=device),
-        indexing="ij",
-    )
-    rotation = pixel_rotation(torch.stack([column.flatten(), row.flatten()], dim=-1).float())
-    return rays_o, rays_d, angle, rotation
+    return rays_o, rays_d, angle
 
 
 def render_frame(

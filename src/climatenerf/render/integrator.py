@@ -9,6 +9,7 @@ surface traces reflected and refracted rays with this same function.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -46,7 +47,6 @@ def trace(
     rays_o: Float[Tensor, "n 3"],
     rays_d: Float[Tensor, "n 3"],
     pixel_angle: Float[Tensor, "n"],
-    sample_rotation: Float[Tensor, "n"] | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> RenderOutput:
     """What camera rays see. Independent of how rays are grouped.
@@ -56,8 +56,6 @@ def trace(
         rays_o: origins, m.
         rays_d: unit directions.
         pixel_angle: angle that a pixel spans, rad.
-        sample_rotation: angle that rotates each ray's glossy sample set, rad; see
-            `volume.pixel_rotation`.
         cancelled: asked every 10 to 20 ms of computing; see `field.compositing.Checkpoints`.
 
     Raises:
@@ -65,9 +63,8 @@ def trace(
     """
     parts, checkpoint = [], Checkpoints(cancelled)
     for chunk in chunks(rays_o, checkpoint):
-        rotation = None if sample_rotation is None else sample_rotation[chunk]
         start = torch.full_like(pixel_angle[chunk], world.field.near)
-        rays = rays_o[chunk], rays_d[chunk], pixel_angle[chunk], rotation, start
+        rays = rays_o[chunk], rays_d[chunk], pixel_angle[chunk], start
         parts.append(_trace(world, *rays, bounces=BOUNCES, checkpoint=checkpoint))
     return concatenate(parts, slice(None))
 
@@ -77,7 +74,6 @@ def _trace(
     rays_o: Float[Tensor, "n 3"],
     rays_d: Float[Tensor, "n 3"],
     pixel_angle: Float[Tensor, "n"],
-    sample_rotation: Float[Tensor, "n"] | None,
     t_min: Float[Tensor, "n"],
     bounces: int,
     checkpoint: Checkpoints = NEVER,
@@ -92,14 +88,14 @@ def _trace(
         # Most reflected rays rise, and see what they would without weather.
         meets = torch.zeros(n, dtype=torch.bool, device=device)
         for surface in surfaces:
-            meets |= (surface.distance(rays_o, rays_d) < torch.inf) | surface.inside(rays_o)
+            meets |= surface.distance(rays_o, rays_d, pixel_angle) < torch.inf
+            meets |= surface.inside(rays_o)
         if not bool(meets.all()):
             dry, wet = (~meets).nonzero()[:, 0], meets.nonzero()[:, 0]
             given = rays_o[dry], rays_d[dry], t_min[dry], step_scale
             parts = [trace_field(world, *given, measured)]
             if wet.numel():
-                rotation = None if sample_rotation is None else sample_rotation[wet]
-                given = rays_o[wet], rays_d[wet], pixel_angle[wet], rotation, t_min[wet]
+                given = rays_o[wet], rays_d[wet], pixel_angle[wet], t_min[wet]
                 checkpoint()
                 parts.append(_trace(world, *given, bounces, checkpoint))
             return concatenate(parts, torch.cat([dry, wet]).argsort())
@@ -115,7 +111,7 @@ def _trace(
     t_surface = torch.full((n,), torch.inf, device=device)
     nearest = torch.full((n,), -1, device=device)
     for index, surface in enumerate(surfaces):
-        t = surface.distance(rays_o, rays_d)
+        t = surface.distance(rays_o, rays_d, pixel_angle)
         nearest = torch.where(t < t_surface, index, nearest)
         t_surface = torch.minimum(t, t_surface)
     behind = torch.zeros_like(weights)
@@ -160,8 +156,7 @@ def _trace(
             # 1e-6: a surface with nothing behind it would give 0/0.
             weight_behind = total(weights * behind, samples.offsets).clamp_min(1e-6)
             t_bottom = total(weights * behind * samples.t, samples.offsets) / weight_behind
-        rotation = None if sample_rotation is None else sample_rotation[hit]
-        rays = rays_o[hit], rays_d[hit], t_surface[hit], t_bottom[hit], pixel_angle[hit], rotation
+        rays = rays_o[hit], rays_d[hit], t_surface[hit], t_bottom[hit], pixel_angle[hit]
         shaded, own_normal, extra = surface.shade(
             world, SurfaceHits(*rays), partial(_radiance, world, bounces - 1, checkpoint)
         )
@@ -187,8 +182,9 @@ def _radiance(
 ) -> Float[Tensor, "n 3"]:
     """Radiance along secondary rays, for surfaces."""
     start = torch.zeros(rays_o.shape[0], device=rays_o.device)
+    world = replace(world, surfaces=tuple(surface.calm for surface in world.surfaces))
     checkpoint()
-    rgb = _trace(world, rays_o, rays_d, pixel_angle, None, start, bounces, checkpoint).rgb
+    rgb = _trace(world, rays_o, rays_d, pixel_angle, start, bounces, checkpoint).rgb
     checkpoint()
     return rgb
 

@@ -15,7 +15,7 @@ from climatenerf.weather.world import RenderOutput, World, concatenate
 
 SPACINGS = (4, 2, 1)  # rays between traced ones after each pass
 
-Rays = tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n"], Float[Tensor, "n"]]
+Rays = tuple[Tensor, Tensor, Tensor]
 
 
 def trace_coarse_first(
@@ -29,7 +29,7 @@ def trace_coarse_first(
 
     Args:
         world: field and weather.
-        rays: origins (m), unit directions, pixel angles and sample rotations (rad).
+        rays: origins (m), unit directions, pixel angles (rad).
         width: rays in a row.
         show: called with each pass's picture in linear radiance. A ray that is not traced yet shows
             the nearest traced one above and left of it.

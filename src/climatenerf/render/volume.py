@@ -1,7 +1,5 @@
 """Rays of cameras, and the clean view: the field with nothing added. No gradients."""
 
-import math
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -22,18 +20,6 @@ def camera_rays(
     pose = to_device(np.asarray(c2w, np.float32), device)
     rays_d = directions @ pose[:3, :3].T
     return pose[:3, 3].expand(rays_d.shape[0], 3).contiguous(), rays_d.contiguous()
-
-
-def pixel_rotation(pixel: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
-    """Return an angle in [0, pi/2) per pixel: interleaved gradient noise (Jimenez 2014).
-
-    Neighbouring pixels get different angles. A surface that rotates its glossy sample set by this
-    angle replaces the ghost images of a fixed set by fine grain, which supersampling averages away.
-    The angle depends on the pixel coordinates (column, row) alone, not on chunks or threads.
-    """
-    x, y = pixel[:, 0].double(), pixel[:, 1].double()
-    noise = (52.9829189 * (0.06711056 * x + 0.00583715 * y).frac()).frac()
-    return (noise * math.pi / 2).to(pixel.dtype)
 
 
 @torch.no_grad()

@@ -102,6 +102,21 @@ def diffuse_reflectance(ior: float) -> float:
     )
 
 
+def returned_light(optical_depth: Float[np.ndarray, "*n"], ior: float) -> Float[np.ndarray, "*n"]:
+    """Return the fraction of a diffuse bottom's light that comes back to it from the surface.
+
+    Light below the surface at an angle a from the vertical passes 2 tau/cos(a). Beyond the critical
+    angle it is reflected totally, within it as light from the other side is (reciprocity).
+    """
+    edges = np.linspace(0, np.pi / 2, 4001)
+    angle = (edges[:-1] + edges[1:]) / 2
+    sine = ior * np.sin(angle)
+    reflected = np.where(sine < 1, fresnel(np.arcsin(np.minimum(sine, 1)), ior), 1.0)
+    weight = reflected * 2 * np.sin(angle) * np.cos(angle) * np.diff(edges)
+    passed = np.exp(-2 * np.asarray(optical_depth)[..., None] / np.cos(angle))
+    return (weight * passed).sum(-1)
+
+
 def wet_radiance(dry: float, albedo: float, ior: float) -> float:
     """Return the radiance of a diffuse bottom under clear water in diffuse light.
 

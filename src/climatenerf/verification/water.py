@@ -21,6 +21,7 @@ from climatenerf.verification.closed_forms import (
     fresnel,
     normal_reflectance,
     refraction_angle,
+    returned_light,
     wet_radiance,
 )
 from climatenerf.verification.setting import IOR, Vector, Viewpoint, frame_in, looking, radiance
@@ -165,12 +166,15 @@ def apparent_depth(landed: Float[np.ndarray, "n"]) -> Check:
 def absorption(measured: Float[np.ndarray, "n 3"]) -> Check:
     """Compare the light left with exp(-beta (d + d/cos t)): down from the zenith, and up the ray.
 
-    Beer-Lambert law in water, for each channel's beta.
+    Beer-Lambert law in water, for each channel's beta. The white bottom receives less light from
+    the surface above it, too: 1/(1 - R) of its own, R after absorption.
     """
     angle = incidence()
     steep = angle < np.radians(60)
     path = DEPTH + DEPTH / np.cos(refraction_angle(angle[steep], IOR))
-    found = -np.log(np.maximum(measured[steep], 1e-300)) / path[:, None]
+    clear, absorbing = (1 - returned_light(np.array(b) * DEPTH, IOR) for b in (BLACK, BETA))
+    left = measured[steep] * absorbing / clear
+    found = -np.log(np.maximum(left, 1e-300)) / path[:, None]
     error = 100 * float(np.abs(found / np.array(BETA) - 1).max())
     compares = "attenuation of each channel with what was asked, 0 to 60 degrees"
     return Check("water absorption", compares, error, 0.5, "%", "Beer-Lambert law")

@@ -124,8 +124,6 @@ class SurfaceHits:
     """Mean ray length of what lies behind the surface, m; 0 where nothing does."""
     pixel_angle: Float[Tensor, "n"]
     """Angle that a pixel spans, rad."""
-    sample_rotation: Float[Tensor, "n"] | None
-    """Angle that rotates each pixel's glossy sample set, rad."""
 
 
 TraceRadiance = Callable[
@@ -152,8 +150,16 @@ class Surface(Protocol):
         """World height below which matter is submerged, m."""
         ...
 
+    @property
+    def calm(self) -> "Surface":
+        """The surface without waves, as reflected and refracted rays meet it."""
+        ...
+
     def distance(
-        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        pixel_angle: Float[Tensor, "n"],
     ) -> Float[Tensor, "n"]:
         """Ray length to the surface, from either side, m; +inf where it is missed."""
         ...

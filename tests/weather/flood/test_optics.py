@@ -2,15 +2,19 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
+from climatenerf.ops.wave_tracing import surface
+from climatenerf.verification.closed_forms import returned_light
 from climatenerf.weather.flood import fresnel, waves
 from climatenerf.weather.flood import optics as water
 from climatenerf.weather.flood.parameters import Flood
 
 IOR = 1.333
 PUDDLE = Flood(level=0.0)
+SHARP = Flood(level=0.0, gloss=1e9)
 
 
 def rays(n: int, seed: int = 0, below: bool = False) -> torch.Tensor:
@@ -141,24 +145,27 @@ def test_apparent_depth_near_the_nadir_is_depth_over_ior():
     assert apparent.item() == pytest.approx(2.0 / IOR, rel=0.01)
 
 
-def test_sigma_points_match_mean_and_variance_of_the_lobe():
-    """Variance 1/lambda on both axes at any sample rotation; angle sqrt(3/lambda)."""
-    axis = -rays(50)
-    spread = torch.full((50,), 1e-3, dtype=torch.float64)
-    for rotation in (None, torch.linspace(0, 1.5, 50, dtype=torch.float64)):
-        d, weights = water.glossy_rays(axis, spread, spread, above_water(axis), rotation)
-        assert weights.tolist() == pytest.approx([1 / 3] + 4 * [1 / 6])
-        torch.testing.assert_close(d.norm(dim=-1), torch.ones(50, 5, dtype=torch.float64))
-        high = axis[:, 2] > 0.1  # not clipped
-        cosines = (d * axis[:, None]).sum(-1)[high]
-        assert cosines[:, 1:].acos() == pytest.approx(math.sqrt(3e-3), rel=1e-6)
-        moment = torch.einsum("r,nri,nrj->nij", weights, d, d)[high]
-        eigen = torch.linalg.eigvalsh(moment)[:, :2]
-        assert eigen.numpy() == pytest.approx(1e-3, rel=2e-3)
+def test_parts_of_a_pixel_lie_within_it_in_rows_and_columns():
+    d = rays(50)
+    angle = torch.full((50,), 0.01, dtype=torch.float64)
+    parts = water.subpixels(d, angle, 9)
+    torch.testing.assert_close(parts.norm(dim=-1), torch.ones(50, 9, dtype=torch.float64))
+    torch.testing.assert_close(parts.mean(1), d, atol=1e-4, rtol=0)
+    off = parts - d[:, None]
+    assert off.norm(dim=-1).max() < 0.01
+    up = off[..., 2].sort(dim=1).values
+    assert (up.diff(dim=1) > 0).all(), "each in a row of its own"
+    torch.testing.assert_close(water.subpixels(d, angle, 1)[:, 0], d)
 
 
-def test_lobe_equals_reflections_off_random_facets():
-    """Mean and variance of the reflected direction, per component."""
+def spread_over(d, slope, variance, flood, below, count=9):
+    """`facets` for parts that all have the same direction and slope."""
+    given = (each[:, None].expand(-1, count, *each.shape[1:]) for each in (d, slope, variance))
+    return water.facets(*given, flood, below)
+
+
+def test_facets_reflect_as_a_rough_surface_does():
+    """Mean and variance of the reflected direction, per component, by brute force."""
     deviation, n = 0.03, 200_000
     generator = torch.Generator().manual_seed(0)
     slope = deviation * torch.randn(n, 2, generator=generator, dtype=torch.float64)
@@ -169,15 +176,37 @@ def test_lobe_equals_reflections_off_random_facets():
         true = water.mirror(d.expand(n, 3), normal)
         variance = torch.tensor([deviation**2], dtype=torch.float64)
         flat = torch.zeros(1, 2, dtype=torch.float64)
-        sharp = Flood(level=0.0, gloss=1e9)
-        seen, weights, _ = water.reflection(d, flat, variance, sharp, above_water(d))
+        seen, _ = spread_over(d, flat, variance, SHARP, above_water(d))
         for component in range(3):
             mean = (weight * true[:, component]).sum() / weight.sum()
             spread = (weight * (true[:, component] - mean) ** 2).sum() / weight.sum()
-            actual = (weights * seen[0, :, component]).sum()
-            actual_spread = (weights * (seen[0, :, component] - actual) ** 2).sum()
+            actual = seen[0, :, component].mean()
             assert actual.item() == pytest.approx(mean.item(), abs=2e-3)
+            actual_spread = seen[0, :, component].var(unbiased=False)
             assert actual_spread.item() == pytest.approx(spread.item(), rel=0.06, abs=2e-5)
+
+
+@pytest.mark.parametrize("sky", ["zenith", "horizon"])
+@pytest.mark.parametrize("degrees", [30, 60, 70, 80, 85])
+def test_each_facet_reflects_by_its_own_angle(degrees, sky):
+    """A sky whose radiance changes with elevation, against brute force over facets."""
+    deviation, n = 0.08, 400_000
+    generator = torch.Generator().manual_seed(1)
+    slope = deviation * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    d, normal = at_angle(degrees), water.normal_of(slope)
+    cos = -(d * normal).sum(-1)
+    weight = (cos / normal[:, 2]).clamp_min(0)
+
+    def radiance(direction):
+        up = direction[..., 2].clamp(0, 1)
+        return 0.2 + up if sky == "zenith" else 1.2 - up
+
+    true = radiance(water.mirror(d.expand(n, 3), normal)) * fresnel.reflectance(cos, IOR)
+    expected = (weight * true).sum() / weight.sum()
+    variance = torch.tensor([deviation**2], dtype=torch.float64)
+    flat = torch.zeros(1, 2, dtype=torch.float64)
+    seen, share = spread_over(d, flat, variance, SHARP, above_water(d))
+    assert (share * radiance(seen)).sum().item() == pytest.approx(expected.item(), rel=0.05)
 
 
 def test_reflected_rays_stay_on_their_side_of_the_water():
@@ -186,22 +215,22 @@ def test_reflected_rays_stay_on_their_side_of_the_water():
         slope = 0.3 * torch.randn(400, 2, dtype=torch.float64)
         variance = 0.05 * torch.rand(400, dtype=torch.float64)
         under = torch.full((400,), below)
-        seen, _, reflectance = water.reflection(d, slope, variance, PUDDLE, under)
+        seen, share = spread_over(d, slope, variance, PUDDLE, under)
         assert (seen[..., 2] <= 0).all() if below else (seen[..., 2] >= 0).all()
-        torch.testing.assert_close(seen.norm(dim=-1), torch.ones(400, 5, dtype=torch.float64))
-        assert ((reflectance >= 0) & (reflectance <= 1)).all()
+        torch.testing.assert_close(seen.norm(dim=-1), torch.ones(400, 9, dtype=torch.float64))
+        assert ((share >= 0) & (share.sum(1, keepdim=True) <= 1 + 1e-9)).all()
 
 
 def test_flat_water_of_high_gloss_is_a_mirror():
     d = rays(100)
     flat = torch.zeros(100, 2, dtype=torch.float64)
     still = torch.zeros(100, dtype=torch.float64)
-    seen, _, reflectance = water.reflection(
-        d, flat, still, Flood(level=0.0, gloss=1e9), above_water(d)
-    )
+    seen, share = spread_over(d, flat, still, SHARP, above_water(d), count=1)
     expected = d * torch.tensor([1, 1, -1])
     assert (seen - expected[:, None]).norm(dim=-1).max() < 6e-5
-    torch.testing.assert_close(reflectance, fresnel.reflectance(-d[:, 2], IOR))
+    torch.testing.assert_close(
+        share[:, 0], fresnel.reflectance(-d[:, 2], IOR), atol=1e-6, rtol=1e-5
+    )
 
 
 # --- radiance ---------------------------------------------------------------------------------
@@ -215,6 +244,20 @@ def test_wet_bottom_equals_path_traced_radiance():
         reflectance = fresnel.reflectance(torch.ones(1), IOR)
         seen = water.shade(torch.ones(1, 3), reflectance, bottom, torch.ones(1, 3), torch.zeros(3))
         assert seen[0, 0].item() == pytest.approx(expected, abs=0.002)
+
+
+@pytest.mark.parametrize("albedo", [0.1, 0.3, 0.6])
+def test_light_between_surface_and_bed_is_absorbed_on_every_way(albedo):
+    """A bed 0.6 m deep, attenuation 1.2/m; without it a bed of .6 was 37 % too bright."""
+    sky, dry = torch.tensor([math.pi] * 3), torch.full((1, 3), albedo)
+    thick = torch.full((1, 3), 1.2 * 0.6)
+    free = water.bottom_radiance(dry, sky, IOR)
+    seen = water.bottom_radiance(dry, sky, IOR, optical_depth=thick)
+    expected = (1 - albedo * 0.4746) / (1 - albedo * returned_light(np.array(0.72), IOR))
+    assert (seen / free)[0, 0].item() == pytest.approx(float(expected), rel=1e-3)
+    torch.testing.assert_close(
+        water.bottom_radiance(dry, sky, IOR, optical_depth=0 * thick), free, atol=1e-6, rtol=1e-5
+    )
 
 
 def test_white_bottom_stays_white_and_black_stays_finite():
@@ -233,9 +276,9 @@ def test_white_furnace(below):
     under = torch.full((2000,), below)
     frame = waves.at_time(waves.make_waves(PUDDLE, 0, 64), 0.4)
     x = 10 * torch.rand(2000, 2)
-    slope, removed = waves.slopes(frame, x, torch.rand(2000))
-    seen, weights, reflectance = water.reflection(d, slope, removed, PUDDLE, under)
-    reflected = (weights[:, None] * torch.ones_like(seen)).sum(1)
+    _, slope, removed = surface(frame, x, torch.rand(2000))
+    _, share = spread_over(d, slope, removed, PUDDLE, under)
+    reflectance, reflected = share.sum(1), torch.ones(2000, 3)
     white = torch.tensor([math.pi] * 3)
     background = (
         torch.ones(2000, 3) if below else water.bottom_radiance(torch.ones(2000, 3), white, IOR)
@@ -295,7 +338,7 @@ def test_gradients_are_finite_everywhere():
         ray = d.clone().requires_grad_()
         slope = (deviation * torch.randn(len(d), 2)).requires_grad_()
         variance = torch.full((len(d),), deviation**2, requires_grad=True)
-        seen, _, reflectance = water.reflection(ray, slope, variance, PUDDLE, under)
+        seen, reflectance = spread_over(ray, slope, variance, PUDDLE, under)
         out, _ = water.refract(ray, water.normal_of(slope), IOR, under)
         (seen[..., :2].sum() + seen[..., 2].sum() + reflectance.sum() + out.sum()).backward()
         for value in (seen, reflectance, out, ray.grad, slope.grad, variance.grad):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from climatenerf.ops.wave_tracing import surface
 from climatenerf.weather.flood import spectrum, waves
 from climatenerf.weather.flood.parameters import Flood
 
@@ -126,8 +127,8 @@ def test_variance_of_height_and_slope_equals_the_spectrum_integral(flood):
     for seed in range(64):
         tile, band = single_tile(flood, seed)
         height.append(waves.heights(as_waves(tile), 0, 0.7).var(unbiased=False).item())
-        maps = waves.at_time(as_waves(tile), 0.7).pyramids[0][: 64 * 64]
-        slope.append((maps.abs() ** 2).mean().item())
+        maps = waves.at_time(as_waves(tile), 0.7).texels[: 64 * 64]
+        slope.append((maps[:, 1:] ** 2).sum(-1).mean().item())
     k = spectrum.log_axis(flood)
     k = k[k < band[1]]
     energy = k * spectrum.wavenumber_spectrum(k, flood, 370.0)
@@ -155,12 +156,13 @@ def test_slopes_are_the_gradient_of_the_height():
         tile.level_covariance,
     )
     h = waves.heights(as_waves(smooth), 0, 0.4)
-    maps = waves.at_time(as_waves(smooth), 0.4).pyramids[0][: 128 * 128].reshape(128, 128)
+    maps = waves.at_time(as_waves(smooth), 0.4).texels[: 128 * 128].reshape(128, 128, 3)
+    torch.testing.assert_close(maps[..., 0], h)
     step = 2 * tile.length / 128
     along_x = (h.roll(-1, 1) - h.roll(1, 1)) / step
     along_y = (h.roll(-1, 0) - h.roll(1, 0)) / step
-    assert (maps.real - along_x).abs().max() < 0.05 * maps.real.abs().max()
-    assert (maps.imag - along_y).abs().max() < 0.05 * maps.imag.abs().max()
+    for slope, expected in zip(maps[..., 1:].unbind(-1), (along_x, along_y), strict=True):
+        assert (slope - expected).abs().max() < 0.05 * slope.abs().max()
 
 
 @pytest.mark.parametrize("index", [(0, 16), (5, 20), (-9, 14)])
@@ -194,7 +196,7 @@ def test_seed_reproduces_and_time_animates():
     narrow = torch.full((500,), 0.01)
 
     def slope(seed, time):
-        return waves.slopes(waves.at_time(waves.make_waves(STREET, seed, 64), time), x, narrow)[0]
+        return surface(waves.at_time(waves.make_waves(STREET, seed, 64), time), x, narrow)[1]
 
     assert torch.equal(slope(5, 1.0), slope(5, 1.0))
     between_seeds = (slope(5, 1.0) - slope(6, 1.0)).pow(2).mean()
@@ -205,7 +207,7 @@ def test_seed_reproduces_and_time_animates():
 
 def test_no_wind_is_perfectly_flat():
     sea = waves.make_waves(Flood(wind_speed=0.0), 0)
-    slope, removed = waves.slopes(waves.at_time(sea, 3.0), torch.rand(9, 2), torch.full((9,), 0.1))
+    _, slope, removed = surface(waves.at_time(sea, 3.0), torch.rand(9, 2), torch.full((9,), 0.1))
     assert not slope.any() and not removed.any()
     assert sea.significant_height == 0
 
@@ -215,9 +217,10 @@ def test_wave_scale_keeps_the_slope():
     large = waves.make_waves(Flood(wave_scale=3.0), 0, 64)
     assert large.significant_height == pytest.approx(3 * small.significant_height)
     x = torch.rand(200, 2)
-    a, va = waves.slopes(waves.at_time(small, 1.0), x, torch.full((200,), 0.02))
-    b, vb = waves.slopes(waves.at_time(large, math.sqrt(3)), 3 * x, torch.full((200,), 0.06))
+    low, a, va = surface(waves.at_time(small, 1.0), x, torch.full((200,), 0.02))
+    high, b, vb = surface(waves.at_time(large, math.sqrt(3)), 3 * x, torch.full((200,), 0.06))
     torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(3 * low, high, atol=1e-5, rtol=1e-3)
     torch.testing.assert_close(va, vb, atol=1e-7, rtol=1e-3)
 
 
@@ -227,17 +230,17 @@ def test_wave_scale_keeps_the_slope():
 def test_lookup_is_periodic_and_exact_at_texels():
     tile, _ = single_tile(STREET, 2)
     frame = waves.at_time(as_waves(tile), 0.2)
-    maps = torch.view_as_real(frame.pyramids[0][: 64 * 64].reshape(64, 64))
+    maps = frame.texels[: 64 * 64]
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     x = torch.stack([columns, rows], dim=-1).reshape(-1, 2) * tile.length / 64
     zero = torch.zeros(len(x))
-    torch.testing.assert_close(
-        waves.slopes(frame, x, zero)[0], maps.reshape(-1, 2), atol=1e-4, rtol=0
-    )
+    height, slope, _ = surface(frame, x, zero)
+    torch.testing.assert_close(slope, maps[:, 1:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(height, maps[:, 0], atol=1e-6, rtol=0)
     shifted = x + 0.3 + torch.tensor([2.0, -3.0]) * tile.length
     torch.testing.assert_close(
-        waves.slopes(frame, x + 0.3, zero)[0],
-        waves.slopes(frame, shifted, zero)[0],
+        surface(frame, x + 0.3, zero)[1],
+        surface(frame, shifted, zero)[1],
         atol=1e-3,
         rtol=0,
     )
@@ -247,7 +250,8 @@ def test_lookup_is_periodic_and_exact_at_texels():
 def test_levels_equal_a_direct_blur(level):
     """Each level is the slope map convolved with a Gaussian of half its texel."""
     tile, _ = single_tile(STREET, 2)
-    pyramid = waves.at_time(as_waves(tile), 0.2).pyramids[0]
+    texels = waves.at_time(as_waves(tile), 0.2).texels[:, 1:].contiguous()
+    pyramid = torch.view_as_complex(texels)
     size = 64 >> level
     start = sum((64 >> i) ** 2 for i in range(level))
     actual = pyramid[start : start + size**2].reshape(size, size)
@@ -272,7 +276,7 @@ def test_filtering_conserves_slope_variance(flood):
         frame = waves.at_time(sea, 0.5)
         total += sea.unresolved + sum(t.slope_variance for t in sea.tiles)
         for width in sums:
-            slope, removed = waves.slopes(frame, x, torch.full((len(x),), width))
+            _, slope, removed = surface(frame, x, torch.full((len(x),), width))
             assert (removed >= 0).all()
             sums[width] += slope.pow(2).mean().item() + removed.mean().item()
             last = removed.mean().item()
@@ -283,7 +287,7 @@ def test_filtering_conserves_slope_variance(flood):
 def test_removed_variance_grows_with_the_footprint():
     frame = waves.at_time(waves.make_waves(STREET, 0, 64), 0.0)
     width = torch.logspace(-4, 3, 200)
-    _, removed = waves.slopes(frame, torch.rand(200, 2), width)
+    _, _, removed = surface(frame, torch.rand(200, 2), width)
     assert (removed.diff() >= -1e-7).all()
 
 
@@ -295,6 +299,6 @@ def test_slopes_are_finite_over_the_parameter_range(wind, fetch, depth):
     sea = waves.make_waves(flood, 0, 32)
     x = torch.tensor([[0.0, 0.0], [1e5, -1e5], [-1e-9, -0.0]])
     for width in (0.0, 1e-6, 1.0, 1e8):
-        slope, removed = waves.slopes(waves.at_time(sea, 1e4), x, torch.full((3,), width))
+        _, slope, removed = surface(waves.at_time(sea, 1e4), x, torch.full((3,), width))
         assert torch.isfinite(slope).all() and torch.isfinite(removed).all()
         assert (removed >= 0).all()

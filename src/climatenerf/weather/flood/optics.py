@@ -8,12 +8,17 @@ R and 1 - R, so white surroundings stay white on both sides. Normals point up; s
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.srgb import linear_colour
-from climatenerf.weather.flood.fresnel import diffuse_reflectances, slope_averaged
+from climatenerf.weather.flood.fresnel import (
+    diffuse_reflectances,
+    reflectance,
+    slope_averaged,
+)
 from climatenerf.weather.flood.parameters import Flood
 
 # Koschmieder's law for the path down and up: a white disc at the depth `clarity` keeps 2 % of its
@@ -23,7 +28,8 @@ _CLARITY = -math.log(0.02) / 2
 _MUD = (0.75, 0.95, 1.3)
 # Absorption of pure water, 1/m (Pope and Fry 1997, mean over the band of each sRGB primary).
 _PURE = (0.3, 0.06, 0.01)
-_MAX_SIGMA_ANGLE = math.pi / 3  # rad; wider sigma points would point away from the lobe
+GOLDEN = 0.6180339887498949
+_RETURNED_NODES = 10  # for each part of the hemisphere
 
 
 def plane_distance(
@@ -107,13 +113,13 @@ def _relative_length_gradient(
     return (normal - along * d) / safe
 
 
-def normal_of(slope: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+def normal_of(slope: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
     """Return the upward unit normal of a surface with the slope (dz/dx, dz/dy)."""
-    raw = torch.cat([-slope, torch.ones_like(slope[:, :1])], dim=-1)
+    raw = torch.cat([-slope, torch.ones_like(slope[..., :1])], dim=-1)
     return raw / raw.norm(dim=-1, keepdim=True)
 
 
-def mirror(d: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def mirror(d: Float[Tensor, "*#n 3"], normal: Float[Tensor, "*#n 3"]) -> Float[Tensor, "*#n 3"]:
     """Return the direction of the mirrored ray."""
     return d - 2 * (d * normal).sum(-1, keepdim=True) * normal
 
@@ -143,53 +149,102 @@ def refract(
     return out / out.norm(dim=-1, keepdim=True), cos2_t <= 0
 
 
-def glossy_rays(
-    reflected: Float[Tensor, "n 3"],
-    vertical_variance: Float[Tensor, "n"],
-    horizontal_variance: Float[Tensor, "n"],
-    below: Bool[Tensor, "n"],
-    sample_rotation: Float[Tensor, "n"] | None = None,
-) -> tuple[Float[Tensor, "n 5 3"], Float[Tensor, "5"]]:
-    """Return the sigma points of the reflection lobe: five rays with the lobe's mean and variance.
+def subpixels(
+    rays_d: Float[Tensor, "n 3"], pixel_angle: Float[Tensor, "n"], count: int
+) -> Float[Tensor, "n k 3"]:
+    """Return directions spread over each pixel: a lattice of rank 1, finest along the view.
 
-    If both variances are 1/lambda, the set is the lobe's axis and four rays at the angle
-    sqrt(3/lambda) from it.
+    A pixel's footprint on water is longer than wide, so rows matter most.
 
     Args:
-        reflected: axis of the lobe, unit vectors.
-        vertical_variance: variance of the lobe within the vertical plane, rad^2.
-        horizontal_variance: variance across that plane, rad^2.
-        below: True under water; these rays are clipped to the horizon from below, others from
-            above.
-        sample_rotation: rotation of the four rays about the axis, rad; None: 0. The variances of
-            the set do not depend on it.
-
-    Returns:
-        Unit directions (the axis first) and their weights, 1/3 and four times 1/6.
+        rays_d: unit directions through the pixels' centres.
+        pixel_angle: angle that a pixel spans, rad.
+        count: directions a pixel; 1: its centre.
     """
-    zeros = torch.zeros_like(vertical_variance)
-    across = torch.stack([-reflected[:, 1], reflected[:, 0], zeros], dim=-1)
+    k = torch.arange(count, device=rays_d.device) + 0.5
+    row, column = k / count - 0.5, (k * GOLDEN) % 1 - 0.5
+    across = _across(rays_d)
+    within = torch.linalg.cross(rays_d, across)
+    offset = row[:, None] * within[:, None] + (column - column.mean())[:, None] * across[:, None]
+    d = rays_d[:, None] + pixel_angle[:, None, None] * offset
+    return d / d.norm(dim=-1, keepdim=True)
+
+
+def part_width(count: int) -> float:
+    """Return the width to which waves are filtered for one of a pixel's parts, in pixels.
+
+    Parts lie in as many rows and columns as there are, and share the area of one pixel.
+    """
+    return count**-0.75
+
+
+def facets(
+    rays_d: Float[Tensor, "n k 3"],
+    slope: Float[Tensor, "n k 2"],
+    variance: Float[Tensor, "n k"],
+    flood: Flood,
+    below: Bool[Tensor, "n"],
+) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k"]]:
+    """Return one reflected ray for each part of a pixel, and its share of the pixel's light.
+
+    Each part has a facet of its own: its resolved slope and a draw from the slopes that are not
+    resolved. Together the draws have their mean and variance. A facet counts by its projected area
+    and by its own Fresnel reflectance; the sum of the shares is the mean reflectance over all
+    slopes (`fresnel.slope_averaged`). Tilting a facet by sigma rotates the reflection by 2 sigma,
+    so the spread 1/gloss of the reflection lobe is a slope variance of 1/(4 gloss).
+
+    Args:
+        rays_d: unit directions of the rays that arrive at the surface.
+        slope: resolved slope (dz/dx, dz/dy) where they do.
+        variance: unresolved slope variance per axis.
+        flood: gloss and refractive index.
+        below: True for rays that arrive from under water.
+    """
+    count = rays_d.shape[1]
+    side = torch.where(below, -1.0, 1.0).to(rays_d)[:, None]
+    facing = -(rays_d * normal_of(slope)).sum(-1) * side
+    unresolved = variance.mean(1) + 1 / (4 * flood.gloss)
+    average, tilt, visible = slope_averaged(facing.mean(1), unresolved, flood.ior, below)
+    # Visible facets are tilted towards the viewer: above water they rise away from the viewer.
+    flat = rays_d[..., :2]
+    away = flat / flat.norm(dim=-1, keepdim=True).clamp_min(1e-6)  # 0/0 at the nadir
+    across = torch.stack([-away[..., 1], away[..., 0]], dim=-1)
+    draws = _draws(count, rays_d.device)
+    # The floors keep the gradients of the square roots finite.
+    along = tilt[:, None] * side + visible.clamp_min(1e-20).sqrt()[:, None] * draws[:, 0]
+    cross = unresolved.clamp_min(1e-20).sqrt()[:, None] * draws[:, 1]
+    drawn = along[..., None] * away + cross[..., None] * across
+    under = below[:, None].expand_as(facing)
+
+    def seen(normal: Tensor) -> Float[Tensor, "n k"]:
+        return reflectance(-(rays_d * normal).sum(-1) * side, flood.ior, under)
+
+    # A few draws err in the mean; at the mean slope the mean is known. 1e-9: no reflection, 0/0.
+    usual = seen(normal_of(slope.mean(1, keepdim=True) + drawn)).mean(1)
+    normal = normal_of(slope + drawn)
+    share = seen(normal) * (average / usual.clamp_min(1e-9) / count)[:, None]
+    # What is seen from behind reflects as if edge-on.
+    return _clip_to_horizon(mirror(rays_d, normal), below[:, None]), share
+
+
+def _draws(count: int, device: torch.device) -> Float[Tensor, "k 2"]:
+    """Slopes in standard deviations: mean 0, variance 1 along each axis; 0 for a single one."""
+    if count == 1:
+        return torch.zeros(1, 2, device=device)
+    k = torch.arange(count - 1, device=device)
+    # Neighbouring rows of the pixel get opposite slopes.
+    angle = 2 * math.pi * ((k * 2) % (count - 1)) / (count - 1)
+    ring = math.sqrt(2 * count / (count - 1)) * torch.stack([angle.cos(), angle.sin()], -1)
+    middle = count // 2
+    return torch.cat([ring[:middle], torch.zeros(1, 2, device=device), ring[middle:]])
+
+
+def _across(d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Horizontal unit vectors across directions; any for a vertical one."""
+    across = torch.stack([-d[:, 1], d[:, 0], torch.zeros_like(d[:, 0])], dim=-1)
     length = across.norm(dim=-1, keepdim=True)
-    east = torch.tensor([1.0, 0, 0], dtype=across.dtype, device=across.device)
-    across = torch.where(length > 1e-6, across / length.clamp(min=1e-6), east)  # vertical axis: any
-    within = torch.linalg.cross(reflected, across)
-    rotation = zeros if sample_rotation is None else sample_rotation
-    up = _sigma_angle(vertical_variance)[:, None] * within
-    side = _sigma_angle(horizontal_variance)[:, None] * across
-    rays = [reflected]
-    for quarter in range(4):
-        phase = (rotation + quarter * math.pi / 2)[:, None]
-        offset = torch.cos(phase) * up + torch.sin(phase) * side
-        angle = offset.norm(dim=-1, keepdim=True)  # > 0, see _sigma_angle
-        rays.append(torch.cos(angle) * reflected + torch.sin(angle) / angle * offset)
-    weights = zeros.new_tensor([1 / 3] + 4 * [1 / 6])
-    return _clip_to_horizon(torch.stack(rays, dim=1), below[:, None]), weights
-
-
-def _sigma_angle(variance: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return the angle of the sigma points from the axis, sqrt(3 variance), rad, > 0."""
-    # The floor keeps the gradient of the square root finite at 0.
-    return torch.sqrt((3 * variance).clamp(min=1e-20)).clamp(max=_MAX_SIGMA_ANGLE)
+    east = torch.tensor([1.0, 0, 0], dtype=d.dtype, device=d.device)
+    return torch.where(length > 1e-6, across / length.clamp(min=1e-6), east)
 
 
 def _clip_to_horizon(d: Float[Tensor, "*n 3"], below: Bool[Tensor, "*#n"]) -> Float[Tensor, "*n 3"]:
@@ -197,49 +252,6 @@ def _clip_to_horizon(d: Float[Tensor, "*n 3"], below: Bool[Tensor, "*#n"]) -> Fl
     z = torch.where(below, d[..., 2].clamp(max=0), d[..., 2].clamp(min=0))
     flat = torch.cat([d[..., :2], z[..., None]], dim=-1)
     return flat / flat.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # vertical ray: 0/0
-
-
-def reflection(
-    rays_d: Float[Tensor, "n 3"],
-    slope: Float[Tensor, "n 2"],
-    variance: Float[Tensor, "n"],
-    flood: Flood,
-    below: Bool[Tensor, "n"],
-    sample_rotation: Float[Tensor, "n"] | None = None,
-) -> tuple[Float[Tensor, "n 5 3"], Float[Tensor, "5"], Float[Tensor, "n"]]:
-    """Return the reflected rays of each hit on the water, their weights and the mean reflectance.
-
-    Tilting a facet by sigma rotates the reflection by 2 sigma within the plane of incidence and by
-    2 sigma cos across it. At the nadir both give 1/lambda = 1/lambda_0 + 4 sigma^2. At grazing
-    angles the lobe is tall and narrow: reflections of lights are streaks.
-
-    Args:
-        rays_d: unit directions of the rays that arrive at the surface.
-        slope: resolved slope (dz/dx, dz/dy) at the hit.
-        variance: unresolved slope variance per axis.
-        flood: gloss and refractive index.
-        below: True for rays that arrive from under water.
-        sample_rotation: see `glossy_rays`.
-
-    Returns:
-        Five unit directions, their weights (sum 1), and the mean reflectance R, all for the facets
-        visible along the ray.
-    """
-    side = torch.where(below, -torch.ones_like(variance), torch.ones_like(variance))
-    cos = -(rays_d * normal_of(slope)).sum(-1) * side
-    reflectance, tilt, visible_variance = slope_averaged(cos, variance, flood.ior, below)
-    horizontal = rays_d[:, :2]
-    away = horizontal / horizontal.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # 0/0 at the nadir
-    # A facet tilted towards a viewer above the water rises away from the viewer.
-    normal = normal_of(slope + (tilt * side)[:, None] * away)
-    cos = (-(rays_d * normal).sum(-1) * side).clamp(0, 1)
-    vertical_variance = 1 / flood.gloss + 4 * visible_variance
-    horizontal_variance = 1 / flood.gloss + 4 * variance * cos**2
-    axis = mirror(rays_d, normal)
-    rays, weights = glossy_rays(
-        axis, vertical_variance, horizontal_variance, below, sample_rotation
-    )
-    return rays, weights, reflectance
 
 
 def attenuation(flood: Flood) -> tuple[float, float, float]:
@@ -287,13 +299,16 @@ def bottom_radiance(
     irradiance: Float[Tensor, "*#n 3"],
     ior: float,
     entering: float | None = None,
+    optical_depth: Float[Tensor, "*n 3"] | None = None,
+    body: Float[Tensor, "*#n 3"] | None = None,
 ) -> Float[Tensor, "*n 3"]:
-    """Return the radiance of the bottom under clear water from the radiance of the dry ground.
+    """Return the radiance of the bottom under water from the radiance of the dry ground.
 
     L_bottom = L_t (1 - r_e)/(n^2 (1 - rho r_i)): 1 - r_e of the light enters, the surface reflects
     the fraction r_i of the light from the bottom back down, and the rest spreads over n^2 when it
     leaves. The albedo rho = pi L_t/E is clamped to [0, 1]. For rho = 1 the factor is exactly 1,
-    since 1 - r_e = n^2 (1 - r_i).
+    since 1 - r_e = n^2 (1 - r_i). What the first way down and the way to the viewer absorb is not
+    included; see `water_transmittance`.
 
     Args:
         dry: linear radiance L_t of the dry ground.
@@ -301,11 +316,33 @@ def bottom_radiance(
         ior: refractive index of the water.
         entering: fraction of the light that enters the water; None: 1 - r_e, for diffuse light. For
             sunlight it is 1 - R at the sun's angle.
+        optical_depth: of the water above the bottom, which light between surface and bottom
+            crosses again and again; None: 0.
+        body: c_w of water in whose place that absorption puts its own light; None: black.
     """
     r_e, r_i = diffuse_reflectances(ior)
     albedo = (math.pi * dry / irradiance.clamp(min=1e-6)).clamp(0, 1)  # a black scene: 0/0
     entering = 1 - r_e if entering is None else entering
-    return dry * entering / (ior**2 * (1 - albedo * r_i))
+    if optical_depth is None:
+        return dry * entering / (ior**2 * (1 - albedo * r_i))
+    back = returned(optical_depth, ior)
+    own = 0.0 if body is None else albedo * (r_i - back).clamp_min(0) * body
+    return (dry * entering / ior**2 + own) / (1 - albedo * back)
+
+
+def returned(optical_depth: Float[Tensor, "*n 3"], ior: float) -> Float[Tensor, "*n 3"]:
+    """Return the fraction of a diffuse bottom's light that the surface sends back to it.
+
+    The integral of 2 mu R(mu) exp(-2 tau/mu) over the cosine mu, with the reflectance R from below.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_RETURNED_NODES)
+    critical = math.sqrt(1 - 1 / ior**2)  # flatter rays are reflected totally
+    parts = ((0.0, critical), (critical, 1.0))
+    mu = optical_depth.new_tensor(np.concatenate([a + (b - a) * (nodes + 1) / 2 for a, b in parts]))
+    width = optical_depth.new_tensor(np.concatenate([(b - a) * weights / 2 for a, b in parts]))
+    weight = 2 * mu * width * reflectance(mu, ior, below=True)
+    weight = weight * (diffuse_reflectances(ior)[1] / weight.sum())  # exact without absorption
+    return (weight * torch.exp(-2 * optical_depth[..., None].clamp_max(50.0) / mu)).sum(-1)
 
 
 def body_colour(flood: Flood, irradiance: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:

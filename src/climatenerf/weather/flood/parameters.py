@@ -36,8 +36,8 @@ class Flood:
     """Attenuation of red, green and blue in 1/m, given instead of the clarity."""
     ior: Annotated[float, number(1.01, 2.0)] = 1.333
     """Refractive index of the water."""
-    gloss: Annotated[float, number(10.0, 1e9)] = 20000.0
-    """Sharpness of the reflection lobe before waves widen it (spread 1/sqrt)."""
+    gloss: Annotated[float, number(10.0, 1e9)] = 1e9
+    """Sharpness of reflections before waves widen them (spread 1/sqrt); 1e9: a mirror."""
 
 
 FLOOD = Effect(

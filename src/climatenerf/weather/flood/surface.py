@@ -16,10 +16,12 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT
 from climatenerf.field.compositing import RENDER_STEP, composited
 from climatenerf.field.protocol import device_of
+from climatenerf.ops.wave_tracing import WaveMaps, first_hits
+from climatenerf.ops.wave_tracing import surface as wave_surface
 from climatenerf.scene.scene import Scene
-from climatenerf.weather.flood import optics, waves
+from climatenerf.weather.flood import optics
 from climatenerf.weather.flood.parameters import Flood
-from climatenerf.weather.flood.waves import WaveFrame, Waves, at_time, make_waves
+from climatenerf.weather.flood.waves import Waves, at_time, make_waves
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import (
     TINY,
@@ -31,6 +33,8 @@ from climatenerf.weather.world import (
 )
 
 SKIN = 2e-3  # secondary rays begin this far from the water, m
+PARTS = 9  # of a pixel, with a reflected ray each
+SHARP = 1e8  # gloss from which on still water is a mirror
 MIN_BOTTOM = 1.0 / 2048  # transmittance below which no bottom is traced: under an 8-bit step
 
 
@@ -45,26 +49,42 @@ class Water:
         irradiance: on level ground in the open, linear.
         sun_elevation: rad; None: light from an even sky.
         mirror_only: reflectance 1 and no gloss: a check against a mirrored camera.
+        displaced: whether rays meet crests and troughs, or the mean surface with their slopes.
     """
 
     flood: Flood
     level: float
-    waves: WaveFrame
+    waves: WaveMaps
     irradiance: Float[Tensor, "3"]
     sun_elevation: float | None = None
     mirror_only: bool = False
+    displaced: bool = True
     mask = "mask_water"
     extra_layers = ("water_depth",)
 
+    @property
+    def calm(self) -> "Water":
+        """The surface as further rays meet it: level, with the slopes of its waves."""
+        return replace(self, displaced=False)
+
     def distance(
-        self, rays_o: Float[Tensor, "n 3"], rays_d: Float[Tensor, "n 3"]
+        self,
+        rays_o: Float[Tensor, "n 3"],
+        rays_d: Float[Tensor, "n 3"],
+        pixel_angle: Float[Tensor, "n"],
     ) -> Float[Tensor, "n"]:
-        """Ray length to the level plane, m; +inf where it is missed."""
-        return optics.plane_distance(rays_o, rays_d, self.level)
+        """Ray length to the surface, m; +inf where it is missed."""
+        if not self.displaced:
+            return optics.plane_distance(rays_o, rays_d, self.level)
+        below = self.inside(rays_o)
+        return first_hits(self.waves, self.level, rays_o, rays_d, below, pixel_angle).t
 
     def inside(self, rays_o: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Whether origins lie under water."""
-        return rays_o[:, 2] < self.level
+        over = rays_o[:, 2] - self.level
+        if not self.displaced or bool((over.abs() > self.waves.crest()).all()):
+            return over < 0
+        return over < wave_surface(self.waves, rays_o[:, :2], torch.zeros_like(over))[0]
 
     def fraction_behind(
         self,
@@ -106,12 +126,20 @@ class Water:
         rays_d: Float[Tensor, "n 3"],
         t: Float[Tensor, "n"],
     ) -> Float[Tensor, "n 3"]:
-        """Radiance at ray length t (m) as it arrives at an eye under water."""
+        """Radiance at ray length t (m) as it arrives at an eye under water, with a wet bed."""
         beta = torch.tensor(optics.attenuation(self.flood), device=rays_o.device)
         depth = self.level - rays_o[:, 2] - t.clamp_max(1e6) * rays_d[:, 2]
+        body = optics.body_colour(self.flood, self.irradiance)
+        # What lies no deeper than the troughs may be the surface itself.
+        bed = ((depth > self.waves.crest() + SKIN) & t.isfinite())[:, None]
+        thick = beta * depth.clamp(0, 1e6)[:, None]
+        wet = optics.bottom_radiance(
+            radiance, self.irradiance, self.flood.ior, optical_depth=thick, body=body
+        )
+        radiance = torch.where(bed, wet, radiance)
         light = optics.light_cosine(self.flood, self.sun_elevation)
         passed = optics.water_transmittance(beta, t, depth, light)
-        return radiance * passed + optics.body_colour(self.flood, self.irradiance) * (1 - passed)
+        return radiance * passed + body * (1 - passed)
 
     def shade(
         self, world: World, hits: SurfaceHits, trace: TraceRadiance
@@ -121,35 +149,53 @@ class Water:
         below = self.inside(hits.rays_o)
         vertical = (hits.t_bottom - hits.t).clamp_min(0) * rays_d[:, 2].abs()
         depth = torch.where(torch.isfinite(vertical) & ~below, vertical, torch.zeros_like(vertical))
-        x = hits.rays_o + hits.t[:, None] * rays_d
-        x[:, 2] = self.level
+        x = self._on_mean_surface(hits.rays_o + hits.t[:, None] * rays_d)
         footprint = optics.footprint(hits.t, rays_d, hits.pixel_angle)
-        slope, variance = waves.slopes(self.waves, x[:, :2], footprint)
+        _, slope, _ = wave_surface(self.waves, x[:, :2], footprint)
         normal = optics.normal_of(slope)
-        directions, parts, reflectance = optics.reflection(
-            rays_d, slope, variance, self.flood, below, hits.sample_rotation
+
+        # --- Reflected rays, traced like any other: one from each part of the pixel ---------------
+        count = 1 if self._even() else PARTS
+        parts = optics.subpixels(rays_d, hits.pixel_angle, count)
+        origins = hits.rays_o[:, None].expand_as(parts).reshape(-1, 3)
+        found = first_hits(
+            self.waves,
+            self.level,
+            origins,
+            parts.reshape(-1, 3),
+            below.repeat_interleave(count),
+            hits.pixel_angle.repeat_interleave(count) * optics.part_width(count),
+        )
+        # Parts that miss the water, beside its horizon, show what the centre does.
+        t = torch.where(found.t < torch.inf, found.t, hits.t.repeat_interleave(count))
+        met = self._on_mean_surface(origins + t[:, None] * parts.reshape(-1, 3))
+        directions, share = optics.facets(
+            parts,
+            found.slope.view(n, count, 2),
+            found.variance.view(n, count),
+            self.flood,
+            below,
         )
         if self.mirror_only:
-            directions, parts = directions[:, :1], torch.ones_like(parts[:1])
-            reflectance = torch.ones_like(reflectance)
-
-        # --- Reflected rays, traced like any other ------------------------------------------------
-        count = directions.shape[1]
+            directions, share = optics.mirror(rays_d, normal)[:, None], torch.ones_like(share)
         side = torch.where(below, -SKIN, SKIN)
         zero = torch.zeros_like(side)
-        start = x + torch.stack([zero, zero, side], dim=-1)
+        lift = torch.stack([zero, zero, side], dim=-1)
         radiance = trace(
-            start.repeat_interleave(count, 0),
+            met + lift.repeat_interleave(count, 0),
             directions.reshape(-1, 3),
             hits.pixel_angle.repeat_interleave(count, 0) * 2,
         )
-        reflected = (radiance.view(n, count, 3) * parts[:, None]).sum(1)
+        reflectance = share.sum(1)
+        # 1e-6: a surface that reflects nothing.
+        share = share / reflectance.clamp_min(1e-6)[:, None]
+        reflected = (radiance.view(n, count, 3) * share[..., None]).sum(1)
 
         # --- What is on the other side ------------------------------------------------------------
         direction, total = optics.refract(rays_d, normal, self.flood.ior, below)
+        total |= below & (direction[:, 2] <= 0)  # behind the next crest it would meet water again
         direction = direction * ~total[:, None]  # total reflection: no ray goes on
-        up = torch.tensor([0.0, 0.0, 1.0], device=start.device)
-        start = start - 2 * side[:, None] * up
+        start = x - lift
         background, passed = self._other_side(
             world, start, direction, below, hits.pixel_angle, depth, trace
         )
@@ -160,6 +206,15 @@ class Water:
         body = optics.body_colour(self.flood, irradiance)
         shaded = optics.shade(reflected, reflectance, background, passed, body)
         return shaded, normal, {"water_depth": depth}
+
+    def _even(self) -> bool:
+        """Whether one reflected ray shows what a pixel does."""
+        still = not self.waves.start.numel() and self.waves.unresolved == 0
+        return self.mirror_only or (still and self.flood.gloss >= SHARP)
+
+    def _on_mean_surface(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """The same places on the surface without waves, where further rays begin."""
+        return torch.cat([x[:, :2], torch.full_like(x[:, :1], self.level)], dim=-1)
 
     def _irradiance_at(self, world: World, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Irradiance of the level water at positions x (m)."""
@@ -206,7 +261,11 @@ class Water:
             light = optics.light_cosine(self.flood, self.sun_elevation)
             through = optics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
             irradiance = self._irradiance_at(world, o)
-            background[down] = optics.bottom_radiance(dry, irradiance, self.flood.ior)
+            thick = beta * (path * d[:, 2].abs())[:, None]
+            body = optics.body_colour(self.flood, irradiance)
+            background[down] = optics.bottom_radiance(
+                dry, irradiance, self.flood.ior, optical_depth=thick, body=body
+            )
             passed[down] = through * (1 - transmittance)[:, None]
         passed[below] = 1.0
         up = (below & (direction[:, 2] > 0)).nonzero()[:, 0]

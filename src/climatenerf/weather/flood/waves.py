@@ -2,9 +2,9 @@
 
 The surface is a sum of plane waves (Fournier and Reeves 1986; Tessendorf 2001) with the spectrum of
 `weather.flood.spectrum`. An FFT evaluates it on periodic tiles; each tile carries one band of
-wavenumbers. Slope maps are prefiltered in a mip pyramid. A lookup returns the filtered slope and
-the slope variance that the filter removed; the reflection lobe and the Fresnel term include this
-variance.
+wavenumbers. Maps of heights and slopes are prefiltered in a mip pyramid. A lookup
+(`ops.wave_tracing`) returns the filtered height and slope and the slope variance that the filter
+removed; the reflection lobe and the Fresnel term include this variance.
 """
 
 import math
@@ -12,10 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float, Int64
+from jaxtyping import Complex, Float
 from torch import Tensor
 
 from climatenerf.core.device import CPU, to_device
+from climatenerf.ops.wave_tracing import WaveMaps
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.spectrum import (
     MAX_CUTOFF,
@@ -80,14 +81,6 @@ class Waves:
     significant_height: float = 0.0
     mean_square_slope: float = 0.0
     cutoff: float = 0.0
-
-
-@dataclass(frozen=True)
-class WaveFrame:
-    """Waves at one moment: the mip pyramid of slope maps of each tile, its levels concatenated."""
-
-    waves: Waves
-    pyramids: tuple[Complex[Tensor, "texels"], ...]
 
 
 def make_waves(flood: Flood, seed: int, n: int = 256, device: torch.device = CPU) -> Waves:
@@ -213,10 +206,28 @@ def _blur(k2: np.ndarray, texel: float, level: int) -> np.ndarray:
     return np.exp(-k2 * (0.5 * texel) ** 2 / 2) if level else np.ones_like(k2)
 
 
-def at_time(waves: Waves, time: float) -> WaveFrame:
-    """Compute the slope maps of all tiles at `time` seconds; once per frame, before any lookup."""
+def at_time(waves: Waves, time: float) -> WaveMaps:
+    """Compute the maps of all tiles at `time` seconds; once per frame, before any lookup."""
     time = time / math.sqrt(waves.scale)  # Froude: s times the length, sqrt(s) times the period
-    return WaveFrame(waves, tuple(_pyramid(tile, time) for tile in waves.tiles))
+    if not waves.tiles:
+        none = torch.zeros(0, 1)
+        empty = torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), none[:, 0]
+        return WaveMaps(*empty, 0, none[:, 0], none, none, none, waves.unresolved)
+    pyramids = [_pyramid(tile, time, waves.scale) for tile in waves.tiles]
+    texels = torch.cat([each for each, _ in pyramids])
+    device, count = texels.device, pyramids[0][0].shape[0]
+    tiles = waves.tiles
+    return WaveMaps(
+        texels,
+        count * torch.arange(len(tiles), device=device),
+        torch.tensor([tile.length * waves.scale for tile in tiles], device=device),
+        len(tiles[0].level_variance) - 1,
+        torch.tensor([tile.slope_variance for tile in tiles], device=device),
+        torch.stack([tile.level_variance for tile in tiles]),
+        torch.stack([tile.level_covariance for tile in tiles]),
+        torch.stack([highest for _, highest in pyramids]),
+        waves.unresolved,
+    )
 
 
 def amplitudes(tile: WaveTile, time: float) -> Complex[Tensor, "n n"]:
@@ -235,75 +246,33 @@ def heights(waves: Waves, index: int, time: float) -> Float[Tensor, "n n"]:
     return torch.fft.ifft2(spectrum, norm="forward").real * waves.scale
 
 
-def _pyramid(tile: WaveTile, time: float) -> Complex[Tensor, "texels"]:
-    """Return the slope maps, x slope + i y slope, from N x N down to 1 x 1, concatenated."""
+def _pyramid(
+    tile: WaveTile, time: float, scale: float
+) -> tuple[Float[Tensor, "texels 3"], Float[Tensor, "levels"]]:
+    """Return the maps of height (m) and slopes from N x N down to 1 x 1, and each level's height.
+
+    The levels are concatenated; lengths are scaled.
+    """
+    height = amplitudes(tile, time)
     # Both slopes are real, so one complex FFT computes both: i kx h + i (i ky h).
-    spectrum = amplitudes(tile, time) * torch.complex(-tile.k[..., 1], tile.k[..., 0])
+    slope = height * torch.complex(-tile.k[..., 1], tile.k[..., 0])
+    height = height * scale
     k2 = (tile.k**2).sum(-1)
-    n, maps = len(spectrum), []
+    n, maps, highest = len(height), [], []
     for level in range(len(tile.level_variance)):
         size = n >> level
         half = size // 2
-        if half < 2:  # only the mean remains, and the mean slope is 0
-            maps.append(spectrum.new_zeros(size * size))
+        if half < 2:  # only the mean remains, and the mean is 0
+            maps.append(k2.new_zeros(size * size, 3))
+            highest.append(k2.new_zeros(()))
             continue
-        row = torch.arange(n, device=spectrum.device)
+        row = torch.arange(n, device=height.device)
         rows = torch.cat([row[:half], row[n - half :]])
-        part = spectrum[rows][:, rows]
+        parts = torch.stack([height[rows][:, rows], slope[rows][:, rows]])
         if level:
-            part = part * torch.exp(-k2[rows][:, rows] * (0.5 * tile.length / size) ** 2 / 2)
-        part[half], part[:, half] = 0, 0  # the Nyquist frequency has no conjugate partner
-        maps.append(torch.fft.ifft2(part, norm="forward").flatten())
-    return torch.cat(maps)
-
-
-def slopes(
-    frame: WaveFrame, x: Float[Tensor, "n 2"], footprint: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return the slope of the water at points, filtered to the size of a pixel.
-
-    Args:
-        frame: the waves at one moment.
-        x: horizontal world position, m.
-        footprint: size of the pixel on the water, m, >= 0; see `optics.footprint`.
-
-    Returns:
-        Slope (dz/dx, dz/dy); and the slope variance per axis that it lacks, >= 0: the variance
-        removed by filtering plus that of waves that no tile resolves.
-    """
-    slope = torch.zeros_like(x)
-    removed = torch.full_like(footprint, frame.waves.unresolved)
-    for tile, pyramid in zip(frame.waves.tiles, frame.pyramids, strict=True):
-        top = len(tile.level_variance) - 1
-        texel = tile.length * frame.waves.scale / (1 << top)
-        exact = torch.log2((footprint / texel).clamp(1, 1 << top))
-        level = exact.floor().long().clamp(max=top - 1)
-        mix = exact - level
-        u = x / (tile.length * frame.waves.scale)
-        fine = _bilinear(pyramid, u, level, top)
-        coarse = _bilinear(pyramid, u, level + 1, top)
-        slope = slope + torch.lerp(fine, coarse, mix[:, None])
-        variance, covariance = tile.level_variance, tile.level_covariance
-        filtered = (1 - mix) ** 2 * variance[level] + mix**2 * variance[level + 1]
-        filtered = filtered + 2 * mix * (1 - mix) * covariance[level]
-        removed = removed + (tile.slope_variance - filtered).clamp(min=0)
-    return slope, removed
-
-
-def _bilinear(
-    pyramid: Complex[Tensor, "texels"], u: Float[Tensor, "n 2"], level: Int64[Tensor, "n"], top: int
-) -> Float[Tensor, "n 2"]:
-    """Interpolate one level of a pyramid at `u`, in units of the tile's side; periodic."""
-    size = torch.bitwise_left_shift(torch.ones_like(level), top - level)
-    # Texels of all finer levels: 4^top + ... + 4 size^2.
-    start = ((4 << (2 * top)) - 4 * size**2) // 3
-    position = (u - u.floor()) * size[:, None]
-    corner = position.floor()
-    fx, fy = (position - corner).unbind(-1)
-    i, j = (corner.long() % size[:, None]).unbind(-1)  # u just below 0 may round to size
-    i1, j1 = (i + 1) % size, (j + 1) % size
-    maps = torch.view_as_real(pyramid)
-    row, row1 = start + j * size, start + j1 * size
-    a, b, c, d = (maps.index_select(0, n) for n in (row + i, row + i1, row1 + i, row1 + i1))
-    fx, fy = fx[:, None], fy[:, None]
-    return torch.lerp(torch.lerp(a, b, fx), torch.lerp(c, d, fx), fy)
+            parts = parts * torch.exp(-k2[rows][:, rows] * (0.5 * tile.length / size) ** 2 / 2)
+        parts[:, half], parts[:, :, half] = 0, 0  # the Nyquist frequency has no conjugate partner
+        fields = torch.fft.ifft2(parts, norm="forward").flatten(1)
+        maps.append(torch.stack([fields[0].real, fields[1].real, fields[1].imag], dim=-1))
+        highest.append(maps[-1][:, 0].abs().max())
+    return torch.cat(maps), torch.stack(highest)
