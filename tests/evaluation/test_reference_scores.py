@@ -236,6 +236,17 @@ def test_a_false_shore_increases_the_waterline_error():
     assert found["waterline_error_cm"] > 1
 
 
+def test_water_correlation_is_high_only_where_crests_lie_in_place():
+    rng = np.random.default_rng(0)
+    true = [rng.integers(0, 256, (30, 40, 3), np.uint8) for _ in range(2)]
+    mask = [np.tile(np.arange(40) < 25, (30, 1)).astype(float)] * 2
+    brighter = [(each // 2 + 90).astype(np.uint8) for each in true]
+    moved = [np.roll(each, 3, axis=0) for each in true]
+    assert weather_scores.water_correlation(brighter, true, mask) == pytest.approx(1, abs=1e-3)
+    assert abs(weather_scores.water_correlation(moved, true, mask)) < 0.15
+    assert math.isnan(weather_scores.water_correlation(true, true, [0 * m for m in mask]))
+
+
 def test_snow_scores_of_a_known_thickness_error():
     truth = truth_of()
     snowy = sloped_ground(truth.c2w, offset=0.15)

@@ -321,6 +321,10 @@ def score_weather(
             run.reference.scene.ground_z + level,
             1.0 / cameras[0][0].fx,
         )
+        if weather.flood.wind_speed > 0:
+            masks = [each["mask_water"] for each in layers]
+            correlation = weather_scores.water_correlation(rendered, true, masks)
+            found["water_correlation"] = correlation
     if weather.snow.depth is not None:
         snow = [case.layers(truth.name) for truth in truths]
         found |= weather_scores.snow_scores(layers, truths, snow, 1.0 / cameras[0][0].fx)

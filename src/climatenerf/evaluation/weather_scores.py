@@ -75,6 +75,23 @@ def waterline_scores(
     }
 
 
+def water_correlation(
+    rendered: list[UInt8[np.ndarray, "h w 3"]],
+    true: list[UInt8[np.ndarray, "h w 3"]],
+    masks: list[Float[np.ndarray, "h w"]],
+) -> float:
+    """Correlation of the grey values of water, ours and true: the mean of the views that show any.
+
+    Crests at other places than in the truth have a correlation of 0, however alike they look.
+    """
+    found = []
+    for ours, other, mask in zip(rendered, true, masks, strict=True):
+        a, b = (each[mask > 0.5].mean(-1) for each in (ours.astype(float), other.astype(float)))
+        if len(a) > 1 and a.std() > 0 and b.std() > 0:
+            found.append(float(np.corrcoef(a, b)[0, 1]))
+    return float(np.mean(found)) if found else float("nan")
+
+
 def crossings(
     points: Float[np.ndarray, "h w 3"], height: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "n 3"], tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]]:

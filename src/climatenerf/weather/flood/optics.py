@@ -365,7 +365,7 @@ def shade(
     """Return c = R L_r + (1 - R)(L_b t_c + (1 - t_c) c_w), linear radiance.
 
     Args:
-        reflected: weighted sum L_r of the glossy rays' radiance.
+        reflected: weighted sum L_r of the reflected rays' radiance.
         reflectance: mean reflectance R.
         background: radiance L_b on the other side: the bottom's, or under water the radiance in air
             along the refracted ray.

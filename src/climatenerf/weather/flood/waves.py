@@ -73,6 +73,7 @@ class Waves:
         significant_height: 4 sqrt(m0) of the resolved waves, scale included, m.
         mean_square_slope: of the resolved waves, both axes together.
         cutoff: k_c before scaling, rad/m.
+        device: where they are computed and looked up.
     """
 
     tiles: tuple[WaveTile, ...]
@@ -81,6 +82,7 @@ class Waves:
     significant_height: float = 0.0
     mean_square_slope: float = 0.0
     cutoff: float = 0.0
+    device: torch.device = CPU
 
 
 def make_waves(flood: Flood, seed: int, n: int = 256, device: torch.device = CPU) -> Waves:
@@ -96,11 +98,11 @@ def make_waves(flood: Flood, seed: int, n: int = 256, device: torch.device = CPU
         The waves; flat without wind, or if the wind is too weak for waves longer than a centimetre.
     """
     if flood.wind_speed < 1e-3:
-        return Waves(())
+        return Waves((), device=device)
     lowest = MIN_PEAK_RATIO * peak_wavenumber(flood)
     cutoff = cutoff_wavenumber(flood)
     if lowest > 2 * MAX_CUTOFF:
-        return Waves(())
+        return Waves((), device=device)
     # The finest tile has `_SAMPLES` points per wave at the cutoff, unless `_MAX_TILES` tiles cannot
     # span the band from the lowest wavenumber to the cutoff.
     highest = lowest * (n / _SAMPLES / _CYCLES) * _RATIO ** (_MAX_TILES - 1)
@@ -121,7 +123,7 @@ def make_waves(flood: Flood, seed: int, n: int = 256, device: torch.device = CPU
     slope = float(np.trapezoid(k**2 * energy, np.log(k)))
     height = 4 * math.sqrt(float(np.trapezoid(energy, np.log(k)))) * flood.wave_scale
     unresolved = max(cox_munk(flood.wind_speed) - slope, 0.0) / 2
-    return Waves(tiles, unresolved, flood.wave_scale, height, slope, cutoff)
+    return Waves(tiles, unresolved, flood.wave_scale, height, slope, cutoff, device)
 
 
 def make_tile(
@@ -210,8 +212,10 @@ def at_time(waves: Waves, time: float) -> WaveMaps:
     """Compute the maps of all tiles at `time` seconds; once per frame, before any lookup."""
     time = time / math.sqrt(waves.scale)  # Froude: s times the length, sqrt(s) times the period
     if not waves.tiles:
-        none = torch.zeros(0, 1)
-        empty = torch.zeros(0, 3), torch.zeros(0, dtype=torch.int64), none[:, 0]
+        device = waves.device
+        none = torch.zeros(0, 1, device=device)
+        start = torch.zeros(0, dtype=torch.int64, device=device)
+        empty = torch.zeros(0, 3, device=device), start, none[:, 0]
         return WaveMaps(*empty, 0, none[:, 0], none, none, none, waves.unresolved)
     pyramids = [_pyramid(tile, time, waves.scale) for tile in waves.tiles]
     texels = torch.cat([each for each, _ in pyramids])
