@@ -393,6 +393,25 @@ def test_radiance_of_muddy_water_is_proportional_to_irradiance():
     assert torch.allclose(radiance[1], albedo * (1 - 0.0204), rtol=0.01)
 
 
+@pytest.mark.parametrize("albedo", [0.1, 0.3, 0.6])
+def test_the_bed_does_not_jump_when_the_eye_goes_under(albedo):
+    """1 cm above and below the surface, net of what it mirrors."""
+    bed = AnalyticField(
+        [HalfSpace(offset=-0.8, colour=(albedo,) * 3)],
+        zenith=(1.0,) * 3, horizon=(1.0,) * 3, box=WIDE,
+    )  # fmt: skip
+    flood = Flood(level=0.0, wind_speed=0.0, attenuation=(0.4,) * 3, colour=(0.0,) * 3)
+    water = Water(flood, 0.0, at_time(make_waves(flood, 0), 0.0), torch.full((3,), math.pi))
+    world = World(bed, surfaces=(water,))
+    down, angle = torch.tensor([[0.0, 0.0, -1.0]]), torch.full((1,), 1e-3)
+    over, under = (
+        trace(world, torch.tensor([[0.0, 0.0, z]]), down, angle).rgb for z in (0.01, -0.01)
+    )
+    mirrored = 0.0204
+    net = (over - mirrored) / (1 - mirrored)
+    assert net[0, 0].item() == pytest.approx(under[0, 0].item(), rel=0.02)
+
+
 def test_white_furnace_from_under_water():
     """White ground and sky, clear water: white in all directions, also under total reflection."""
     white = AnalyticField(
