@@ -85,7 +85,7 @@ def first_hits(
         rays_o: origins, m.
         rays_d: unit directions.
         below: whether the origins are under water.
-        pixel_angle: angle that a pixel spans, rad.
+        pixel_angle: angle that a pixel spans, rad; waves shorter than the pixel are filtered out.
     """
     if dispatch.backend(maps.texels, rays_o, rays_d, pixel_angle) == "cpu":
         from climatenerf.ops.cpu import wave_tracing as kernels
@@ -123,6 +123,7 @@ def _first_hits(
     distance = torch.where(among, flat.clamp(0, NEAR), flat.clamp_min(0))
     footprint = distance * pixel_angle / rays_d[:, 2].abs().clamp_min(GRAZING).sqrt()
     crest = _blended(maps, maps.highest, footprint)
+    # 1e-9: a level ray leaves the layer nowhere, x/0.
     safe = torch.where(climb.abs() < 1e-9, torch.full_like(climb, 1e-9), climb)
     first, last = (crest - over) / safe, (-crest - over) / safe
     begin = torch.minimum(first, last).clamp_min(0)

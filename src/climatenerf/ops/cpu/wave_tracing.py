@@ -1,6 +1,6 @@
 """CPU kernel in Numba: rays against waves. The twin for any device is in `ops.wave_tracing`.
 
-Floats are of single precision; positions within a tile are computed in double precision.
+Maps are of single precision, positions of double precision. Names and limits are those of the twin.
 """
 
 import math
@@ -8,13 +8,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-STEPS = 16
-STEP = 0.5
-REFINED = 4
-REACH = 50.0
-NEAR = 3.0
-FLAT = 1e-5
-GRAZING = 1e-4
+from climatenerf.ops.wave_tracing import FLAT, GRAZING, NEAR, REACH, REFINED, STEP, STEPS
+
 _BLOCK = 256  # rays that share their scratch arrays
 
 
@@ -44,6 +39,15 @@ def _value(tables, top, k, level, mix, x, y, channel):
         first += size * size
         value += _texel(texels, first, size >> 1, 0.5 * x * scale, 0.5 * y * scale, channel) * mix
     return value
+
+
+@njit(cache=True, inline="always")
+def _sum(tables, top, levels, mixes, x, y, channel):
+    """One channel of all tiles together at x, y (m)."""
+    total = 0.0
+    for k in range(levels.shape[0]):
+        total += _value(tables, top, k, levels[k], mixes[k], x, y, channel)
+    return total
 
 
 @njit(cache=True, parallel=True)
@@ -79,9 +83,8 @@ def first_hits(tables, top, unresolved, level, rays, results):
                 levels[k] = at
                 mixes[k] = mix
                 crest += highest[k, at] * (1 - mix) + highest[k, at + 1] * mix
-                filtered = (1 - mix) ** 2 * level_variance[k, at] + mix**2 * level_variance[
-                    k, at + 1
-                ]
+                filtered = (1 - mix) ** 2 * level_variance[k, at]
+                filtered += mix**2 * level_variance[k, at + 1]
                 filtered += 2 * mix * (1 - mix) * level_covariance[k, at]
                 variance += max(slope_variance[k] - filtered, 0.0)
             found[r] = math.inf
@@ -94,7 +97,7 @@ def first_hits(tables, top, unresolved, level, rays, results):
             else:
                 if climb >= 0 and over >= crest:
                     continue
-                safe = climb if abs(climb) >= 1e-9 else 1e-9
+                safe = climb if abs(climb) >= 1e-9 else 1e-9  # a level ray leaves nowhere: x/0
                 first, last = (crest - over) / safe, (-crest - over) / safe
                 begin = max(min(first, last), 0.0)
                 end = min(max(first, last), begin + REACH)
@@ -107,11 +110,7 @@ def first_hits(tables, top, unresolved, level, rays, results):
                 for q in range(steps + 1):
                     share = q / steps
                     t = begin + (end - begin) * (share * share if among else share)
-                    h = 0.0
-                    for k in range(tiles):
-                        h += _value(
-                            tables, top, k, levels[k], mixes[k], ox + t * dx, oy + t * dy, 0
-                        )
+                    h = _sum(tables, top, levels, mixes, ox + t * dx, oy + t * dy, 0)
                     f = over + climb * t - sign * h
                     if f <= 0:
                         high, f_high = t, f
@@ -122,13 +121,10 @@ def first_hits(tables, top, unresolved, level, rays, results):
                 if high < 0:
                     continue
                 for _ in range(REFINED):
+                    # 1e-12: equal heights at both ends, 0/0.
                     share = min(max(f_low / max(f_low - f_high, 1e-12), 0.0), 1.0)
                     t = low + share * (high - low)
-                    h = 0.0
-                    for k in range(tiles):
-                        h += _value(
-                            tables, top, k, levels[k], mixes[k], ox + t * dx, oy + t * dy, 0
-                        )
+                    h = _sum(tables, top, levels, mixes, ox + t * dx, oy + t * dy, 0)
                     f = over + climb * t - sign * h
                     if f <= 0:
                         high, f_high = t, f
@@ -138,8 +134,7 @@ def first_hits(tables, top, unresolved, level, rays, results):
                         f_high *= 0.5
                 t = high
             found[r] = t
-            sx, sy = 0.0, 0.0
-            for k in range(tiles):
-                sx += _value(tables, top, k, levels[k], mixes[k], ox + t * dx, oy + t * dy, 1)
-                sy += _value(tables, top, k, levels[k], mixes[k], ox + t * dx, oy + t * dy, 2)
-            slopes[r, 0], slopes[r, 1] = sx, sy
+            for axis in range(2):
+                slopes[r, axis] = _sum(
+                    tables, top, levels, mixes, ox + t * dx, oy + t * dy, 1 + axis
+                )

@@ -1,4 +1,4 @@
-"""Optics of flood water: ray-plane intersection, reflection, refraction and attenuation.
+"""Optics of flood water: parts of pixels, reflection, refraction and attenuation.
 
 World frame, metres, z up. Directions are unit vectors. `below` is True for rays whose origin is
 under water. Radiance is *basic* radiance, L/n^2: a flat interface only splits it into the fractions
@@ -28,7 +28,7 @@ _CLARITY = -math.log(0.02) / 2
 _MUD = (0.75, 0.95, 1.3)
 # Absorption of pure water, 1/m (Pope and Fry 1997, mean over the band of each sRGB primary).
 _PURE = (0.3, 0.06, 0.01)
-GOLDEN = 0.6180339887498949
+_GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples spread evenly over columns
 _RETURNED_NODES = 10  # for each part of the hemisphere
 
 
@@ -162,7 +162,7 @@ def subpixels(
         count: directions a pixel; 1: its centre.
     """
     k = torch.arange(count, device=rays_d.device) + 0.5
-    row, column = k / count - 0.5, (k * GOLDEN) % 1 - 0.5
+    row, column = k / count - 0.5, (k * _GOLDEN) % 1 - 0.5
     across = _across(rays_d)
     within = torch.linalg.cross(rays_d, across)
     offset = row[:, None] * within[:, None] + (column - column.mean())[:, None] * across[:, None]
@@ -187,11 +187,12 @@ def facets(
 ) -> tuple[Float[Tensor, "n k 3"], Float[Tensor, "n k"]]:
     """Return one reflected ray for each part of a pixel, and its share of the pixel's light.
 
-    Each part has a facet of its own: its resolved slope and a draw from the slopes that are not
-    resolved. Together the draws have their mean and variance. A facet counts by its projected area
-    and by its own Fresnel reflectance; the sum of the shares is the mean reflectance over all
-    slopes (`fresnel.slope_averaged`). Tilting a facet by sigma rotates the reflection by 2 sigma,
-    so the spread 1/gloss of the reflection lobe is a slope variance of 1/(4 gloss).
+    Each part has a facet of its own: its resolved slope and a draw from those unresolved slopes
+    that the viewer can see. The draws have the mean and the variance of these
+    (`fresnel.slope_averaged`), and are the same in all pixels. A facet counts by its own Fresnel
+    reflectance; what the draws err in the mean reflectance is corrected. Tilting a facet by sigma
+    rotates the reflection by 2 sigma, so the spread 1/gloss of the reflection lobe is a slope
+    variance of 1/(4 gloss).
 
     Args:
         rays_d: unit directions of the rays that arrive at the surface.
@@ -199,6 +200,10 @@ def facets(
         variance: unresolved slope variance per axis.
         flood: gloss and refractive index.
         below: True for rays that arrive from under water.
+
+    Returns:
+        Unit directions of the reflected rays, and their shares; the sum of a pixel's shares is its
+        reflectance.
     """
     count = rays_d.shape[1]
     side = torch.where(below, -1.0, 1.0).to(rays_d)[:, None]
@@ -232,8 +237,8 @@ def _draws(count: int, device: torch.device) -> Float[Tensor, "k 2"]:
     if count == 1:
         return torch.zeros(1, 2, device=device)
     k = torch.arange(count - 1, device=device)
-    # Neighbouring rows of the pixel get opposite slopes.
-    angle = 2 * math.pi * ((k * 2) % (count - 1)) / (count - 1)
+    # Neighbouring rows of the pixel get slopes of opposite sides.
+    angle = 2 * math.pi * 3 * k / (count - 1)
     ring = math.sqrt(2 * count / (count - 1)) * torch.stack([angle.cos(), angle.sin()], -1)
     middle = count // 2
     return torch.cat([ring[:middle], torch.zeros(1, 2, device=device), ring[middle:]])
@@ -318,7 +323,7 @@ def bottom_radiance(
             sunlight it is 1 - R at the sun's angle.
         optical_depth: of the water above the bottom, which light between surface and bottom
             crosses again and again; None: 0.
-        body: c_w of water in whose place that absorption puts its own light; None: black.
+        body: radiance c_w of deep water, which replaces what is absorbed on that way; None: 0.
     """
     r_e, r_i = diffuse_reflectances(ior)
     albedo = (math.pi * dry / irradiance.clamp(min=1e-6)).clamp(0, 1)  # a black scene: 0/0

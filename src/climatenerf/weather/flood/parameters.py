@@ -14,7 +14,7 @@ _TURN = 2 * math.pi
 
 @dataclass(frozen=True)
 class Flood:
-    """Flood water: a level plane with waves, a body colour and a bottom."""
+    """Flood water: a level surface with waves, a body colour and a bottom."""
 
     level: Annotated[float | None, quantity(LENGTH, -1e3, 1e3, optional=True)] = None
     """Height of the water above the ground datum. none: no flood."""

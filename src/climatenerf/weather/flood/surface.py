@@ -1,8 +1,8 @@
 """Flood water as a surface: where rays meet it, how its shore is antialiased, how it is shaded.
 
-The physics is in `optics`, `fresnel` and `waves`. The surface is a level plane; waves change its
-normals alone. Reflected and refracted rays are traced through the whole world by the integrator,
-which hands itself over as `trace`.
+The physics is in `optics`, `fresnel` and `waves`, the search for hits in `ops.wave_tracing`. Rays
+from the camera meet crests and troughs. Reflected and refracted rays begin on the mean surface, and
+the integrator, which hands itself over as `trace`, follows them through the whole world.
 """
 
 from dataclasses import dataclass, replace
@@ -45,7 +45,7 @@ class Water:
     Attributes:
         flood: its parameters.
         level: world height of the surface, m.
-        waves: their slopes at this moment.
+        waves: their heights and slopes at this moment.
         irradiance: on level ground in the open, linear.
         sun_elevation: rad; None: light from an even sky.
         mirror_only: reflectance 1 and no gloss: a check against a mirrored camera.

@@ -29,7 +29,7 @@ STEEPEST_EDGE = math.tan(math.radians(50))  # of a surface and its rounded edge
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.35  # m, standard deviation of the heap of what slid
-DESCENT = 1e-6  # m a node, of filled hollows, so that a way leads out of them
+DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
 MAX_SWEEPS = 40  # of `settled`; a metre of snow on a lattice of 5 cm takes 20
 
 
@@ -59,10 +59,8 @@ class Cushions(NamedTuple):
 
     height: Float[np.ndarray, "h w"]
     """Of the cushion's base, m; NaN without one."""
-    closed: Float[np.ndarray, "h w"]
-    """How closed the crown is, 0 to 1."""
     keeps: Float[np.ndarray, "h w"]
-    """Fraction that its slope keeps of what a closed and level crown holds; 0 without a cushion."""
+    """Fraction of what a closed, level crown holds; 0 without a cushion."""
 
 
 def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
@@ -85,7 +83,7 @@ def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
     height = np.where(closed > 0, moment / np.maximum(weight, 1e-6), np.nan)
     slope = np.hypot(*np.gradient(height, spacing))  # NaN at the rim
     keeps = (CROWN_SHEDS - slope) / (CROWN_SHEDS - CROWN_KEEPS)
-    return Cushions(height, closed, closed * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
+    return Cushions(height, closed * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
 
 
 def slid(
@@ -97,8 +95,8 @@ def slid(
     """Depth that arrives from steeper surfaces above, over the depth that falls.
 
     What a slope does not keep slides down, over edges as well, to the first surface that keeps all
-    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m. Hollows of a
-    slope are filled first, and what slides passes over them.
+    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m. What slides
+    passes over depressions of a slope, which are roughness of the field.
 
     Args:
         lost: depth that slides off each node, over the depth that falls.
@@ -112,7 +110,7 @@ def slid(
     smooth = np.where(known, smooth / np.maximum(weight, 1e-6), np.nan)
     # Roughness would catch what slides; at edges the surfaces stay apart.
     smooth = np.where(np.abs(smooth - height) < spacing, smooth, height)
-    filled = _without_hollows(smooth, share > KEEPS_ALL)
+    filled = _depressions_filled(smooth, share > KEEPS_ALL)
     order = np.argsort(np.where(known, -filled, np.inf), axis=None, kind="stable")
     arrived = _routed(lost, share, filled, order[: int(known.sum())])
     level = (share > KEEPS_ALL).astype(np.float64)
@@ -122,13 +120,17 @@ def slid(
 
 
 @njit(cache=True)
-def _without_hollows(
+def _depressions_filled(
     height: Float[np.ndarray, "h w"], outlet: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w"]:
-    """Raise nodes until each has a descending way to an outlet or to the border of the raster.
+    """Fill depressions: each node has a descending way to an outlet or to the raster's border.
 
     The priority flood of Barnes, Lehman and Mulla (2014), algorithm 3. Nodes that no way joins to
     an outlet keep their height.
+
+    Args:
+        height: of the surface, m; NaN without one.
+        outlet: where what slides may come to rest.
     """
     rows, columns = height.shape
     filled = height.copy()

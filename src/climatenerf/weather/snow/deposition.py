@@ -50,7 +50,7 @@ STEPS = 8  # towards the ground below a slanted ray
 SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
 ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
-BETWEEN_LEAVES = 0.026  # m of snow that an open crown takes before any bridges its leaves
+BETWEEN_LEAVES = 0.026  # m of snow that open or steep crowns take before any bridges their leaves
 _CHUNK = 1 << 14  # positions per evaluation
 
 
