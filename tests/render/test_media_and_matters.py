@@ -70,6 +70,14 @@ class Sheet:
         return torch.full((len(x),), 0.5)
 
 
+@dataclass(frozen=True)
+class Glitter(Sheet):
+    """A sheet that adds light where a pixel on it is narrower than 20 mm."""
+
+    def glints(self, x, d, width):
+        return torch.where(width < 0.02, 0.25, 0.0)[:, None].expand_as(x)
+
+
 def rays(n=200, seed=0, height=20.0):
     generator = torch.Generator().manual_seed(seed)
     d = torch.randn(n, 3, generator=generator)
@@ -170,3 +178,16 @@ def test_two_media_and_two_matters_have_the_closed_form():
     expected = 0.3 * at_high + 0.42 * at_low + 0.28 * at_sky
     assert (found.rgb - expected).abs().max() < 1e-3
     assert {"mask_slab", "mask_low_air", "mask_high", "mask_low"} <= found.layers.keys()
+
+
+def test_matter_may_add_light_that_depends_on_the_pixel():
+    o, d = rays()
+    plain = Sheet(0.0, 0.9999, BLUE, "mask_blue", "blue_thickness")
+    glitter = Glitter(0.0, 0.9999, BLUE, "mask_blue", "blue_thickness")
+    narrow, wide = (torch.full((len(d),), angle) for angle in (1e-6, 1.0))
+    seen = [
+        trace(World(AIR, matters=(matter,)), o, d, angle).rgb
+        for matter, angle in ((plain, narrow), (glitter, narrow), (glitter, wide))
+    ]
+    assert seen[1] - seen[0] == pytest.approx(0.25, abs=1e-3)
+    assert torch.equal(seen[2], seen[0])

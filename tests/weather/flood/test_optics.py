@@ -11,6 +11,7 @@ from climatenerf.verification.closed_forms import returned_light
 from climatenerf.weather.flood import fresnel, waves
 from climatenerf.weather.flood import optics as water
 from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.flood.surface import PARTS
 
 IOR = 1.333
 PUDDLE = Flood(level=0.0)
@@ -148,17 +149,21 @@ def test_apparent_depth_near_the_nadir_is_depth_over_ior():
 def test_parts_of_a_pixel_lie_within_it_in_rows_and_columns():
     d = rays(50)
     angle = torch.full((50,), 0.01, dtype=torch.float64)
-    parts = water.subpixels(d, angle, 9)
-    torch.testing.assert_close(parts.norm(dim=-1), torch.ones(50, 9, dtype=torch.float64))
+    parts = water.subpixels(d, angle, PARTS)
+    torch.testing.assert_close(parts.norm(dim=-1), torch.ones(50, PARTS, dtype=torch.float64))
     torch.testing.assert_close(parts.mean(1), d, atol=1e-4, rtol=0)
     off = parts - d[:, None]
     assert off.norm(dim=-1).max() < 0.01
-    up = off[..., 2].sort(dim=1).values
-    assert (up.diff(dim=1) > 0).all(), "each in a row of its own"
+    level = torch.stack([-d[:, 1], d[:, 0], 0 * d[:, 0]], -1)
+    within = torch.linalg.cross(d, torch.nn.functional.normalize(level, dim=-1))
+    row = (off * within[:, None]).sum(-1).sort(dim=1).values
+    torch.testing.assert_close(
+        row.diff(dim=1), torch.full((50, PARTS - 1), 0.01 / PARTS).double(), atol=1e-5, rtol=0
+    )
     torch.testing.assert_close(water.subpixels(d, angle, 1)[:, 0], d)
 
 
-def spread_over(d, slope, variance, flood, below, count=9):
+def spread_over(d, slope, variance, flood, below, count=PARTS):
     """`facets` for parts that all have the same direction and slope."""
     given = (each[:, None].expand(-1, count, *each.shape[1:]) for each in (d, slope, variance))
     return water.facets(*given, flood, below)
@@ -184,6 +189,13 @@ def test_facets_reflect_as_a_rough_surface_does():
             assert actual.item() == pytest.approx(mean.item(), abs=2e-3)
             actual_spread = seen[0, :, component].var(unbiased=False)
             assert actual_spread.item() == pytest.approx(spread.item(), rel=0.06, abs=2e-5)
+
+
+def test_no_two_facets_are_alike():
+    d, flat = at_angle(50), torch.zeros(1, 2, dtype=torch.float64)
+    seen, _ = spread_over(d, flat, torch.full((1,), 1e-3).double(), SHARP, above_water(d))
+    apart = torch.cdist(seen[0], seen[0]) + torch.eye(PARTS)
+    assert apart.min() > 0.02
 
 
 @pytest.mark.parametrize("sky", ["zenith", "horizon"])
@@ -217,7 +229,7 @@ def test_reflected_rays_stay_on_their_side_of_the_water():
         under = torch.full((400,), below)
         seen, share = spread_over(d, slope, variance, PUDDLE, under)
         assert (seen[..., 2] <= 0).all() if below else (seen[..., 2] >= 0).all()
-        torch.testing.assert_close(seen.norm(dim=-1), torch.ones(400, 9, dtype=torch.float64))
+        torch.testing.assert_close(seen.norm(dim=-1), torch.ones(400, PARTS, dtype=torch.float64))
         assert ((share >= 0) & (share.sum(1, keepdim=True) <= 1 + 1e-9)).all()
 
 

@@ -197,6 +197,10 @@ def test_a_crown_carries_a_cap_and_lets_the_rest_through():
     top = (np.abs(position[..., :2]) < 0.3).all(-1) & (cap.weight > 0)
     assert position[top][:, 2] == pytest.approx(2.5, abs=0.02)
     assert cap.of_fall[top].max() == 0 and cap.of_held[top] == pytest.approx(1, abs=0.05)
+    assert cap.hidden[top] == pytest.approx(0, abs=1e-3)
+    rim = (cap.weight > 0) & (cap.of_held < 0.9)
+    assert rim.any()
+    assert cap.hidden[rim].min() > 1e-3, "between leaves"
     open_ground = (np.abs(position[..., :2]) > 1.0).any(-1) & (catch.weight > 0)
     assert catch.of_held[open_ground] == pytest.approx(0, abs=1e-3)
 

@@ -1,10 +1,16 @@
 """Sparkle of snow: its mean is that of a mirror in pieces, and it stays where it is."""
 
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
+from support.analytic_fields import AnalyticField, HalfSpace
 
+from climatenerf.weather.snow.lattice import SnowGrid
+from climatenerf.weather.snow.layer import bake_snow
+from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.sparkle import MIRRORED, SUN_SOLID_ANGLE, TILTS, WIDEST, glints
 
 SUN = torch.tensor([0.6, 0.0, 0.8])
@@ -52,3 +58,36 @@ def test_none_without_faces_and_none_far_away():
     assert not glints(x, d, torch.full((len(x),), 2 * WIDEST), SUN, 1.0).any()
     against = glints(x[:1], SUN[None], torch.full((1,), 0.01), SUN, 1.0)
     assert torch.isfinite(against).all(), "an eye that looks into the sun"
+
+
+@dataclasses.dataclass
+class SunlitPlace:
+    """A sun that half of the place sees."""
+
+    def beam(self):
+        return SUN, torch.tensor([3.0, 2.0, 1.0])
+
+    def visibility(self, x, normal):
+        return (x[:, 0] > 0).float()
+
+
+def test_snow_sparkles_in_the_sun_and_not_in_shadow():
+    field = AnalyticField([HalfSpace()], box=((-4.0, -4.0, -1.0), (4.0, 4.0, 2.0)))
+    grid = SnowGrid((0.0, 0.0), (-1.0, 1.0), 0.05, 32)
+    snow = bake_snow(field, Snow(depth=0.1), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=grid)
+    assert snow is not None
+    generator = torch.Generator().manual_seed(0)
+    x = 2 * torch.rand(200_000, 3, generator=generator) - 1
+    x[:, 2] = 0.1
+    _, d = looks(len(x), 4)
+    width = torch.full((len(x),), 0.06)
+    assert not snow.glints(x, d, width).any(), "no light of the place, no sun"
+    lit = dataclasses.replace(snow, place_light=SunlitPlace())
+    found = lit.glints(x, d, width)
+    assert not found[x[:, 0] <= 0].any()
+    expected = glints(x, d, width, SUN, snow.snow.sparkle)[:, None] * torch.tensor([3.0, 2.0, 1.0])
+    sunny = x[:, 0] > 0
+    assert expected[sunny].any()
+    torch.testing.assert_close(found[sunny], expected[sunny])
+    dull = dataclasses.replace(lit, snow=Snow(depth=0.1, sparkle=0.0))
+    assert not dull.glints(x, d, width).any()

@@ -33,7 +33,7 @@ from climatenerf.weather.world import (
 )
 
 SKIN = 2e-3  # secondary rays begin this far from the water, m
-PARTS = 9  # of a pixel, with a reflected ray each
+PARTS = 8  # of a pixel, with a reflected ray each
 SHARP = 1e8  # gloss from which on still water is a mirror
 MIN_BOTTOM = 1.0 / 2048  # transmittance below which no bottom is traced: under an 8-bit step
 
