@@ -27,19 +27,17 @@ def still(z: float, mud: bool = False) -> dict:
 def wavy(z: float, time: float, folder: Path) -> dict:
     """Write the program's waves at a time (s) as a mesh with normals; return the surface."""
     from climatenerf.weather.flood.parameters import Flood
-    from climatenerf.weather.flood.waves import at_time, heights, make_waves
+    from climatenerf.weather.flood.waves import at_time, make_waves
 
-    waves = make_waves(Flood(level=0.0, wind_speed=WIND, wave_scale=WAVE_SCALE), SEED)
-    frame = at_time(waves, time)
+    maps = at_time(make_waves(Flood(level=0.0, wind_speed=WIND, wave_scale=WAVE_SCALE), SEED), time)
     (x0, x1), (y0, y1) = EXTENT
     x, y = np.meshgrid(np.arange(x0, x1 + STEP / 2, STEP), np.arange(y0, y1 + STEP / 2, STEP))
-    height, slope = np.zeros_like(x), np.zeros(x.shape, complex)
-    for i, tile in enumerate(waves.tiles):
-        table = heights(waves, i, time).double().numpy()
-        side, n = tile.length * waves.scale, len(table)
-        height += periodic(table, side, x, y)
-        slope += periodic(frame.pyramids[i][: n * n].reshape(n, n).numpy(), side, x, y)
-    normals = np.stack([-slope.real, -slope.imag, np.ones_like(x)], -1)
+    surface, n = np.zeros((3, *x.shape)), 1 << maps.top  # of height and both slopes
+    for start, side in zip(maps.start.tolist(), maps.side.tolist(), strict=True):
+        finest = maps.texels[start : start + n * n].double().numpy().reshape(n, n, 3)
+        surface += [periodic(table, side, x, y) for table in np.moveaxis(finest, -1, 0)]
+    height, slope_x, slope_y = surface
+    normals = np.stack([-slope_x, -slope_y, np.ones_like(x)], -1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     points = np.stack([x, y, z + height], -1)
     rows, columns = x.shape

@@ -241,15 +241,6 @@ def amplitudes(tile: WaveTile, time: float) -> Complex[Tensor, "n n"]:
     return tile.forward * rotation.conj() + tile.backward * rotation
 
 
-def heights(waves: Waves, index: int, time: float) -> Float[Tensor, "n n"]:
-    """Return the heights of tile `index` at `time` seconds, m.
-
-    Rows run along +y, columns along +x; the sides are `length * scale` metres.
-    """
-    spectrum = amplitudes(waves.tiles[index], time / math.sqrt(waves.scale))
-    return torch.fft.ifft2(spectrum, norm="forward").real * waves.scale
-
-
 def _pyramid(
     tile: WaveTile, time: float, scale: float
 ) -> tuple[Float[Tensor, "texels 3"], Float[Tensor, "levels"]]:
