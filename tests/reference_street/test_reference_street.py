@@ -100,7 +100,7 @@ def test_snow_is_reproducible_by_its_seed(yard):
 
 def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path, monkeypatch):
     from climatenerf.ops.wave_tracing import surface
-    from climatenerf.weather.flood.parameters import Flood
+    from climatenerf.weather.description import read_weather
     from climatenerf.weather.flood.waves import at_time, make_waves
 
     monkeypatch.setattr(water, "EXTENT", ((-14.0, 14.0), (-22.0, 18.0)))
@@ -117,9 +117,8 @@ def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path, monkeypatch):
     expected = np.stack([slope_x, slope_y], -1)
     error = np.sqrt(((analytic - expected)[inner] ** 2).mean())
     assert error < 0.25 * np.sqrt((analytic[inner] ** 2).mean()), "differences smooth short waves"
-    waves = make_waves(
-        Flood(level=0.0, wind_speed=water.WIND, wave_scale=water.WAVE_SCALE), water.SEED
-    )
+    weather = read_weather(REFERENCE / "weather" / "flood-waves.toml").base
+    waves = make_waves(weather.flood, weather.seed)
     x, y = np.meshgrid(x0 + water.STEP * np.arange(80, 300), y0 + water.STEP * np.arange(80, 300))
     positions = torch.from_numpy(np.stack([x.ravel(), y.ravel()], -1)).float()
     of_mesh = analytic[80:300, 80:300].reshape(-1, 2)

@@ -16,6 +16,7 @@ from climatenerf.render import merging
 from climatenerf.render.frame import render_frame
 from climatenerf.render.integrator import trace
 from climatenerf.verification.closed_forms import returned_light
+from climatenerf.weather.flood.fresnel import reflectance
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.surface import Water
 from climatenerf.weather.flood.waves import at_time, make_waves
@@ -142,6 +143,21 @@ def test_a_perfect_mirror_equals_the_view_of_a_mirrored_camera():
     start = mirrored_o[wet] + t[wet, None] * mirrored_d[wet]
     clean = trace(World(street()), start, mirrored_d[wet], torch.full((int(wet.sum()),), 1 / 60))
     error = (clean.rgb - seen.rgb[wet]).square().mean()
+    assert -10 * math.log10(float(error) + 1e-12) >= 40
+
+
+def test_still_water_is_as_sharp_as_a_mirror_by_default():
+    """What black water reflects is the mirror's picture times R."""
+    from climatenerf.render.volume import camera_rays
+
+    dark = flooded(0.3, wind_speed=0.0, attenuation=(1e4,) * 3, colour=(0.0,) * 3)
+    mirror = linear(World(street(), surfaces=(dataclasses.replace(dark, mirror_only=True),)))
+    seen = linear(World(street(), surfaces=(dark,)))
+    wet = seen.layers["mask_water"] > 0.999
+    _, d = camera_rays(CAMERA, pose_along((0.0, 1.0, -0.2)))
+    above = torch.zeros(int(wet.sum()), dtype=torch.bool)
+    share = reflectance(-d[wet, 2], 1.333, above)
+    error = (seen.rgb[wet] / share[:, None] - mirror.rgb[wet]).square().mean()
     assert -10 * math.log10(float(error) + 1e-12) >= 40
 
 

@@ -182,7 +182,8 @@ def weather_file(kind: str) -> list[str]:
         return [
             f"seed = {water.SEED}", "[flood]", f'level = "{LEVELS[kind]:g} m"',
             f'wind-speed = "{water.WIND if kind == "flood-waves" else 0.0:g} m/s"',
-            f"wave-scale = {water.WAVE_SCALE}",
+            f"wave-scale = {water.WAVE_SCALE}", f'spreading = "{water.SPREADING}"',
+            'wet-band = "0 m"',  # the true shore is dry down to the waterline
             f"colour = {[round(float(value), 3) for value in colour]}",
             f"attenuation = {[round(float(value), 3) for value in attenuation]}",
             f"ior = {water.IOR}", "gloss = 1e9", *sun,

@@ -11,6 +11,7 @@ IOR = 1.333
 ABSORPTION = 1.2  # 1/m, for all colours; no scattering
 WIND = 3.0  # m/s
 WAVE_SCALE = 4.0  # the shortest waves are 15 cm long, which the mesh resolves
+SPREADING = "donelan-banner"
 SEED = 7
 EXTENT = ((-26.0, 26.0), (-48.0, 19.0))  # m, in x and y: all ground below the flood and its waves
 STEP = 0.03  # m, a fifth of the shortest wave
@@ -29,7 +30,8 @@ def wavy(z: float, time: float, folder: Path) -> dict:
     from climatenerf.weather.flood.parameters import Flood
     from climatenerf.weather.flood.waves import at_time, make_waves
 
-    maps = at_time(make_waves(Flood(level=0.0, wind_speed=WIND, wave_scale=WAVE_SCALE), SEED), time)
+    flood = Flood(level=0.0, wind_speed=WIND, wave_scale=WAVE_SCALE, spreading=SPREADING)
+    maps = at_time(make_waves(flood, SEED), time)
     (x0, x1), (y0, y1) = EXTENT
     x, y = np.meshgrid(np.arange(x0, x1 + STEP / 2, STEP), np.arange(y0, y1 + STEP / 2, STEP))
     surface, n = np.zeros((3, *x.shape)), 1 << maps.top  # of height and both slopes

@@ -7,7 +7,7 @@ from typing import Annotated
 from climatenerf.core.layer_table import Layer
 from climatenerf.field.capabilities import DENSITY
 from climatenerf.weather.effect import Effect, Measure
-from climatenerf.weather.units import ANGLE, LENGTH, SPEED, number, quantity, triple
+from climatenerf.weather.units import ANGLE, LENGTH, SPEED, choice, number, quantity, triple
 
 _TURN = 2 * math.pi
 
@@ -28,6 +28,10 @@ class Flood:
     """Water depth in the waves' dispersion relation; it is not measured from the geometry."""
     wave_scale: Annotated[float, number(0.1, 10.0)] = 1.0
     """Horizontal size of the waves at unchanged slope; 2: half the frequency."""
+    spreading: Annotated[str, choice("hasselmann", "donelan-banner")] = "hasselmann"
+    """How waves spread about the wind. donelan-banner: longer crests, more alike."""
+    wet_band: Annotated[float, quantity(LENGTH, 0.0, 10.0)] = 0.03
+    """Height above the crests up to which ground and walls are wet. 0 m: dry at the waterline."""
     colour: Annotated[tuple[float, float, float], triple(0.0, 1.0)] = (0.488, 0.406, 0.32)
     """Colour of deep water under a white sky, display sRGB."""
     clarity: Annotated[float, quantity(LENGTH, 0.01, 100.0)] = 0.3
@@ -62,6 +66,7 @@ FLOOD = Effect(
         "flood.fetch",
         "flood.depth",
         "flood.wave_scale",
+        "flood.spreading",
         "seed",
     ),
 )

@@ -1,7 +1,7 @@
 """Spectrum of wind waves: variance of height and slope as a function of wavenumber.
 
-TMA spectrum: JONSWAP (fetch-limited wind sea) times Kitaigorodskii's depth factor times the
-Donelan-Banner spreading, as collected by Horvath, "Empirical directional wave spectra for computer
+TMA spectrum: JONSWAP (fetch-limited wind sea) times Kitaigorodskii's depth factor times a
+directional spreading, as collected by Horvath, "Empirical directional wave spectra for computer
 graphics" (2015). numpy, float64; k is a wavenumber in rad/m, omega an angular frequency in rad/s.
 
 The slope variance of JONSWAP's omega^-5 tail is unbounded, and at the short fetch of a street it
@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import gammaln
 
 from climatenerf.weather.flood.parameters import Flood
 
@@ -72,13 +73,52 @@ def tma(
 
 
 def spreading(
-    omega_over_peak: Float[np.ndarray, "*n"], angle: Float[np.ndarray, "*n"]
+    omega: Float[np.ndarray, "*n"], angle: Float[np.ndarray, "*n"], flood: Flood
 ) -> Float[np.ndarray, "*n"]:
-    """Return the Donelan-Banner spreading: fraction of the energy per radian; its integral is 1.
+    """Return the directional spreading: fraction of the energy per radian; its integral is 1.
+
+    Args:
+        omega: angular frequency, rad/s.
+        angle: direction of the wave relative to downwind, rad, in [-pi, pi].
+        flood: wind speed, fetch and the law of `flood.spreading`.
+    """
+    peak = peak_frequency(flood.wind_speed, flood.fetch)
+    if flood.spreading == "donelan-banner":
+        return donelan_banner(omega / peak, angle)
+    return hasselmann(omega / peak, angle, flood.wind_speed * peak / GRAVITY)
+
+
+def hasselmann(
+    omega_over_peak: Float[np.ndarray, "*n"], angle: Float[np.ndarray, "*n"], wind_over_peak: float
+) -> Float[np.ndarray, "*n"]:
+    """Return cos^2s(angle/2) over its integral, by Hasselmann, Dunckel and Ewing (1980).
+
+    s falls with the frequency above the peak, the faster the younger the waves. Short waves spread
+    almost evenly, so the slopes along and across the wind differ as little as Cox and Munk (1954)
+    found.
 
     Args:
         omega_over_peak: frequency over the peak frequency.
-        angle: direction of the wave relative to downwind, rad, in [-pi, pi].
+        angle: direction of the wave relative to downwind, rad.
+        wind_over_peak: wind speed over the phase speed of the peak's waves.
+    """
+    r = omega_over_peak
+    above = 9.77 * np.maximum(r, 1) ** (-2.33 - 1.45 * (wind_over_peak - 1.17))
+    s = np.where(r <= 1, 6.97 * r**4.06, above)
+    log_integral = math.log(2 * math.sqrt(math.pi)) + gammaln(s + 0.5) - gammaln(s + 1)
+    return np.cos(angle / 2) ** (2 * s) / np.exp(log_integral)
+
+
+def donelan_banner(
+    omega_over_peak: Float[np.ndarray, "*n"], angle: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n"]:
+    """Return the spreading of Donelan, Hamilton and Hui (1985), with Banner's (1990) high range.
+
+    Crests are three times as long as by `hasselmann` on a street's fetch.
+
+    Args:
+        omega_over_peak: frequency over the peak frequency.
+        angle: direction of the wave relative to downwind, rad.
     """
     r = np.maximum(omega_over_peak, 0.56)
     high = 10 ** (-0.4 + 0.8393 * np.exp(-0.567 * np.log(r**2)))

@@ -6,6 +6,7 @@ the integrator, which hands itself over as `trace`, follows them through the who
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,11 +16,11 @@ from torch import Tensor
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT
 from climatenerf.field.compositing import RENDER_STEP, composited
-from climatenerf.field.protocol import device_of
+from climatenerf.field.protocol import device_of, ground_height
 from climatenerf.ops.wave_tracing import WaveMaps, first_hits
 from climatenerf.ops.wave_tracing import surface as wave_surface
 from climatenerf.scene.scene import Scene
-from climatenerf.weather.flood import optics
+from climatenerf.weather.flood import optics, shore
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.waves import Waves, at_time, make_waves
 from climatenerf.weather.weather import Weather
@@ -102,7 +103,8 @@ class Water:
         width depends on the ground's slope, so the field's normal is found for rays that have
         matter within a pixel of the plane.
         """
-        ray, lengths = along.ray, along.samples.t
+        ray = along.ray
+        lengths = shore.lengths_on_terrain(world, along, rays_o, rays_d, self.level)
         behind = (lengths > t[ray]).float()
         near = ((along.weights > MIN_WEIGHT) & (t[ray] < torch.inf)).nonzero()[:, 0]
         of = ray[near]
@@ -148,8 +150,9 @@ class Water:
         n, rays_d = hits.t.shape[0], hits.rays_d
         below = self.inside(hits.rays_o)
         vertical = (hits.t_bottom - hits.t).clamp_min(0) * rays_d[:, 2].abs()
-        depth = torch.where(torch.isfinite(vertical) & ~below, vertical, torch.zeros_like(vertical))
         x = self._on_mean_surface(hits.rays_o + hits.t[:, None] * rays_d)
+        depth = torch.where(vertical > 0, vertical, self._terrain_depth(world, x))
+        depth = torch.where(torch.isfinite(depth) & ~below, depth, torch.zeros_like(depth))
         footprint = optics.footprint(hits.t, rays_d, hits.pixel_angle)
         _, slope, _ = wave_surface(self.waves, x[:, :2], footprint)
         normal = optics.normal_of(slope)
@@ -178,9 +181,10 @@ class Water:
         )
         if self.mirror_only:
             directions, share = optics.mirror(rays_d, normal)[:, None], torch.ones_like(share)
-        side = torch.where(below, -SKIN, SKIN)
-        zero = torch.zeros_like(side)
-        lift = torch.stack([zero, zero, side], dim=-1)
+        # A lump of fitted ground that the terrain puts under water stands over the surface still.
+        lump = (hits.t - hits.t_bottom).clamp_min(0) * rays_d[:, 2].abs() * (hits.t_bottom > 0)
+        side = torch.where(below, -SKIN, SKIN + 1.5 * lump)
+        lift = torch.stack([torch.zeros_like(side), torch.zeros_like(side), side], dim=-1)
         radiance = trace(
             met + lift.repeat_interleave(count, 0),
             directions.reshape(-1, 3),
@@ -195,14 +199,14 @@ class Water:
         direction, total = optics.refract(rays_d, normal, self.flood.ior, below)
         total |= below & (direction[:, 2] <= 0)  # behind the next crest it would meet water again
         direction = direction * ~total[:, None]  # total reflection: no ray goes on
-        start = x - lift
+        start = x - lift.clamp(-SKIN, SKIN)
         background, passed = self._other_side(
             world, start, direction, below, hits.pixel_angle, depth, trace
         )
         # From below, the mean over slopes lets a little light through even where the visible facet
         # reflects all of it.
         reflectance = torch.where(total, torch.ones_like(reflectance), reflectance)
-        irradiance = self._irradiance_at(world, x)
+        irradiance = self.irradiance_at(world, x)
         body = optics.body_colour(self.flood, irradiance)
         shaded = optics.shade(reflected, reflectance, background, passed, body)
         return shaded, normal, {"water_depth": depth}
@@ -216,7 +220,12 @@ class Water:
         """The same places on the surface without waves, where further rays begin."""
         return torch.cat([x[:, :2], torch.full_like(x[:, :1], self.level)], dim=-1)
 
-    def _irradiance_at(self, world: World, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    def _terrain_depth(self, world: World, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Depth of the terrain below the level at positions x (m); 0 where it is not known."""
+        ground = ground_height(world.field, x[:, :2])
+        return (self.level - ground).clamp_min(0).nan_to_num(0.0)
+
+    def irradiance_at(self, world: World, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Irradiance of the level water at positions x (m)."""
         if world.light is None:
             return self.irradiance.expand(x.shape[0], 3)
@@ -258,9 +267,10 @@ class Water:
             )
             opacity = (1 - transmittance).clamp_min(TINY)
             dry, path = matter / opacity[:, None], length / opacity
+            path = shore.path_to_terrain(world, o, d, path)
             light = optics.light_cosine(self.flood, self.sun_elevation)
             through = optics.water_transmittance(beta, path, path * d[:, 2].abs(), light)
-            irradiance = self._irradiance_at(world, o)
+            irradiance = self.irradiance_at(world, o)
             thick = beta * (path * d[:, 2].abs())[:, None]
             body = optics.body_colour(self.flood, irradiance)
             background[down] = optics.bottom_radiance(
@@ -306,7 +316,13 @@ class FloodEntity:
             self.irradiance if light is None else light.open_irradiance(),
             elevation,
         )
-        return replace(world, surfaces=(*world.surfaces, water))
+        field = world.field
+        if weather.flood.wet_band > 0:
+            # Crests wet what lies within two deviations of the waves' height.
+            band = self.waves.significant_height / 2 + weather.flood.wet_band
+            at = partial(water.irradiance_at, world)
+            field = shore.WetField(field, water.level, band, weather.flood.ior, at)
+        return replace(world, field=field, surfaces=(*world.surfaces, water))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse levels above the whole scene; see `check_level`."""

@@ -25,7 +25,6 @@ from climatenerf.weather.flood.spectrum import (
     cutoff_wavenumber,
     dispersion,
     log_axis,
-    peak_frequency,
     peak_wavenumber,
     spreading,
     wavenumber_spectrum,
@@ -153,7 +152,7 @@ def make_tile(
     # `wind_direction` is where the wind comes from; waves travel downwind.
     heading = math.atan2(-math.cos(flood.wind_direction), -math.sin(flood.wind_direction))
     angle = np.angle(np.exp(1j * (np.arctan2(ky, kx) - heading)))
-    per_radian = spreading(omega / peak_frequency(flood.wind_speed, flood.fetch), angle)
+    per_radian = spreading(omega, angle, flood)
     energy = wavenumber_spectrum(k, flood, cutoff) * per_radian / np.maximum(k, 1e-9)  # k = 0: 0/0
     # The Nyquist frequency has no conjugate partner, so a real surface cannot contain it.
     inside = (k >= band[0]) & (k < band[1]) & (k > 0)

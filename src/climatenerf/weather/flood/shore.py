@@ -1,0 +1,133 @@
+"""The shore: which ground is under water, and what is wet above it.
+
+Fitted ground is rough where few photos show it. The terrain decides which of it lies under water;
+the field decides what is seen. World frame, metres, z up.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from climatenerf.core.classes import GROUND, SOLID_OF
+from climatenerf.core.samples import MIN_WEIGHT
+from climatenerf.field.capabilities import CLASSES, COMPLETES
+from climatenerf.field.normals import normals_at
+from climatenerf.field.protocol import ground_height, observed
+from climatenerf.field.wrapped import WrappedField
+from climatenerf.weather.flood.optics import bottom_radiance
+from climatenerf.weather.world import RaySamples, World
+
+ROUGH = 1.0  # m off the terrain, up to which matter of a ground class is ground
+EDGE = 0.05  # m about the water level, within which the terrain gives the waterline
+DRYING = 0.5  # fraction of the wet band over which it dries
+
+
+def lengths_on_terrain(
+    world: World,
+    along: RaySamples,
+    rays_o: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    level: float,
+) -> Float[Tensor, "s"]:
+    """Ray lengths of samples (m), with those of ground where rays reach the terrain's height.
+
+    Lumps of the field that stand out of the water, where the terrain is flooded, come to lie behind
+    its surface; and holes in dry ground in front of it. A field without classes or terrain, and
+    rays that do not descend, keep their lengths.
+
+    Args:
+        world: its field.
+        along: samples of rays.
+        rays_o: origins, m.
+        rays_d: unit directions.
+        level: world height of the water, m.
+    """
+    lengths, ray = along.samples.t, along.ray
+    if not {CLASSES, COMPLETES} <= world.field.capabilities:
+        return lengths
+    z = rays_o[ray, 2] + lengths * rays_d[ray, 2]
+    near = (along.weights > MIN_WEIGHT) & ((z - level).abs() < ROUGH) & (rays_d[ray, 2] < 0)
+    chosen = near.nonzero()[:, 0]
+    x = rays_o[ray[chosen]] + lengths[chosen, None] * rays_d[ray[chosen]]
+    ground = ground_height(world.field, x[:, :2])  # NaN compares False
+    other_side = (ground < level) != (x[:, 2] < level)
+    unsure = (other_side | ((ground - level).abs() < EDGE)) & ((ground - x[:, 2]).abs() < ROUGH)
+    chosen, x, ground = chosen[unsure], x[unsure], ground[unsure]
+    if not chosen.numel():
+        return lengths
+    _, logits = world.field.surface_heads(rays_o, rays_d, along.samples, chosen)
+    of_ground = is_ground(logits.argmax(-1))
+    chosen, x, ground = chosen[of_ground], x[of_ground], ground[of_ground]
+    # 1e-4: grazing rays would reach the terrain at infinity.
+    descent = (-rays_d[ray[chosen], 2]).clamp_min(1e-4)
+    return lengths.index_copy(0, chosen, lengths[chosen] + (x[:, 2] - ground) / descent)
+
+
+def path_to_terrain(
+    world: World,
+    start: Float[Tensor, "n 3"],
+    rays_d: Float[Tensor, "n 3"],
+    path: Float[Tensor, "n"],
+) -> Float[Tensor, "n"]:
+    """Lengths of paths down to the bottom (m); where this is a lump of ground, to the terrain."""
+    if not {CLASSES, COMPLETES} <= world.field.capabilities:
+        return path
+    x = start + path[:, None] * rays_d
+    ground = ground_height(world.field, x[:, :2])
+    over = x[:, 2] - ground
+    lumps = ((over > EDGE) & (over < ROUGH)).nonzero()[:, 0]
+    _, kind = normals_at(world.field, x[lumps], rays_d[lumps])
+    lumps = lumps[is_ground(kind)]
+    descent = (-rays_d[lumps, 2]).clamp_min(1e-4)  # as above
+    return path.index_add(0, lumps, over[lumps] / descent)
+
+
+def is_ground(kind: Int[Tensor, "n"]) -> Bool[Tensor, "n"]:
+    """Return which indices in `core.classes.SOLID` are classes of ground."""
+    return (kind[:, None] == torch.as_tensor(SOLID_OF[list(GROUND)], device=kind.device)).any(-1)
+
+
+@dataclass(frozen=True)
+class WetField(WrappedField):
+    """A field (`field.protocol.RadianceField`) that is wet in a band above the water.
+
+    A film of water darkens what it lies on, since part of the light stays in it (Lekner and Dorf
+    1988): `optics.bottom_radiance` under no depth of water. The film's own gloss is left out.
+
+    Attributes:
+        level: world height of the water, m.
+        band: height over it up to which all is wet or dries, m.
+        ior: refractive index of the water.
+        irradiance: at positions (world m), linear.
+    """
+
+    level: float
+    band: float
+    ior: float
+    irradiance: Callable[[Float[Tensor, "k 3"]], Float[Tensor, "k 3"]]
+
+    def colour(
+        self,
+        x: Float[Tensor, "s 3"],
+        d: Float[Tensor, "n 3"],
+        ray: Int[Tensor, "s"] | None = None,
+        *,
+        ids: Int[Tensor, "s"] | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
+    ) -> Float[Tensor, "s 3"]:
+        """Linear radiance, darkened by a film of water near its level."""
+        dry = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
+        height = (x[:, 2] - self.level) / self.band
+        wet = ((height > 0) & (height < 1)).nonzero()[:, 0]
+        if not wet.numel():
+            return dry
+        film = bottom_radiance(dry[wet], self.irradiance(x[wet]), self.ior)
+        wetness = ((1 - height[wet, None]) / DRYING).clamp_max(1)
+        return dry.index_copy(0, wet, dry[wet] + wetness * (film - dry[wet]))
+
+    def observed_only(self) -> "WetField":
+        """The same, without density that no photo shows."""
+        return replace(self, field=observed(self.field))
