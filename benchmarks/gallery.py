@@ -9,6 +9,7 @@ python benchmarks/gallery.py ditch RUN --ground --level=-1.5m --columns 2
 python benchmarks/gallery.py street-hard RUN --before EARLIER --columns 2
 python benchmarks/gallery.py street-sun RUN --light --columns 3
 python benchmarks/gallery.py street-sun RUN --depths --columns 2
+python benchmarks/gallery.py ditch RUN --water="-1.5 m,-1 m,-0.5 m" --columns 2
 
 Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
 smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
@@ -18,7 +19,8 @@ NAME-ground.jpg shows photos' cameras turned down by 15 degrees, clean and flood
 completed ground. With --before, NAME-before-after.jpg shows each weather in an earlier run and in
 this one; levels count from the datum of each. With --light, NAME-light.jpg shows the place in the
 light of the photos, under other skies, in fog and under snow. With --depths, NAME-snow.jpg shows
-2, 10 and 30 cm of snow in the light of the photos and under an overcast sky.
+2, 10 and 30 cm of snow in the light of the photos and under an overcast sky. With --water,
+NAME-water.jpg shows rising muddy water, then clear water at the highest of the levels.
 """
 
 import argparse
@@ -51,6 +53,7 @@ PAINT = np.zeros((256, 3), np.uint8)
 PAINT[:7] = [[128, 64, 128], [70, 70, 70], [107, 142, 35], [152, 251, 152], [70, 130, 180],
              [220, 20, 60], [0, 0, 142]]  # fmt: skip
 TURN = -np.radians(15.0)  # of a camera about its x axis, downwards
+CLEAR = "6 m"  # Secchi depth of a clear lake
 GALLERY = Path(__file__).resolve().parents[1] / "docs" / "gallery"
 
 
@@ -88,6 +91,14 @@ def depths(run: Path, options: argparse.Namespace) -> Rows:
     for depth in ("2 cm", "10 cm", "30 cm"):
         flags[depth] = ["--snow.depth", depth]
         flags[f"{depth}, overcast"] = ["--snow.depth", depth, "--sky.kind", "overcast"]
+    return along_path(run, options, flags)
+
+
+def water(run: Path, options: argparse.Namespace) -> Rows:
+    """Render frames along the path as muddy water rises, then with clear water."""
+    levels = [level.strip() for level in options.water.split(",")]
+    flags = {level: [f"--flood.level={level}"] for level in levels}
+    flags["clear"] = [f"--flood.level={levels[-1]}", "--flood.clarity", CLEAR]
     return along_path(run, options, flags)
 
 
@@ -204,6 +215,7 @@ def main() -> None:
     kinds.add_argument("--ground", action="store_true")
     kinds.add_argument("--light", action="store_true")
     kinds.add_argument("--depths", action="store_true")
+    kinds.add_argument("--water", metavar="LEVELS", help="such as '20 cm,50 cm'")
     kinds.add_argument("--before", type=Path, metavar="RUN", help="an earlier run")
     options = parser.parse_args()
     name = options.name
@@ -217,13 +229,15 @@ def main() -> None:
         name, rows = f"{name}-light", light(options.run, options)
     elif options.depths:
         name, rows = f"{name}-snow", depths(options.run, options)
+    elif options.water:
+        name, rows = f"{name}-water", water(options.run, options)
     elif options.before:
         name += "-before-after"
         rows = before_after(options.before, options.run, options)
     else:
         rows = weathers(options.run, options)
-    wide = options.ground or options.before or options.light or options.depths
-    width = 480 if wide else 320
+    wide = ("ground", "before", "light", "depths", "water")
+    width = 480 if any(vars(options)[kind] for kind in wide) else 320
     sheet = contact_sheet(rows, options.columns, cell_width=width)
     path = options.out / f"{name}.jpg"
     size = write_jpeg(path, sheet, max_bytes=150_000)

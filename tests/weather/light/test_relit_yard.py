@@ -134,7 +134,7 @@ def test_light_that_stays_is_bit_identical():
     world = clean.world(0.0)
     assert world.field is field and world.light is None
     assert "_found" not in clean._entities["sky"].__dict__
-    flooded = session(field, flood={"level": "0.2 m"})
+    flooded = session(field, flood={"level": "0.2 m", "wet-band": "0 m"})
     world = flooded.world(0.0)
     assert world.field is field and world.light is not None
     camera, pose = scene.cameras[0].resized(40, 25), scene.c2w_world(scene.views[0])

@@ -36,6 +36,8 @@ from climatenerf.weather.world import (
 SKIN = 2e-3  # secondary rays begin this far from the water, m
 PARTS = 8  # of a pixel, with a reflected ray each
 SHARP = 1e8  # gloss from which on still water is a mirror
+ENTRIES = 12  # places at which light enters the water that leaves it at one
+MAX_REACH = 1.0  # m; clear water scatters too little to matter
 MIN_BOTTOM = 1.0 / 2048  # transmittance below which no bottom is traced: under an 8-bit step
 
 
@@ -206,8 +208,7 @@ class Water:
         # From below, the mean over slopes lets a little light through even where the visible facet
         # reflects all of it.
         reflectance = torch.where(total, torch.ones_like(reflectance), reflectance)
-        irradiance = self.irradiance_at(world, x)
-        body = optics.body_colour(self.flood, irradiance)
+        body = optics.body_colour(self.flood, self._scattered_irradiance(world, x))
         shaded = optics.shade(reflected, reflectance, background, passed, body)
         return shaded, normal, {"water_depth": depth}
 
@@ -232,6 +233,19 @@ class Water:
         up = torch.zeros_like(x)
         up[:, 2] = 1.0
         return world.light.irradiance(x, up)
+
+    def _scattered_irradiance(self, world: World, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Irradiance that the water's body shows at positions x (m).
+
+        Light leaves scattering water about an attenuation length from where it entered, which
+        softens the edges of a hard sun's shadow.
+        """
+        if world.light is None or world.light.beam() is None:
+            return self.irradiance_at(world, x)
+        reach = min(1 / max(optics.attenuation(self.flood)[1], 1e-3), MAX_REACH)
+        offset = x.new_tensor(_disc(ENTRIES) * reach)
+        spread = x[:, None].expand(-1, ENTRIES, 3) + offset
+        return self.irradiance_at(world, spread.reshape(-1, 3)).view(-1, ENTRIES, 3).mean(1)
 
     def _other_side(
         self,
@@ -368,6 +382,13 @@ def check_level(level: float, top: float) -> None:
             f"--flood.level {level:g} m is above the whole scene, whose top is {top:.1f} m"
             " over its ground; give a lower level"
         )
+
+
+def _disc(count: int) -> Float[np.ndarray, "k 3"]:
+    """Points spread evenly over the horizontal unit disc (Vogel's spiral)."""
+    k = np.arange(count)
+    radius, angle = np.sqrt((k + 0.5) / count), k * np.pi * (3 - np.sqrt(5))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * k], axis=-1)
 
 
 def _field_normal(

@@ -1,0 +1,69 @@
+"""Flood water as a surface: how its body is lit."""
+
+import math
+
+import pytest
+import torch
+
+from climatenerf.field.analytic import AnalyticField, HalfSpace
+from climatenerf.render.integrator import trace
+from climatenerf.weather.flood import optics
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.flood.surface import Water
+from climatenerf.weather.flood.waves import at_time, make_waves
+from climatenerf.weather.world import World
+
+
+class HalfShaded:
+    """A black sky and a hard sun that shines where x > 0."""
+
+    def __init__(self, hard: bool):
+        self.hard = hard
+
+    def irradiance(self, x, normal, diffuse=None):
+        return math.pi * (x[:, :1] > 0).float().expand(-1, 3)
+
+    def open_irradiance(self):
+        return torch.full((3,), math.pi)
+
+    def reflected_sky(self, d, sky):
+        return torch.zeros_like(sky)
+
+    def sun_elevation(self):
+        return None
+
+    def beam(self):
+        return (torch.tensor([0.0, 0.0, 1.0]), self.open_irradiance()) if self.hard else None
+
+
+def mud_across_the_edge(hard: bool, clarity: float) -> torch.Tensor:
+    """Radiance of windless, deep, muddy water, seen from straight above, along x."""
+    flood = Flood(level=1.0, wind_speed=0.0, clarity=clarity, colour=(1.0, 1.0, 1.0))
+    light = HalfShaded(hard)
+    water = Water(flood, 1.0, at_time(make_waves(flood, 0), 0.0), light.open_irradiance())
+    ground = AnalyticField([HalfSpace(colour=(0.0,) * 3)], zenith=(0.0,) * 3, horizon=(0.0,) * 3)
+    x = torch.linspace(-0.6, 0.6, 241)
+    o = torch.stack([x, torch.zeros_like(x), torch.full_like(x, 2.0)], dim=-1)
+    d = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(x), 3).contiguous()
+    world = World(ground, surfaces=(water,), light=light)  # pyright: ignore[reportArgumentType]
+    return trace(world, o, d, torch.full((len(x),), 1e-3)).rgb[:, 1]
+
+
+@pytest.mark.parametrize("clarity", [0.05, 0.3])
+def test_mud_softens_the_edge_of_a_hard_shadow_over_its_attenuation_length(clarity):
+    seen = mud_across_the_edge(True, clarity)
+    reach = 1 / optics.attenuation(Flood(clarity=clarity))[1]
+    x = torch.linspace(-0.6, 0.6, 241)
+    full = float(seen[-1])
+    assert full == pytest.approx(1 - 0.0204, abs=5e-3)
+    assert float(seen[0]) < 1e-3
+    assert (seen.diff() > -1e-5).all()
+    partial = x[(seen > 0.05 * full) & (seen < 0.95 * full)].abs()
+    assert 0.6 * reach < partial.max() < reach
+    assert float(seen[120]) == pytest.approx(full / 2, abs=0.1)
+
+
+def test_only_a_hard_sun_costs_more_than_one_look_at_the_light():
+    seen = mud_across_the_edge(False, 0.3)
+    assert set((seen > 0.5).tolist()) == {False, True}
+    assert ((seen < 1e-3) | (seen > 0.97)).all()
