@@ -162,3 +162,13 @@ def test_maps_may_hold_a_single_tile(sea):
     assert torch.isfinite(
         first_hits(first, LEVEL, o, d, above(100), torch.full((100,), 1e-3)).t
     ).all()
+
+
+@FAST
+def test_descending_rays_reach_the_sea_whatever_its_waves(find):
+    """Waves of a gale are metres high; rays stay between crest and trough for longer than REACH."""
+    gale = at_time(make_waves(Flood(wind_speed=40.0, fetch=1e6, depth=100.0), 0, 64), 0.0)
+    o, d = rays(500, seed=5, height=LEVEL + 12.0, steepest=0.02)
+    found = find(gale, LEVEL, o, d, above(500), torch.full((500,), 1e-3))
+    assert torch.isfinite(found.t).all() and (found.t > 0).all()
+    assert (found.t > wave_tracing.REACH).any()

@@ -404,7 +404,7 @@ def test_radiance_of_muddy_water_is_proportional_to_irradiance():
         waves = at_time(make_waves(flood, 0), 0.0)
         water = Water(flood, 0.0, waves, torch.full((3,), math.pi * light))
         radiance.append(trace(World(black, surfaces=(water,)), o, d, torch.full((1,), 1e-3)).rgb[0])
-    albedo = ((torch.tensor(flood.colour) + 0.055) / 1.055) ** 2.4
+    albedo = ((torch.tensor([0.488, 0.406, 0.32]) + 0.055) / 1.055) ** 2.4
     assert torch.allclose(radiance[0] * 2, radiance[1], rtol=1e-4)
     assert torch.allclose(radiance[1], albedo * (1 - 0.0204), rtol=0.01)
 

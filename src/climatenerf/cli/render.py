@@ -106,6 +106,8 @@ def run(
     weather = combine(film, flags, given, used)
     for name, absent in without_effect(weather, given, used).items():
         progress.warn(f"--{name} changes nothing without {absent}")
+    for name in weather.frozen(used):
+        progress.warn(f"{name} keeps one value for the whole movie; its keyframes are ignored")
 
     from climatenerf.api import load_run, render_movie
     from climatenerf.output.render_folder import SIDECAR

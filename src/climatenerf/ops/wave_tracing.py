@@ -19,7 +19,7 @@ from climatenerf.ops import dispatch
 STEPS = 16  # along a ray's way through the layer, at most
 STEP = 0.5  # pixels
 REFINED = 4  # iterations of regula falsi (Illinois)
-REACH = 50.0  # m along rays that do not leave the layer
+REACH = 50.0  # m through the layer of the waves; beyond, rays meet the mean surface
 NEAR = 3.0  # m; an eye among the waves sees those of this distance sharply
 FLAT = 1e-5  # m; lower waves do not move the surface
 GRAZING = 1e-4  # of a direction's z: pixels on the water stay finite
@@ -167,8 +167,9 @@ def _first_hits(
         high, f_high_new = torch.where(under, t, high), torch.where(under, f, f_high * 0.5)
         low, f_low_new = torch.where(under, low, t), torch.where(under, f_low * 0.5, f)
         f_low, f_high = f_low_new, f_high_new
-    t = torch.where(level_surface, flat, high)
-    missed = none | (~level_surface & ~met)
+    far = ~met & falls & (end < torch.maximum(first, last)) & (flat > end)
+    t = torch.where(level_surface | far, flat, high)
+    missed = none | (~level_surface & ~met & ~far)
     x = rays_o[:, :2] + t[:, None] * rays_d[:, :2]
     _, slope, variance = surface(maps, torch.where(missed[:, None], 0.0, x), footprint)
     return WaveHits(

@@ -206,6 +206,6 @@ def _arrive(
     for surface in surfaces:
         within = surface.inside(o)
         if bool(within.any()):
-            through = surface.attenuate(radiance, o, d, t)
+            through = surface.attenuate(world, radiance, o, d, t)
             arriving = torch.where(within[:, None], through, arriving)
     return arriving

@@ -40,6 +40,12 @@ class KeyframedWeather:
     base: Weather
     keyframes: Mapping[str, Keyframes]
 
+    def frozen(self, effects: Sequence[Effect]) -> list[str]:
+        """Keyframed values that effects read once for a movie."""
+        once = {name for effect in effects for name in effect.prepared_from
+                if name.startswith(f"{effect.name}.")}  # fmt: skip
+        return sorted(once & set(self.keyframes))
+
     def at(self, time: float) -> Weather:
         """The weather `time` seconds into the movie; the end values hold before and after."""
         weather = self.base

@@ -15,11 +15,12 @@ from climatenerf.core.layer_table import FRAME_LAYERS, ON_DEMAND, RESERVED_NAMES
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.flood.parameters import FLOOD
 from climatenerf.weather.light.parameters import SKY, SUN
+from climatenerf.weather.season.parameters import SEASON
 from climatenerf.weather.smog.parameters import SMOG
 from climatenerf.weather.snow.parameters import SNOW
 from climatenerf.weather.units import Parameter
 
-EFFECTS: tuple[Effect, ...] = (SKY, SMOG, FLOOD, SNOW, SUN)
+EFFECTS: tuple[Effect, ...] = (SKY, SEASON, SMOG, FLOOD, SNOW, SUN)
 ENTRY_POINTS = "climatenerf.effects"
 MEAN_TRANSMITTANCE, COMPLETED_GROUND = "mean_transmittance", "completed_ground_fraction"
 FRAME_MEASURES = (MEAN_TRANSMITTANCE, COMPLETED_GROUND)

@@ -182,6 +182,7 @@ class Surface(Protocol):
 
     def attenuate(
         self,
+        world: "World",
         radiance: Float[Tensor, "n 3"],
         rays_o: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],

@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
 from support.holed_ground import GREY, LabelledField, terrain_of
 
 from climatenerf.core.classes import BUILDING, ROAD, VEGETATION
+from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import Box, HalfSpace
 from climatenerf.field.capabilities import COMPLETES
 from climatenerf.render.completed_ground import CompletedField
@@ -120,8 +122,8 @@ def test_a_film_darkens_what_lies_low_over_the_water():
     d = torch.tensor([[0.0, 1.0, 0.0]]).expand(len(x), 3)
     dry, wet = wall.colour(x, d), field.colour(x, d)
     ratio = (wet / dry)[:, 0].tolist()
-    assert ratio[0] == ratio[-1] == 1, "what is under water is darkened by the water's own optics"
-    assert ratio[1:3] == pytest.approx([0.61, 0.61], abs=0.01)
+    assert ratio[-1] == 1
+    assert ratio[:3] == pytest.approx([0.61] * 3, abs=0.01), "wet in a trough, too"
     assert ratio[2] < ratio[3] < ratio[4] < 1, "it dries upwards"
     torch.testing.assert_close(wet[:, 2], dry[:, 2], atol=2e-3, rtol=0)
 
@@ -138,3 +140,49 @@ def test_the_band_reaches_over_the_crests_and_can_be_left_out():
             assert isinstance(world.field, WetField)
             assert world.field.band == pytest.approx(band + waves.significant_height / 2)
             assert (wind == 0) == (world.field.band == pytest.approx(0.03))
+
+
+def test_holes_in_dry_ground_are_wet_as_the_ground_around():
+    """The terrain lies in the wet band, the field's ground below the water."""
+    flood = Flood(level=LEVEL, wind_speed=0.0)
+    entity = FloodEntity(make_waves(flood, 0), E, 0.0, 3.0)
+    seen = []
+    for height in (LEVEL + 0.01, LEVEL + 0.2):
+        field = scenery(height=height)
+        world = entity.place(World(field), Weather(flood=flood), 0.0)
+        assert float(seen_at(world, [(0.0, 0.0)]).layers["mask_water"]) < 1e-3
+        seen.append(
+            seen_at(world, [(0.0, 0.0)]).rgb[0] / seen_at(World(field), [(0.0, 0.0)]).rgb[0]
+        )
+    assert float(seen[0].max()) < 0.75
+    torch.testing.assert_close(seen[1], torch.ones(3), atol=5e-3, rtol=0)
+
+
+def test_rays_under_water_see_the_field_without_the_film():
+    """A clear bed is darkened once: by the water's own optics."""
+    flood = Flood(level=LEVEL, wind_speed=0.0, attenuation=(0.0, 0.0, 0.0))
+    entity = FloodEntity(make_waves(flood, 0), E, 0.0, 3.0)
+    field = scenery()
+    with_band = entity.place(World(field), Weather(flood=flood), 0.0)
+    without = World(field, surfaces=with_band.surfaces)
+    for slant in (0.0, 0.4):
+        a, b = (seen_at(world, [(0.0, 0.0)], slant).rgb for world in (with_band, without))
+        torch.testing.assert_close(a, b)
+
+
+def test_shoals_darken_smoothly_with_their_height():
+    flood = {"attenuation": (6.0, 6.0, 6.0), "colour": (0.0, 0.0, 0.0)}
+    seen = []
+    for top in torch.arange(0.01, 0.12, 0.005).tolist():
+        world = World(scenery(top=top), surfaces=(water(**flood),))
+        seen.append(float(seen_at(world, [LUMP], slant=0.0).rgb[0, 1]))
+    assert max(abs(b - a) for a, b in pairwise(seen)) < 0.01
+
+
+def test_cameras_under_murky_water_are_refused():
+    flood = Flood(level=5.0, clarity=0.3)
+    entity = FloodEntity(make_waves(flood, 0), E, 0.0, 9.0, 1.6)
+    with pytest.raises(UserError, match="all cameras are under water"):
+        entity.check((Weather(flood=flood),))
+    for changed in (replace(flood, clarity=6.0), replace(flood, level=1.0)):
+        entity.check((Weather(flood=flood), Weather(flood=changed)))

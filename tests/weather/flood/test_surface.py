@@ -67,3 +67,27 @@ def test_only_a_hard_sun_costs_more_than_one_look_at_the_light():
     seen = mud_across_the_edge(False, 0.3)
     assert set((seen > 0.5).tolist()) == {False, True}
     assert ((seen < 1e-3) | (seen > 0.97)).all()
+
+
+def test_mud_does_not_jump_when_the_eye_goes_under_in_the_shade():
+    """Its light is that of the place on both sides of the surface."""
+    flood = Flood(level=1.0, wind_speed=0.0, clarity=0.05, colour=(1.0, 1.0, 1.0))
+    light = HalfShaded(True)
+    water = Water(flood, 1.0, at_time(make_waves(flood, 0), 0.0), light.open_irradiance())
+    ground = AnalyticField([HalfSpace(colour=(0.0,) * 3)], zenith=(0.0,) * 3, horizon=(0.0,) * 3)
+    world = World(ground, surfaces=(water,), light=light)  # pyright: ignore[reportArgumentType]
+    d, angle = torch.tensor([[0.0, 0.0, -1.0]]), torch.full((1,), 1e-3)
+    for x, bright in ((-3.0, 0.0), (3.0, 1.0)):
+        above, below = (trace(world, torch.tensor([[x, 0.0, 1.0 + h]]), d, angle).rgb[0, 1]
+                        for h in (0.01, -0.01))  # fmt: skip
+        assert float(above) == pytest.approx(bright * (1 - 0.0204), abs=0.01)
+        assert float(below) == pytest.approx(bright, abs=0.01)
+
+
+def test_clear_water_is_dark_and_blue_green_and_mud_is_brown():
+    mud, lake, sea = (optics.deep_colour(Flood(clarity=c)) for c in (0.3, 6.0, 100.0))
+    assert mud[0] > mud[1] > mud[2]
+    assert lake == sea and lake[2] > lake[1] > lake[0] and max(lake) < min(mud)
+    between = optics.deep_colour(Flood(clarity=1.3))
+    assert all(min(a, b) < c < max(a, b) for a, b, c in zip(mud, lake, between, strict=True))
+    assert optics.deep_colour(Flood(colour=(1.0, 0.0, 0.0))) == (1.0, 0.0, 0.0)

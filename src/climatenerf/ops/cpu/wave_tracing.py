@@ -119,8 +119,10 @@ def first_hits(tables, top, unresolved, level, rays, results):
                         break
                     low, f_low = t, f
                 if high < 0:
-                    continue
-                for _ in range(REFINED):
+                    if climb >= 0 or end >= max(first, last) or flat <= end:
+                        continue
+                    low = high = flat  # the mean surface, far away
+                for _ in range(REFINED if high > low else 0):
                     # 1e-12: equal heights at both ends, 0/0.
                     share = min(max(f_low / max(f_low - f_high, 1e-12), 0.0), 1.0)
                     t = low + share * (high - low)

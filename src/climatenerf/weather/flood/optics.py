@@ -28,6 +28,7 @@ _CLARITY = -math.log(0.02) / 2
 _MUD = (0.75, 0.95, 1.3)
 # Absorption of pure water, 1/m (Pope and Fry 1997, mean over the band of each sRGB primary).
 _PURE = (0.3, 0.06, 0.01)
+DEEP = ((0.3, (0.488, 0.406, 0.32)), (6.0, (0.1, 0.26, 0.3)))  # m of clarity, display sRGB
 _GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples spread evenly over columns
 _RETURNED_NODES = 10  # for each part of the hemisphere
 
@@ -357,7 +358,22 @@ def body_colour(flood: Flood, irradiance: Float[Tensor, "*n 3"]) -> Float[Tensor
         flood: colour of the water.
         irradiance: E on horizontal ground, linear, per channel.
     """
-    return irradiance.new_tensor(linear_colour(flood.colour)) * irradiance / math.pi
+    return irradiance.new_tensor(deep_colour(flood)) * irradiance / math.pi
+
+
+def deep_colour(flood: Flood) -> tuple[float, float, float]:
+    """Return the linear colour of deep water under a white sky: as asked, else by its clarity.
+
+    It goes from brown to blue-green and darkens as the water clears, as on the scale of Forel and
+    Ule; muddy and clear water are the ends of a mixture over the logarithm of the clarity.
+    """
+    if flood.colour is not None:
+        return linear_colour(flood.colour)
+    low, high = (math.log(clarity) for clarity, _ in DEEP)
+    mud, clear = (linear_colour(colour) for _, colour in DEEP)
+    part = min(max((math.log(flood.clarity) - low) / (high - low), 0.0), 1.0)
+    red, green, blue = (m + part * (c - m) for m, c in zip(mud, clear, strict=True))
+    return red, green, blue
 
 
 def shade(

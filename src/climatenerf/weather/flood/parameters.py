@@ -32,8 +32,8 @@ class Flood:
     """How waves spread about the wind. donelan-banner: longer crests, more alike."""
     wet_band: Annotated[float, quantity(LENGTH, 0.0, 10.0)] = 0.03
     """Height above the crests up to which ground and walls are wet. 0 m: dry at the waterline."""
-    colour: Annotated[tuple[float, float, float], triple(0.0, 1.0)] = (0.488, 0.406, 0.32)
-    """Colour of deep water under a white sky, display sRGB."""
+    colour: Annotated[tuple[float, float, float] | None, triple(0.0, 1.0, True)] = None
+    """Colour of deep water under a white sky, display sRGB. none: by the clarity."""
     clarity: Annotated[float, quantity(LENGTH, 0.01, 100.0)] = 0.3
     """Depth at which a white disc keeps 2 % of its contrast."""
     attenuation: Annotated[tuple[float, float, float] | None, triple(0.0, 1e3, True)] = None

@@ -15,7 +15,7 @@ from climatenerf.core.classes import GROUND, SOLID_OF
 from climatenerf.core.samples import MIN_WEIGHT
 from climatenerf.field.capabilities import CLASSES, COMPLETES
 from climatenerf.field.normals import normals_at
-from climatenerf.field.protocol import ground_height, observed
+from climatenerf.field.protocol import RadianceField, ground_height, observed
 from climatenerf.field.wrapped import WrappedField
 from climatenerf.weather.flood.optics import bottom_radiance
 from climatenerf.weather.world import RaySamples, World
@@ -78,11 +78,17 @@ def path_to_terrain(
     x = start + path[:, None] * rays_d
     ground = ground_height(world.field, x[:, :2])
     over = x[:, 2] - ground
-    lumps = ((over > EDGE) & (over < ROUGH)).nonzero()[:, 0]
+    lumps = ((over > EDGE / 2) & (over < ROUGH)).nonzero()[:, 0]
     _, kind = normals_at(world.field, x[lumps], rays_d[lumps])
     lumps = lumps[is_ground(kind)]
     descent = (-rays_d[lumps, 2]).clamp_min(1e-4)  # as above
-    return path.index_add(0, lumps, over[lumps] / descent)
+    over = over[lumps] * ((over[lumps] - EDGE / 2) / EDGE).clamp_max(1)
+    return path.index_add(0, lumps, over / descent)
+
+
+def without_film(field: RadianceField) -> RadianceField:
+    """The field as rays under water see it: their own optics make it wet."""
+    return field.field if isinstance(field, WetField) else field
 
 
 def is_ground(kind: Int[Tensor, "n"]) -> Bool[Tensor, "n"]:
@@ -95,7 +101,8 @@ class WetField(WrappedField):
     """A field (`field.protocol.RadianceField`) that is wet in a band above the water.
 
     A film of water darkens what it lies on, since part of the light stays in it (Lekner and Dorf
-    1988): `optics.bottom_radiance` under no depth of water. The film's own gloss is left out.
+    1988): `optics.bottom_radiance` under no depth of water. The film's own gloss is left out. What
+    lies lower is wet, too, as in the troughs of waves; rays under water see `without_film`.
 
     Attributes:
         level: world height of the water, m.
@@ -120,12 +127,17 @@ class WetField(WrappedField):
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance, darkened by a film of water near its level."""
         dry = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
-        height = (x[:, 2] - self.level) / self.band
-        wet = ((height > 0) & (height < 1)).nonzero()[:, 0]
+        z = x[:, 2]
+        holes = ((z < self.level) & (z > self.level - ROUGH)).nonzero()[:, 0]
+        if holes.numel():  # ground of a dry terrain, or under a trough: NaN compares False
+            ground = ground_height(self.field, x[holes, :2])
+            z = z.index_copy(0, holes, torch.where(ground > z[holes], ground, z[holes]))
+        height = (z - self.level) / self.band
+        wet = (height < 1).nonzero()[:, 0]
         if not wet.numel():
             return dry
         film = bottom_radiance(dry[wet], self.irradiance(x[wet]), self.ior)
-        wetness = ((1 - height[wet, None]) / DRYING).clamp_max(1)
+        wetness = ((1 - height[wet, None]) / DRYING).clamp(0, 1)
         return dry.index_copy(0, wet, dry[wet] + wetness * (film - dry[wet]))
 
     def observed_only(self) -> "WetField":

@@ -5,6 +5,7 @@ from the camera meet crests and troughs. Reflected and refracted rays begin on t
 the integrator, which hands itself over as `trace`, follows them through the whole world.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -35,6 +36,7 @@ from climatenerf.weather.world import (
 
 SKIN = 2e-3  # secondary rays begin this far from the water, m
 PARTS = 8  # of a pixel, with a reflected ray each
+EDGE_ON = 0.7  # cosine to ground over that to the water
 SHARP = 1e8  # gloss from which on still water is a mirror
 ENTRIES = 12  # places at which light enters the water that leaves it at one
 MAX_REACH = 1.0  # m; clear water scatters too little to matter
@@ -119,12 +121,19 @@ class Water:
         step = (2 * pixel_angle[rays] * t[rays]).clamp_min(0.02)
         normal = torch.zeros_like(rays_d)
         normal[:, 2] = 1.0
-        normal[rays] = _field_normal(world, x, step, rays_d[rays])
-        covered = 2 * optics.shore_coverage(*arguments, normal[of]) - 1
+        found = _field_normal(world, x, step, rays_d[rays])
+        # Rough ground that is met more edge-on than the water would hide itself.
+        facing = -(found * rays_d[rays]).sum(-1, keepdim=True)
+        rough = facing < EDGE_ON * rays_d[rays, 2:].abs()
+        normal[rays] = torch.where(rough, normal[rays], found)
+        moved = (lengths != along.samples.t)[near, None]
+        own = torch.where(moved, normal.new_tensor([0.0, 0.0, 1.0]), normal[of])
+        covered = 2 * optics.shore_coverage(*arguments, own) - 1
         return behind.index_copy(0, near, covered.clamp_min(0.0))
 
     def attenuate(
         self,
+        world: World,
         radiance: Float[Tensor, "n 3"],
         rays_o: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
@@ -133,13 +142,14 @@ class Water:
         """Radiance at ray length t (m) as it arrives at an eye under water, with a wet bed."""
         beta = torch.tensor(optics.attenuation(self.flood), device=rays_o.device)
         depth = self.level - rays_o[:, 2] - t.clamp_max(1e6) * rays_d[:, 2]
-        body = optics.body_colour(self.flood, self.irradiance)
+        eye = self._on_mean_surface(rays_o)
+        body = optics.body_colour(self.flood, self._scattered_irradiance(world, eye))
         # What lies no deeper than the troughs may be the surface itself.
         bed = ((depth > self.waves.crest() + SKIN) & t.isfinite())[:, None]
         thick = beta * depth.clamp(0, 1e6)[:, None]
-        wet = optics.bottom_radiance(
-            radiance, self.irradiance, self.flood.ior, optical_depth=thick, body=body
-        )
+        seen = self._on_mean_surface(rays_o + t.clamp_max(1e6)[:, None] * rays_d)
+        given = self.irradiance_at(world, seen), self.flood.ior
+        wet = optics.bottom_radiance(radiance, *given, optical_depth=thick, body=body)
         radiance = torch.where(bed, wet, radiance)
         light = optics.light_cosine(self.flood, self.sun_elevation)
         passed = optics.water_transmittance(beta, t, depth, light)
@@ -271,7 +281,7 @@ class Water:
             o, d = start[down], direction[down]
             # The bottom is seen directly, so its steps are those of camera rays.
             matter, transmittance, length = composited(
-                world.field,
+                shore.without_film(world.field),
                 o,
                 d,
                 torch.zeros_like(o[:, 0]),
@@ -307,12 +317,14 @@ class FloodEntity:
         irradiance: on level ground in the open, linear.
         ground_z: world height of the ground datum, m.
         top: height of the scene's top above the ground datum, m.
+        highest_eye: world height of the highest camera, m.
     """
 
     waves: Waves
     irradiance: Float[Tensor, "3"]
     ground_z: float
     top: float
+    highest_eye: float = math.inf
 
     def place(self, world: World, weather: Weather, time: float) -> World:
         """The world with the flood's surface in it."""
@@ -342,6 +354,14 @@ class FloodEntity:
         """Refuse levels above the whole scene; see `check_level`."""
         for moment in moments:
             check_level(moment.flood.level, self.top)
+        eye = self.highest_eye - self.ground_z
+        if moments and all(_blind(moment.flood, eye) for moment in moments):
+            flood = moments[0].flood
+            raise UserError(
+                f"all cameras are under water at --flood.level {flood.level:g} m (the highest is"
+                f" at {eye:.1f} m), deeper than its clarity of {flood.clarity:g} m lets them see;"
+                " give a lower level, or clearer water"
+            )
 
     def facts(self) -> dict[str, float]:
         """Height of the waves."""
@@ -359,7 +379,14 @@ def prepare(preparation: Preparation) -> FloodEntity:
     for moment in preparation.moments:
         check_level(moment.flood.level, top)
     waves = make_waves(first.flood, first.seed, device=device_of(preparation.field))
-    return FloodEntity(waves, preparation.irradiance(), scene.ground_z, top)
+    eye = float(preparation.camera_positions[:, 2].max())
+    return FloodEntity(waves, preparation.irradiance(), scene.ground_z, top, eye)
+
+
+def _blind(flood: Flood, eye: float) -> bool:
+    """Whether a camera so high above the ground datum (m) sees nothing but water."""
+    level = -math.inf if flood.level is None else flood.level
+    return flood.attenuation is None and level - eye > flood.clarity
 
 
 def scene_top(scene: Scene) -> float:

@@ -38,6 +38,7 @@ from climatenerf.weather.light.scene_light import (
 )
 from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.light.sun_map import SunMap, sun_map
+from climatenerf.weather.season.sky import sky_of, under_season
 from climatenerf.weather.smog.medium import sigma_of
 from climatenerf.weather.smog.scattering import sun_transmittance
 from climatenerf.weather.snow.cover import slope_share
@@ -166,8 +167,11 @@ class LightEntity:
     def place(self, world: World, weather: Weather, time: float) -> World:
         """The world in the light of the moment."""
         new_sky = weather.sky.kind != "captured"
+        seasonal = not new_sky and sky_of(weather.season) is not None  # the season's sky
         snow = weather.snow.depth or 0.0
-        if not (new_sky or snow > 0 or weather.flood.level is not None or _lit_smog(weather)):
+        if not (
+            new_sky or seasonal or snow > 0 or weather.flood.level is not None or _lit_smog(weather)
+        ):
             return world
         if self.captured is None:
             return world  # snow, water and smog are lit as in the open
@@ -175,18 +179,24 @@ class LightEntity:
         old = self._photographed(override)
         slab = float(slab_reflectance(torch.tensor(snow, device="cpu"), weather.snow.grain))
         cover = round(slab * COVER_STEPS) / COVER_STEPS
-        if not new_sky and cover == 0 and not (old.sun is not None and _lit_smog(weather)):
+        if (
+            not (new_sky or seasonal)
+            and cover == 0
+            and not (old.sun is not None and _lit_smog(weather))
+        ):
             return replace(world, light=old)
         white = _whiteness(weather) if cover else ()
         smog = weather.smog if _lit_smog(weather) else None
         slopes = weather.snow.slope, weather.snow.slope_sharpness
-        key = weather.sky, weather.sun, cover, white, slopes, smog
+        season = weather.season if seasonal else None
+        key = weather.sky, weather.sun, cover, white, slopes, smog, season
         if self._last is None or self._last[0] != key:
             new = self._new_light(weather, old, cover)
             brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
             self._last = key, new, brighter
         _, new, brighter = self._last
-        field = RelitField(world.field, old, new, new_sky, brighter, self._albedo(old))
+        shown = new_sky or seasonal
+        field = RelitField(world.field, old, new, shown, brighter, self._albedo(old))
         return replace(world, field=field, light=new)
 
     def _new_light(self, weather: Weather, old: SceneLight, cover: float) -> SceneLight:
@@ -194,7 +204,8 @@ class LightEntity:
         hidden = functools.partial(snow_cover, weather.snow, cover)
         surfaces = Surfaces(hidden, albedo) if cover else None
         if weather.sky.kind == "captured":
-            return relit(self._gathered, old, below_smog(weather, old), surfaces)
+            changed = under_season(weather.season, old)
+            return relit(self._gathered, old, below_smog(weather, changed), surfaces)
         sky = self._sky(weather)
         direct = torch.tensor(sky.sun_irradiance, device=device_of(self._given.field))
         shadow = self._sun_map(np.array(sky.sun)) if bool((direct > 0).any()) else None

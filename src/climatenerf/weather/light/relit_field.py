@@ -6,10 +6,10 @@ albedo. It is wrong for what is glossy, and for what photos clip.
 
 from dataclasses import dataclass, replace
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import observed
 from climatenerf.field.wrapped import WrappedField
@@ -52,7 +52,7 @@ class RelitField(WrappedField):
         colour = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
         if ray is None:
             return colour * self.ratio(colour, x, *normals_at(self.field, x, d))
-        middle, group = shared_lookups(x, d, ray)
+        middle, group = shared_lookups(x, d, ray, SHARED)
         place, along = x[middle], d[ray[middle]]
         ratio = self.ratio(colour[middle], place, *normals_at(self.field, place, along))
         return colour * ratio[group]
@@ -116,24 +116,3 @@ class RelitField(WrappedField):
     def observed_only(self) -> "RelitField":
         """The same, without density that no photo shows."""
         return replace(self, field=observed(self.field))
-
-
-def shared_lookups(
-    x: Float[Tensor, "s 3"], d: Float[Tensor, "n 3"], ray: Int[Tensor, "s"]
-) -> tuple[Int[Tensor, "g"], Int[Tensor, "s"]]:
-    """Group the samples of each ray that lie within `SHARED` of each other.
-
-    Args:
-        x: positions, sorted by ray and by depth.
-        d: unit directions of the rays.
-        ray: of each sample.
-
-    Returns:
-        The index of each group's middle sample, and the group of each sample.
-    """
-    cell = ((x * d[ray]).sum(-1) / SHARED).floor()
-    first = torch.ones_like(ray, dtype=torch.bool)
-    first[1:] = (cell[1:] != cell[:-1]) | (ray[1:] != ray[:-1])
-    start = first.nonzero()[:, 0]
-    end = torch.cat([start[1:], start.new_tensor([len(ray)])])
-    return (start + end - 1) // 2, first.cumsum(0) - 1

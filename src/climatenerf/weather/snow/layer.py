@@ -259,6 +259,8 @@ class SnowEntity:
         self._preparation = preparation
         self._baked = self._grown = None
         snowy = [moment for moment in preparation.moments if moment.snow.depth > 0]
+        if any(moment.snow.shadows and moment.snow.light != "paper" for moment in snowy):
+            raise UserError("--snow.shadows belongs to the paper's shading; add --snow.light paper")
         if snowy:
             self._bake(snowy[-1])
 
@@ -285,8 +287,6 @@ class SnowEntity:
     def _photographed_shadows(self, snow: Snow) -> Callable[[np.ndarray], np.ndarray] | None:
         if snow.shadows is None:
             return None
-        if snow.light != "paper":
-            raise UserError("--snow.shadows belongs to the paper's shading; add --snow.light paper")
         if self._preparation.photo_rays is None:
             raise UserError("--snow.shadows needs a field that knows its surfaces; leave it out")
         photos = self._preparation.photo_rays()
@@ -323,7 +323,19 @@ class SnowEntity:
         return replace(world, matters=(*world.matters, snow))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
-        """Any parameters fit any scene."""
+        """Refuse snow over the heads of all cameras.
+
+        Raises:
+            UserError: it is deeper than every camera is high, at all moments.
+        """
+        given = self._preparation
+        eye = float(given.camera_positions[:, 2].max()) - given.scene.ground_z
+        depths = [moment.snow.depth or 0.0 for moment in moments]
+        if depths and min(depths) > max(eye, 0.0):
+            raise UserError(
+                f"--snow.depth {min(depths):g} m buries all cameras, whose highest is {eye:.1f} m"
+                " above the ground; give a smaller depth"
+            )
 
     def facts(self) -> dict[str, float]:
         """None: thickness is a layer."""

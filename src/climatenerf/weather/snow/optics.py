@@ -14,7 +14,9 @@ from torch import Tensor
 from climatenerf.weather.snow.parameters import Snow
 
 ICE_DENSITY = 917.0  # kg/m3
-SNOW_DENSITY = 100.0  # kg/m3, of fresh dry snow
+FRESH_DENSITY, FRESH_GRAIN = 100.0, 1e-4  # kg/m3, of fresh dry snow; m, its grains
+SETTLING = 0.55  # power of the grain: wet snow with grains of 1 mm has some 350 kg/m3
+DENSITIES = (50.0, 500.0)  # kg/m3, of new snow and of old wet snow
 ABSORPTION_ENHANCEMENT = 1.6  # B of the grains
 ASYMMETRY = 0.845  # g of the grains
 ICE_ABSORPTION = (
@@ -51,6 +53,15 @@ def albedo_of(snow: Snow) -> Float[np.ndarray, "3"]:
     return deep_reflectance(snow.grain, 1e-9 * snow.soot)
 
 
+def density(grain: float) -> float:
+    """Return the density of snow in kg/m3: snow with coarse grains has settled.
+
+    Args:
+        grain: optical radius of the grains, m.
+    """
+    return float(np.clip(FRESH_DENSITY * (grain / FRESH_GRAIN) ** SETTLING, *DENSITIES))
+
+
 def slab_reflectance(thickness: Float[Tensor, "*n"], grain: float) -> Float[Tensor, "*n"]:
     """Reflectance of a slab of snow that absorbs nothing; what it does not reflect it lets through.
 
@@ -60,7 +71,7 @@ def slab_reflectance(thickness: Float[Tensor, "*n"], grain: float) -> Float[Tens
         thickness: m.
         grain: optical radius of the grains, m.
     """
-    per_metre = (1 - ASYMMETRY) * specific_surface(grain) * SNOW_DENSITY / 2
+    per_metre = (1 - ASYMMETRY) * specific_surface(grain) * density(grain) / 2
     scaled = 0.75 * per_metre * thickness.clamp_min(0)
     return scaled / (1 + scaled)
 

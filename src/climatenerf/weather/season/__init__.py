@@ -1,0 +1,1 @@
+"""Seasons: the colours of plants and lawns, and the sky above them."""

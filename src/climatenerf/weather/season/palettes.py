@@ -1,0 +1,125 @@
+"""The colours of seasons, read from small text files. Does not import torch."""
+
+import functools
+import math
+import tomllib
+from dataclasses import dataclass, fields
+from importlib import resources
+from typing import Any
+
+from climatenerf.core.errors import UserError
+from climatenerf.core.srgb import LUMA
+
+SEASONS = ("autumn", "winter", "drought", "wildfire")
+MAX_COLOURS = 16
+Colour = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ClassPalette:
+    """How one class of surfaces changes its colour."""
+
+    palette: tuple[Colour, ...]
+    """Linear RGB of luminance 1; neighbours blend into each other from place to place."""
+    strength: float
+    """Fraction of the change that is made, 0 to 1."""
+    brightness: float
+    """New over old luminance, 0 to 4."""
+    gate: float
+    """Fraction of the change on what is not green, 0 to 1; green changes wholly."""
+
+
+@dataclass(frozen=True)
+class SkyPalette:
+    """The sky of a season."""
+
+    colour: Colour
+    """Linear RGB of luminance 1."""
+    gradient: float
+    """Luminance of the zenith over that of the horizon, less 1; -1 to 4."""
+    share: float
+    """Fraction of the photographed sky, its sun included, that is replaced, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Palettes:
+    """All colours of a season; classes that are None stay as they are."""
+
+    vegetation: ClassPalette | None = None
+    terrain: ClassPalette | None = None
+    sky: SkyPalette | None = None
+    note: str = ""
+
+
+RANGES = {"strength": (0, 1), "brightness": (0, 4), "gate": (0, 1), "gradient": (-1, 4),
+          "share": (0, 1)}  # fmt: skip
+
+
+@functools.cache
+def palettes_of(season: str) -> Palettes:
+    """The colours of a season that comes with the program."""
+    file = resources.files("climatenerf") / "assets" / "seasons" / f"{season}.toml"
+    return read_palettes(tomllib.loads(file.read_text("utf-8")), f"the season {season}")
+
+
+def read_palettes(table: dict[str, Any], where: str) -> Palettes:
+    """Check the tables of a season file.
+
+    Args:
+        table: its content.
+        where: name of the file, for errors.
+
+    Raises:
+        UserError: a key is unknown or missing, or a value is no number of its range.
+    """
+    known = {"vegetation": ClassPalette, "terrain": ClassPalette, "sky": SkyPalette}
+    unknown = set(table) - set(known) - {"note"}
+    if unknown:
+        raise UserError(
+            f"{where} has the unknown key {min(unknown)!r}; it may have"
+            f" {', '.join([*known, 'note'])}"
+        )
+    note = table.get("note", "")
+    if not isinstance(note, str):
+        raise UserError(f"the note of {where} must be a text")
+    parts = {name: _section(table[name], kind, f"[{name}] of {where}")
+             for name, kind in known.items() if name in table}  # fmt: skip
+    return Palettes(note=note, **parts)
+
+
+def _section(table: Any, kind: type, where: str) -> Any:
+    names = {item.name for item in fields(kind)}
+    if not isinstance(table, dict) or set(table) != names:
+        given = sorted(table) if isinstance(table, dict) else table
+        raise UserError(f"{where} must have exactly {', '.join(sorted(names))}; it has {given}")
+    values: dict[str, Any] = {}
+    for name, value in table.items():
+        if name == "colour":
+            values[name] = _colour(value, where)
+        elif name == "palette":
+            if not isinstance(value, list) or not 1 <= len(value) <= MAX_COLOURS:
+                raise UserError(f"the palette in {where} must be 1 to {MAX_COLOURS} colours")
+            values[name] = tuple(_colour(each, where) for each in value)
+        else:
+            low, high = RANGES[name]
+            if not _is_number(value) or not low <= value <= high:
+                raise UserError(f"{name} in {where} must be a number from {low} to {high}")
+            values[name] = float(value)
+    return kind(**values)
+
+
+def _colour(value: Any, where: str) -> Colour:
+    """Three numbers, scaled to a luminance of 1."""
+    if not (isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))):
+        raise UserError(f"each colour in {where} must be three numbers, such as [1.1, 1.0, 0.9]")
+    luminance = sum(a * b for a, b in zip(value, LUMA, strict=True))
+    if min(value) < 0 or luminance <= 0:
+        raise UserError(
+            f"the colour {value} in {where} must have no negative part and not be black"
+        )
+    red, green, blue = (float(part / luminance) for part in value)
+    return red, green, blue
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

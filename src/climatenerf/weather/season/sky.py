@@ -1,0 +1,42 @@
+"""The sky of a season: part of the photographed sky, and of its sun, gives way to it."""
+
+import math
+from dataclasses import replace
+
+from jaxtyping import Float
+from torch import Tensor
+
+from climatenerf.core.colour import luma
+from climatenerf.weather.light.scene_light import SceneLight
+from climatenerf.weather.season.palettes import SkyPalette, palettes_of
+from climatenerf.weather.season.parameters import Season
+
+
+def sky_of(season: Season) -> SkyPalette | None:
+    """The sky that a season brings; None if it leaves that of the photos."""
+    if season.kind == "captured" or season.strength == 0:
+        return None
+    return palettes_of(season.kind).sky
+
+
+def under_season(season: Season, light: SceneLight) -> SceneLight:
+    """The light of the photos under the season's sky; what surfaces send back is still the old.
+
+    L'(d) = (1 - u) L(d) + u l a (1 + g z), with the sky's share u, colour a, gradient g and the
+    height z of the direction. Its level l keeps the luminance of open ground, as a camera would.
+    """
+    palette = sky_of(season)
+    if palette is None:
+        return light
+    share = palette.share * season.strength
+    # Integral of (1 + g z) z over the upper hemisphere.
+    whole = math.pi * (1 + palette.gradient * 2 / 3)
+    level = float(luma(light.open_irradiance())) / whole
+    colour = light.sun_irradiance.new_tensor(palette.colour) * level
+
+    def radiance(d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        height = d[:, 2:].clamp_min(0)
+        return (1 - share) * light.radiance(d) + share * colour * (1 + palette.gradient * height)
+
+    beam = (1 - share) * light.sun_irradiance
+    return replace(light, radiance=radiance, sun_irradiance=beam, captured=None)

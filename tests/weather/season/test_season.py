@@ -1,0 +1,268 @@
+"""Seasons: recolouring of radiance, the palettes of files, and fields in other colours."""
+
+import math
+import tomllib
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+import pytest
+import torch
+from support.holed_ground import LabelledField
+from support.sunlit_yard import sunlit_yard, yard_scene
+
+from climatenerf.core.classes import BUILDING, SOLID_OF, TERRAIN, VEGETATION
+from climatenerf.core.colour import luma
+from climatenerf.core.errors import UserError
+from climatenerf.field.analytic import Box, HalfSpace
+from climatenerf.render.session import RenderSession
+from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.season import recolouring as r
+from climatenerf.weather.season.entity import SeasonEntity
+from climatenerf.weather.season.palettes import SEASONS, palettes_of, read_palettes
+from climatenerf.weather.season.parameters import Season
+from climatenerf.weather.season.styled_field import ClassColours, StyledField
+from climatenerf.weather.weather import Weather
+
+
+def session(field, **table):
+    return RenderSession(field, yard_scene(), weather_from_table(table))
+
+
+LEAF = (0.10, 0.16, 0.03)
+
+
+def colours(n=500, seed=0):
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) ** 2
+
+
+def autumn(c, share=0.85):
+    palette = torch.tensor(palettes_of("autumn").vegetation.palette)[:1]
+    mean = torch.tensor([LEAF]) / luma(torch.tensor(LEAF))
+    gate = (share * r.green(c))[:, None]
+    return r.recoloured(c, gate, palette.expand(len(c), 1, 3), mean, torch.tensor([1.1]))
+
+
+# --- recolouring ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("exposure", [0.1, 0.5, 4.0])
+def test_recolouring_follows_the_exposure_and_keeps_black(exposure):
+    c = colours()
+    torch.testing.assert_close(autumn(exposure * c), exposure * autumn(c), rtol=1e-4, atol=1e-6)
+    assert (autumn(torch.zeros(1, 3)) == 0).all()
+
+
+def test_green_is_told_by_hue_and_saturation():
+    named = torch.tensor([LEAF, (0.05, 0.2, 0.05), (0.3, 0.3, 0.3), (0.4, 0.1, 0.05),
+                          (0.1, 0.2, 0.5), (0.5, 0.25, 0.1)])  # fmt: skip
+    found = r.green(named).tolist()
+    assert min(found[:2]) > 0.9, "leaves, grass"
+    assert max(found[2:]) < 0.05, "grey, brick, sky, rust"
+
+
+def test_strength_nought_changes_nothing_and_one_takes_the_palette():
+    c = torch.tensor([LEAF])
+    assert torch.equal(autumn(c, 0.0), c)
+    new = autumn(c, 1.0)
+    assert float(luma(new)) == pytest.approx(1.1 * float(luma(c)), rel=0.02)
+    assert new[0, 0] > 1.5 * new[0, 1] > 3 * new[0, 2], "orange"
+
+
+def test_differences_between_leaves_stay():
+    c = torch.tensor([LEAF]) * torch.tensor([[1.0, 1.0, 1.0], [1.3, 1.0, 0.8]])
+    new = autumn(c, 1.0)
+    assert float((new[1] / luma(new[1:]) - new[0] / luma(new[:1])).abs().max()) > 0.02
+
+
+def test_the_mottle_is_even_periodic_smooth_and_seeded():
+    table = r.mottle(3)
+    assert torch.equal(table, r.mottle(3)) and not torch.equal(table, r.mottle(4))
+    inner = table[:-1, :-1, :-1]
+    histogram = torch.histc(inner, 10, 0, 1) / inner.numel()
+    assert (histogram - 0.1).abs().max() < 0.01
+    assert torch.equal(table[0], table[-1]) and torch.equal(table[:, :, 0], table[:, :, -1])
+    x = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * 300 - 150
+    at = r.mottled(table, x, 4.0)
+    period = 4.0 * r.PATCHES
+    torch.testing.assert_close(r.mottled(table, x + period, 4.0), at, atol=2e-3, rtol=0)
+    assert (r.mottled(table, x + 0.01, 4.0) - at).abs().max() < 0.05
+    far = r.mottled(table, x + torch.tensor([6.0, 0.0, 0.0]), 4.0)
+    assert abs(np.corrcoef(at, far)[0, 1]) < 0.3
+
+
+def test_palettes_blend_between_their_colours():
+    palette = torch.tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    found = r.palette_at(torch.tensor([0.0, 0.25, 0.5, 1.0]), palette)
+    expected = [[1.0, 0, 0], [0.5, 0.5, 0], [0, 1.0, 0], [0, 0, 1.0]]
+    torch.testing.assert_close(found, torch.tensor(expected))
+    one = r.palette_at(torch.tensor([0.0, 1.0]), palette[:1])
+    assert torch.equal(one, palette[:1].expand(2, 3))
+
+
+# --- season files ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("season", SEASONS)
+def test_each_season_has_a_small_file_of_colours_of_luminance_one(season):
+    file = resources.files("climatenerf") / "assets" / "seasons" / f"{season}.toml"
+    assert len(file.read_text("utf-8")) < 2000
+    palettes = palettes_of(season)
+    assert palettes.vegetation is not None and palettes.terrain is not None and palettes.note
+    every = [*palettes.vegetation.palette, *palettes.terrain.palette]
+    every += [palettes.sky.colour] if palettes.sky else []
+    assert luma(torch.tensor(every)).tolist() == pytest.approx([1.0] * len(every))
+
+
+GOOD = """
+[sky]
+colour = [1.0, 1.0, 1.0]
+gradient = 0.0
+share = 0.5
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[leaves]\npalette = []", "'leaves'"),
+        (GOOD.replace("share = 0.5", ""), "exactly"),
+        (GOOD.replace("0.5", "1.5"), "share .* from 0 to 1"),
+        (GOOD.replace("[1.0, 1.0, 1.0]", "[1.0, 1.0]"), "three numbers"),
+        (GOOD.replace("[1.0, 1.0, 1.0]", "[0, 0, 0]"), "not be black"),
+        (GOOD.replace("[1.0, 1.0, 1.0]", "[nan, 1.0, 1.0]"), "three numbers"),
+        ("note = 3", "text"),
+    ],
+)
+def test_wrong_season_files_are_one_sentence(text, named):
+    assert read_palettes(tomllib.loads(GOOD), "a.toml").sky is not None
+    with pytest.raises(UserError, match=named) as error:
+        read_palettes(tomllib.loads(text), "a.toml")
+    assert "a.toml" in str(error.value) and "\n" not in str(error.value)
+
+
+# --- a field in other colours ---------------------------------------------------------------------
+
+
+def garden():
+    """A lawn, a hedge and a green wall: the wall is no plant."""
+    hedge = Box((-3.0, 1.0, 0.0), (0.0, 2.0, 2.0), LEAF)
+    wall = Box((0.0, 1.0, 0.0), (3.0, 2.0, 2.0), LEAF)
+    solids = [HalfSpace(colour=LEAF), hedge, wall]
+    return LabelledField(solids, classes=[TERRAIN, VEGETATION, BUILDING])
+
+
+def styled(inner, kind="autumn", white=(1.0, 1.0, 1.0)):
+    mean = torch.tensor(LEAF) / luma(torch.tensor(LEAF))
+    palettes = palettes_of(kind)
+    classes = tuple(
+        ClassColours(
+            int(SOLID_OF[k]), torch.tensor(p.palette), mean, p.strength, p.brightness, p.gate
+        )
+        for k, p in ((VEGETATION, palettes.vegetation), (TERRAIN, palettes.terrain))
+    )
+    return StyledField(inner, classes, 4.0, r.mottle(0), torch.tensor(white))
+
+
+def look(field, places):
+    """Colours of surfaces at places, by rays along +y that begin a metre before."""
+    x = torch.tensor(places)
+    d = torch.tensor([[0.0, 1.0, 0.0]]).expand(len(x), 3).contiguous()
+    return field.colour(x, d, torch.arange(len(x)))
+
+
+def test_hedges_turn_and_walls_of_the_same_colour_do_not():
+    field = garden()
+    places = [(-1.0, 1.0, 1.0), (1.0, 1.0, 1.0)]
+    before, after = look(field, places), look(styled(field), places)
+    assert (after[0] - before[0]).abs().max() > 0.03
+    assert (after[1] - before[1]).abs().max() < 0.5 / 255
+    grey = look(styled(field, "winter"), places)[0]
+    assert float(grey.max() / grey.min()) < 1.6 < float(before[0].max() / before[0].min())
+
+
+def test_shapes_normals_and_classes_are_those_of_the_field():
+    field = garden()
+    other = styled(field)
+    o, d = torch.tensor([[-1.0, -2.0, 1.0]]), torch.tensor([[0.0, 1.0, 0.0]])
+    a, b = (f.march(o, d, torch.zeros(1), torch.full((1,), 9.0)) for f in (field, other))
+    assert torch.equal(a.t, b.t) and torch.equal(a.sigma, b.sigma)
+    chosen = torch.arange(len(a.t))
+    for one, two in zip(field.surface_heads(o, d, a, chosen), other.surface_heads(o, d, b, chosen),
+                        strict=True):  # fmt: skip
+        assert torch.equal(one, two)
+    x = torch.rand(50, 3) * 2
+    assert torch.equal(field.density(x), other.density(x))
+    assert torch.equal(field.sky(d), other.sky(d))
+
+
+def test_a_place_has_one_colour_from_wherever_it_is_seen():
+    field = styled(garden())
+    x = torch.tensor([[-1.0, 1.0, 1.0]]).expand(2, 3)
+    d = torch.nn.functional.normalize(torch.tensor([[0.0, 1.0, 0.0], [0.6, 0.8, -0.3]]), dim=-1)
+    a, b = field.colour(x, d, torch.arange(2))
+    torch.testing.assert_close(a, b)
+
+
+def test_hues_are_judged_without_the_light_that_falls_on_them():
+    """Leaves under an orange dusk are leaves still."""
+    dusk = (1.6, 0.9, 0.5)
+    lit = torch.tensor(LEAF) * torch.tensor(dusk)
+    hedge = Box((-3.0, 1.0, 0.0), (0.0, 2.0, 2.0), tuple(lit.tolist()))
+    inner = LabelledField([HalfSpace(colour=LEAF), hedge], classes=[TERRAIN, VEGETATION])
+    place = [(-1.0, 1.0, 1.0)]
+    expected = look(styled(garden()), place) * torch.tensor(dusk)
+    torch.testing.assert_close(look(styled(inner, white=dusk), place), expected)
+
+
+# --- a scene --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def yard():
+    return sunlit_yard(), yard_scene()
+
+
+def test_seasons_without_classes_are_refused():
+    given = type("Given", (), {"field": replace(garden(), capabilities=frozenset())})()
+    entity = SeasonEntity(given)
+    entity.check((Weather(),))
+    with pytest.raises(UserError, match="plants from walls"):
+        entity.check((Weather(season=Season(kind="winter")),))
+
+
+def test_a_season_of_no_strength_is_the_clean_picture(yard):
+    field, scene = yard
+    camera, pose = scene.cameras[0].resized(40, 25), scene.c2w_world(scene.views[0])
+    clean = session(field).frame(camera, pose)
+    for season in ({"kind": "winter", "strength": 0}, {"kind": "captured"}):
+        seen = session(field, season=season).frame(camera, pose)
+        np.testing.assert_array_equal(seen.linear, clean.linear)
+
+
+def test_a_grey_sky_takes_the_hard_sun_and_keeps_the_light_in_the_open(yard):
+    field, _ = yard
+    old = session(field, flood={"level": "-9 m"}).world(0.0).light
+    new = session(field, season={"kind": "winter"}).world(0.0).light
+    share = palettes_of("winter").sky.share
+    before, after = old.open_irradiance(), new.open_irradiance()
+    assert float(luma(after) / luma(before)) == pytest.approx(1, abs=0.02)
+    torch.testing.assert_close(new.sun_irradiance, (1 - share) * old.sun_irradiance)
+    d = torch.nn.functional.normalize(torch.tensor([[0.3, 0.1, 0.4], [-0.5, 0.3, 0.9]]), dim=-1)
+    grey = session(field, season={"kind": "winter"}).world(0.0).field.sky(d)
+    torch.testing.assert_close(grey, new.radiance(d))
+    # The photos' sky has its share still; another kind of sky wins over the season's.
+    level = float(luma(before)) / (math.pi * (1 + 0.2 * 2 / 3))
+    colour = torch.tensor(palettes_of("winter").sky.colour) * level * (1 + 0.2 * d[:, 2:])
+    torch.testing.assert_close(grey, (1 - share) * old.radiance(d) + share * colour)
+    overcast = session(field, season={"kind": "winter"}, sky={"kind": "overcast"}).world(0.0)
+    plain = session(field, sky={"kind": "overcast"}).world(0.0)
+    torch.testing.assert_close(overcast.light.radiance(d), plain.light.radiance(d))
+
+
+def test_floods_mirror_the_season(yard):
+    """Water is placed on the styled field."""
+    field, _ = yard
+    world = session(field, season={"kind": "autumn"}, flood={"level": "0.2 m"}).world(0.0)
+    assert isinstance(world.field.field, StyledField)
+    assert len(world.field.field.classes) == 2
