@@ -17,6 +17,7 @@ from climatenerf.weather.description import (
     weather_to_table,
 )
 from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.registry import EFFECTS
 from climatenerf.weather.smog.parameters import Smog
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
@@ -148,3 +149,10 @@ def test_a_word_in_keyframes_holds_until_the_next():
     assert kinds == ["captured", "captured", "overcast", "overcast"]
     with pytest.raises(UserError, match="must be one of captured, overcast"):
         weather_from_table({"sky": {"kind": {"0 s": "sunny"}}})
+
+
+def test_keyframes_of_what_a_movie_reads_once_are_named():
+    keys = {"0 s": "2 m/s", "3 s": "6 m/s"}
+    levels = {"0 s": "0 m", "3 s": "1 m"}
+    film = weather_from_table({"flood": {"level": levels, "wind-speed": keys}})
+    assert film.frozen(EFFECTS) == ["flood.wind_speed"]

@@ -177,7 +177,7 @@ def test_snow_and_mud_receive_the_light_of_their_place(snowy):
     muddy = session(field, flood={"level": "0.1 m", "clarity": "5 cm", "wind-speed": "0 m/s"})
     world = muddy.world(0.0)
     (water,) = world.surfaces
-    received = water._irradiance_at(world, places)
+    received = water.irradiance_at(world, places)
     assert float(received[1, 0] / received[0, 0]) < 0.75
 
 

@@ -11,11 +11,13 @@ from support.analytic_fields import AnalyticField, Box, HalfSpace, ground, table
 from support.holed_ground import LabelledField
 
 from climatenerf.core.classes import BUILDING, ROAD
+from climatenerf.core.errors import UserError
 from climatenerf.weather.snow.fall_rays import fall_directions
 from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
-from climatenerf.weather.snow.layer import bake_snow
+from climatenerf.weather.snow.layer import SnowEntity, bake_snow
 from climatenerf.weather.snow.optics import albedo_of
 from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.weather import Weather
 
 CAMERAS = np.array([[0.0, 0.0, 1.6]])
 WHITE = np.ones(3)
@@ -443,3 +445,14 @@ def test_progress_increases_to_one():
     bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=GRID, progress=seen.append)
     assert seen[-1] == pytest.approx(1)
     assert all(np.diff(seen) > 0)
+
+
+def test_snow_over_the_heads_of_all_cameras_is_refused():
+    eyes = np.array([[0.0, 0.0, 1.5], [3.0, 0.0, 2.6]])
+    scene = type("Scene", (), {"ground_z": 1.0})()
+    given = type("Given", (), {"moments": (), "camera_positions": eyes, "scene": scene})()
+    entity = SnowEntity(given)
+    thin, deep = (Weather(snow=Snow(depth=depth)) for depth in (0.2, 1.8))
+    with pytest.raises(UserError, match="buries all cameras"):
+        entity.check((deep,))
+    entity.check((thin, deep))

@@ -2,12 +2,12 @@
 
 import functools
 import math
-import tomllib
 from dataclasses import dataclass, fields
 from importlib import resources
 from typing import Any
 
 from climatenerf.core.errors import UserError
+from climatenerf.core.parsing import read_toml
 from climatenerf.core.srgb import LUMA
 
 SEASONS = ("autumn", "winter", "drought", "wildfire")
@@ -59,7 +59,8 @@ RANGES = {"strength": (0, 1), "brightness": (0, 4), "gate": (0, 1), "gradient": 
 def palettes_of(season: str) -> Palettes:
     """The colours of a season that comes with the program."""
     file = resources.files("climatenerf") / "assets" / "seasons" / f"{season}.toml"
-    return read_palettes(tomllib.loads(file.read_text("utf-8")), f"the season {season}")
+    with resources.as_file(file) as path:
+        return read_palettes(read_toml(path, "the season file"), f"the season {season}")
 
 
 def read_palettes(table: dict[str, Any], where: str) -> Palettes:

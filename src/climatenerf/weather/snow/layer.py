@@ -331,7 +331,7 @@ class SnowEntity:
         given = self._preparation
         eye = float(given.camera_positions[:, 2].max()) - given.scene.ground_z
         depths = [moment.snow.depth or 0.0 for moment in moments]
-        if depths and min(depths) > max(eye, 0.0):
+        if depths and eye > 0 and min(depths) > eye:
             raise UserError(
                 f"--snow.depth {min(depths):g} m buries all cameras, whose highest is {eye:.1f} m"
                 " above the ground; give a smaller depth"
