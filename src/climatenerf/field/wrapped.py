@@ -1,6 +1,8 @@
 """A field around another one: it answers as the inner field does, but for what is overridden."""
 
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Self
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -8,7 +10,7 @@ from torch import Tensor
 from climatenerf.core.samples import Samples
 from climatenerf.field.capabilities import FUSED
 from climatenerf.field.compositing import composited
-from climatenerf.field.protocol import RadianceField, ground_height
+from climatenerf.field.protocol import RadianceField, ground_height, observed
 
 
 @dataclass(frozen=True)
@@ -108,3 +110,43 @@ class WrappedField:
     def photo_appearance(self, index: int) -> Float[Tensor, "1 e"]:
         """Appearance of a training photo."""
         return self.field.photo_appearance(index)
+
+
+@dataclass(frozen=True)
+class RecolouredField(WrappedField, ABC):
+    """A field whose colours are changed from sample to sample; all else is the inner field's."""
+
+    @abstractmethod
+    def recoloured(
+        self,
+        colour: Float[Tensor, "s 3"],
+        x: Float[Tensor, "s 3"],
+        d: Float[Tensor, "n 3"],
+        ray: Int[Tensor, "s"] | None,
+    ) -> Float[Tensor, "s 3"]:
+        """Change linear radiance.
+
+        Args:
+            colour: of the samples in the inner field.
+            x: positions, world m.
+            d: unit directions of the rays.
+            ray: of each sample; None: one sample a ray.
+        """
+        ...
+
+    def colour(
+        self,
+        x: Float[Tensor, "s 3"],
+        d: Float[Tensor, "n 3"],
+        ray: Int[Tensor, "s"] | None = None,
+        *,
+        ids: Int[Tensor, "s"] | None = None,
+        appearance: Float[Tensor, "1 e"] | None = None,
+    ) -> Float[Tensor, "s 3"]:
+        """Linear radiance, changed by `recoloured`."""
+        colour = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
+        return self.recoloured(colour, x, d, ray)
+
+    def observed_only(self) -> Self:
+        """The same, without density that no photo shows."""
+        return replace(self, field=observed(self.field))

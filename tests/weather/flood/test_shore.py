@@ -117,12 +117,14 @@ def test_a_film_darkens_what_lies_low_over_the_water():
     wall = LabelledField(
         [Box((-1.0, 0.0, -1.0), (1.0, 1.0, 3.0), (0.24, 0.24, 0.8))], classes=[BUILDING]
     )
-    field = WetField(wall, LEVEL, 0.1, 1.333, lambda x: E.expand(len(x), 3))
-    x = torch.tensor([[0.0, 0.0, LEVEL + h] for h in (-0.05, 0.01, 0.05, 0.075, 0.099, 0.11)])
+    field = WetField(wall, LEVEL, 0.1, 0.06, 1.333, lambda x: E.expand(len(x), 3))
+    x = torch.tensor(
+        [[0.0, 0.0, LEVEL + h] for h in (-0.05, 0.01, 0.05, 0.075, 0.099, 0.11, -0.07)]
+    )
     d = torch.tensor([[0.0, 1.0, 0.0]]).expand(len(x), 3)
     dry, wet = wall.colour(x, d), field.colour(x, d)
     ratio = (wet / dry)[:, 0].tolist()
-    assert ratio[-1] == 1
+    assert ratio[-2:] == [1, 1], "what lies deeper is left to the water's own optics"
     assert ratio[:3] == pytest.approx([0.61] * 3, abs=0.01), "wet in a trough, too"
     assert ratio[2] < ratio[3] < ratio[4] < 1, "it dries upwards"
     torch.testing.assert_close(wet[:, 2], dry[:, 2], atol=2e-3, rtol=0)
@@ -186,3 +188,18 @@ def test_cameras_under_murky_water_are_refused():
         entity.check((Weather(flood=flood),))
     for changed in (replace(flood, clarity=6.0), replace(flood, level=1.0)):
         entity.check((Weather(flood=flood), Weather(flood=changed)))
+
+
+@pytest.mark.parametrize("wind", [0.0, 2.0])
+def test_an_eye_under_water_sees_the_bed_as_without_the_band(wind):
+    """The water's optics make the bed wet; a film on top would darken it twice."""
+    flood = Flood(level=LEVEL, wind_speed=wind, attenuation=(0.0, 0.0, 0.0))
+    entity = FloodEntity(make_waves(flood, 0), E, 0.0, 3.0)
+    field = scenery()
+    with_band = entity.place(World(field), Weather(flood=flood), 0.0)
+    o, d = torch.tensor([[0.0, 0.0, 0.15]]), torch.tensor([[0.0, 0.6, -0.8]])
+    a, b = (
+        trace(World(each, surfaces=with_band.surfaces), o, d, torch.full((1,), 1e-3)).rgb
+        for each in (with_band.field, field)
+    )
+    torch.testing.assert_close(a, b)

@@ -5,7 +5,7 @@ the field decides what is seen. World frame, metres, z up.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,8 +15,8 @@ from climatenerf.core.classes import GROUND, SOLID_OF
 from climatenerf.core.samples import MIN_WEIGHT
 from climatenerf.field.capabilities import CLASSES, COMPLETES
 from climatenerf.field.normals import normals_at
-from climatenerf.field.protocol import RadianceField, ground_height, observed
-from climatenerf.field.wrapped import WrappedField
+from climatenerf.field.protocol import RadianceField, ground_height
+from climatenerf.field.wrapped import RecolouredField
 from climatenerf.weather.flood.optics import bottom_radiance
 from climatenerf.weather.world import RaySamples, World
 
@@ -97,49 +97,46 @@ def is_ground(kind: Int[Tensor, "n"]) -> Bool[Tensor, "n"]:
 
 
 @dataclass(frozen=True)
-class WetField(WrappedField):
+class WetField(RecolouredField):
     """A field (`field.protocol.RadianceField`) that is wet in a band above the water.
 
     A film of water darkens what it lies on, since part of the light stays in it (Lekner and Dorf
-    1988): `optics.bottom_radiance` under no depth of water. The film's own gloss is left out. What
-    lies lower is wet, too, as in the troughs of waves; rays under water see `without_film`.
+    1988): `optics.bottom_radiance` under no depth of water. The film's own gloss is left out.
+    Ground in the troughs of waves is wet, too. What lies deeper is left to the water's own optics,
+    and so is all that refracted rays meet: they see `without_film`.
 
     Attributes:
         level: world height of the water, m.
         band: height over it up to which all is wet or dries, m.
+        trough: depth below it that waves can bare, m.
         ior: refractive index of the water.
         irradiance: at positions (world m), linear.
     """
 
     level: float
     band: float
+    trough: float
     ior: float
     irradiance: Callable[[Float[Tensor, "k 3"]], Float[Tensor, "k 3"]]
 
-    def colour(
+    def recoloured(
         self,
+        colour: Float[Tensor, "s 3"],
         x: Float[Tensor, "s 3"],
         d: Float[Tensor, "n 3"],
-        ray: Int[Tensor, "s"] | None = None,
-        *,
-        ids: Int[Tensor, "s"] | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
+        ray: Int[Tensor, "s"] | None,
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance, darkened by a film of water near its level."""
-        dry = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
         z = x[:, 2]
         holes = ((z < self.level) & (z > self.level - ROUGH)).nonzero()[:, 0]
         if holes.numel():  # ground of a dry terrain, or under a trough: NaN compares False
             ground = ground_height(self.field, x[holes, :2])
             z = z.index_copy(0, holes, torch.where(ground > z[holes], ground, z[holes]))
         height = (z - self.level) / self.band
-        wet = (height < 1).nonzero()[:, 0]
+        wet = ((height < 1) & (z > self.level - self.trough)).nonzero()[:, 0]
         if not wet.numel():
-            return dry
-        film = bottom_radiance(dry[wet], self.irradiance(x[wet]), self.ior)
+            return colour
+        dry = colour[wet]
+        film = bottom_radiance(dry, self.irradiance(x[wet]), self.ior)
         wetness = ((1 - height[wet, None]) / DRYING).clamp(0, 1)
-        return dry.index_copy(0, wet, dry[wet] + wetness * (film - dry[wet]))
-
-    def observed_only(self) -> "WetField":
-        """The same, without density that no photo shows."""
-        return replace(self, field=observed(self.field))
+        return colour.index_copy(0, wet, dry + wetness * (film - dry))

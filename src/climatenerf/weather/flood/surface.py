@@ -347,7 +347,8 @@ class FloodEntity:
             # Crests wet what lies within two deviations of the waves' height.
             band = self.waves.significant_height / 2 + weather.flood.wet_band
             at = partial(water.irradiance_at, world)
-            field = shore.WetField(field, water.level, band, weather.flood.ior, at)
+            trough = water.waves.crest()
+            field = shore.WetField(field, water.level, band, trough, weather.flood.ior, at)
         return replace(world, field=field, surfaces=(*world.surfaces, water))
 
     def check(self, moments: tuple[Weather, ...]) -> None:

@@ -4,15 +4,14 @@ Diffuse surfaces send light in proportion to the light that they receive, so the
 albedo. It is wrong for what is glossy, and for what photos clip.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.normals import normals_at
-from climatenerf.field.protocol import observed
-from climatenerf.field.wrapped import WrappedField
+from climatenerf.field.wrapped import RecolouredField
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
 from climatenerf.weather.light.scene_light import MOST, SceneLight
 
@@ -20,7 +19,7 @@ SHARED = 0.4  # m along a ray, within which samples share the change of their li
 
 
 @dataclass(frozen=True)
-class RelitField(WrappedField):
+class RelitField(RecolouredField):
     """A field (`field.protocol.RadianceField`) under another light.
 
     Attributes:
@@ -39,17 +38,14 @@ class RelitField(WrappedField):
     brighter: float = 1.0
     albedo: ReferenceAlbedo | None = None
 
-    def colour(
+    def recoloured(
         self,
+        colour: Float[Tensor, "s 3"],
         x: Float[Tensor, "s 3"],
         d: Float[Tensor, "n 3"],
-        ray: Int[Tensor, "s"] | None = None,
-        *,
-        ids: Int[Tensor, "s"] | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
+        ray: Int[Tensor, "s"] | None,
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance under the new light."""
-        colour = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
         if ray is None:
             return colour * self.ratio(colour, x, *normals_at(self.field, x, d))
         middle, group = shared_lookups(x, d, ray, SHARED)
@@ -112,7 +108,3 @@ class RelitField(WrappedField):
     ) -> Float[Tensor, "n 3"]:
         """Linear radiance of the sky."""
         return self.new.radiance(d) if self.new_sky else self.field.sky(d, appearance)
-
-    def observed_only(self) -> "RelitField":
-        """The same, without density that no photo shows."""
-        return replace(self, field=observed(self.field))

@@ -1,6 +1,6 @@
 """A field in the colours of another season. Its shapes, normals, classes and depth stay."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -8,8 +8,7 @@ from torch import Tensor
 
 from climatenerf.core.samples import Samples
 from climatenerf.field.grouping import shared_lookups
-from climatenerf.field.protocol import observed
-from climatenerf.field.wrapped import WrappedField
+from climatenerf.field.wrapped import RecolouredField
 from climatenerf.weather.season import recolouring
 
 SHARED = 0.3  # m along a ray, within which samples share their class
@@ -37,7 +36,7 @@ class ClassColours:
 
 
 @dataclass(frozen=True)
-class StyledField(WrappedField):
+class StyledField(RecolouredField):
     """A field (`field.protocol.RadianceField`) with the colours of another season.
 
     Attributes:
@@ -52,17 +51,14 @@ class StyledField(WrappedField):
     mottle: Float[Tensor, "z y x"]
     white: Float[Tensor, "3"]
 
-    def colour(
+    def recoloured(
         self,
+        colour: Float[Tensor, "s 3"],
         x: Float[Tensor, "s 3"],
         d: Float[Tensor, "n 3"],
-        ray: Int[Tensor, "s"] | None = None,
-        *,
-        ids: Int[Tensor, "s"] | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
+        ray: Int[Tensor, "s"] | None,
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance in the season's colours."""
-        colour = self.field.colour(x, d, ray, ids=ids, appearance=appearance)
         if not self.classes or not x.shape[0]:
             return colour
         photographed = colour / self.white
@@ -95,7 +91,3 @@ class StyledField(WrappedField):
         _, logits = self.field.surface_heads(x[middle], along, samples, index[:-1])
         probability = logits.softmax(-1)[:, [each.index for each in self.classes]]
         return (probability * probability.new_tensor([c.strength for c in self.classes]))[group]
-
-    def observed_only(self) -> "StyledField":
-        """The same, without density that no photo shows."""
-        return replace(self, field=observed(self.field))
