@@ -161,15 +161,17 @@ def test_holes_in_dry_ground_are_wet_as_the_ground_around():
 
 
 def test_rays_under_water_see_the_field_without_the_film():
-    """A clear bed is darkened once: by the water's own optics."""
-    flood = Flood(level=LEVEL, wind_speed=0.0, attenuation=(0.0, 0.0, 0.0))
-    entity = FloodEntity(make_waves(flood, 0), E, 0.0, 3.0)
+    """A clear bed is darkened once: by the water's own optics, also where troughs come near it."""
     field = scenery()
-    with_band = entity.place(World(field), Weather(flood=flood), 0.0)
-    without = World(field, surfaces=with_band.surfaces)
-    for slant in (0.0, 0.4):
-        a, b = (seen_at(world, [(0.0, 0.0)], slant).rgb for world in (with_band, without))
-        torch.testing.assert_close(a, b)
+    for level, wind in ((LEVEL, 0.0), (4e-3, 2.0)):
+        flood = Flood(level=level, wind_speed=wind, attenuation=(0.0, 0.0, 0.0))
+        entity = FloodEntity(make_waves(flood, 0), E, 0.0, 3.0)
+        with_band = entity.place(World(field), Weather(flood=flood), 0.0)
+        without = World(field, surfaces=with_band.surfaces)
+        for slant in (0.0, 0.4):
+            a, b = (seen_at(world, [(0.0, 0.0)], slant) for world in (with_band, without))
+            assert float(a.layers["mask_water"]) > 0.99
+            torch.testing.assert_close(a.rgb, b.rgb)
 
 
 def test_shoals_darken_smoothly_with_their_height():
