@@ -181,6 +181,19 @@ def test_hedges_turn_and_walls_of_the_same_colour_do_not():
     assert float(grey.max() / grey.min()) < 1.6 < float(before[0].max() / before[0].min())
 
 
+def test_a_red_maple_keeps_its_colour_in_autumn_and_in_winter_turns_less_than_a_hedge():
+    red = (0.2, 0.04, 0.03)
+    maple = Box((-3.0, 1.0, 0.0), (0.0, 2.0, 2.0), red)
+    inner = LabelledField([HalfSpace(colour=LEAF), maple], classes=[TERRAIN, VEGETATION])
+    place = [(-1.0, 1.0, 1.0)]
+    torch.testing.assert_close(look(styled(inner), place), torch.tensor([red]), atol=1e-4, rtol=0)
+    kept = palettes_of("winter").vegetation
+    share = kept.strength * kept.gate
+    winter = look(styled(inner, "winter"), place)
+    assert float(winter[0, 0] / winter[0, 2]) > 1.5
+    assert (winter - torch.tensor([red])).abs().max() > 0.1 * share * max(red)
+
+
 def test_shapes_normals_and_classes_are_those_of_the_field():
     field = garden()
     other = styled(field)

@@ -8,6 +8,7 @@ from climatenerf.weather.snow.optics import (
     ICE_DENSITY,
     albedo_of,
     deep_reflectance,
+    density,
     over_ground,
     slab_reflectance,
     specific_surface,
@@ -63,3 +64,14 @@ def test_a_given_albedo_replaces_grain_and_soot():
     dirty, clean = albedo_of(Snow(soot=1000.0)), albedo_of(Snow(soot=0.0))
     assert np.all(dirty < clean)
     assert 0.9 < albedo_of(Snow()).min() < albedo_of(Snow()).max() < 0.95
+
+
+def test_coarse_snow_has_settled():
+    """Fresh snow 100, wet snow with grains of a millimetre 300 to 400, never over 500 kg/m3."""
+    assert density(1e-4) == pytest.approx(100)
+    assert 300 < density(1e-3) < 400
+    assert (density(1e-5), density(2e-3)) == (50, 500)
+    # So 15 cm of it hide the ground better than as much ice as fresh snow has.
+    through = 1 - float(slab_reflectance(torch.tensor(0.15), 1e-3))
+    as_fresh = 1 - float(slab_reflectance(torch.tensor(0.15 * 100 / density(1e-3)), 1e-3))
+    assert through < 0.4 * as_fresh

@@ -21,7 +21,7 @@ from climatenerf.weather.flood.optics import bottom_radiance
 from climatenerf.weather.world import RaySamples, World
 
 ROUGH = 1.0  # m off the terrain, up to which matter of a ground class is ground
-EDGE = 0.05  # m about the water level, within which the terrain gives the waterline
+EDGE = 0.05  # m about the water level, within which ground or terrain may soften the waterline
 DRYING = 0.5  # fraction of the wet band over which it dries
 
 
@@ -54,7 +54,8 @@ def lengths_on_terrain(
     x = rays_o[ray[chosen]] + lengths[chosen, None] * rays_d[ray[chosen]]
     ground = ground_height(world.field, x[:, :2])  # NaN compares False
     other_side = (ground < level) != (x[:, 2] < level)
-    unsure = (other_side | ((ground - level).abs() < EDGE)) & ((ground - x[:, 2]).abs() < ROUGH)
+    nearby = torch.minimum((ground - level).abs(), (x[:, 2] - level).abs()) < EDGE
+    unsure = (other_side | nearby) & ((ground - x[:, 2]).abs() < ROUGH)
     chosen, x, ground = chosen[unsure], x[unsure], ground[unsure]
     if not chosen.numel():
         return lengths

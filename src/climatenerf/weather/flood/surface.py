@@ -36,7 +36,6 @@ from climatenerf.weather.world import (
 
 SKIN = 2e-3  # secondary rays begin this far from the water, m
 PARTS = 8  # of a pixel, with a reflected ray each
-EDGE_ON = 0.7  # cosine to ground over that to the water
 SHARP = 1e8  # gloss from which on still water is a mirror
 ENTRIES = 12  # places at which light enters the water that leaves it at one
 MAX_REACH = 1.0  # m; clear water scatters too little to matter
@@ -121,11 +120,7 @@ class Water:
         step = (2 * pixel_angle[rays] * t[rays]).clamp_min(0.02)
         normal = torch.zeros_like(rays_d)
         normal[:, 2] = 1.0
-        found = _field_normal(world, x, step, rays_d[rays])
-        # Rough ground that is met more edge-on than the water would hide itself.
-        facing = -(found * rays_d[rays]).sum(-1, keepdim=True)
-        rough = facing < EDGE_ON * rays_d[rays, 2:].abs()
-        normal[rays] = torch.where(rough, normal[rays], found)
+        normal[rays] = _field_normal(world, x, step, rays_d[rays])
         moved = (lengths != along.samples.t)[near, None]
         own = torch.where(moved, normal.new_tensor([0.0, 0.0, 1.0]), normal[of])
         covered = 2 * optics.shore_coverage(*arguments, own) - 1
