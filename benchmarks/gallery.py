@@ -10,6 +10,7 @@ python benchmarks/gallery.py street-hard RUN --before EARLIER --columns 2
 python benchmarks/gallery.py street-sun RUN --light --columns 3
 python benchmarks/gallery.py street-sun RUN --depths --columns 2
 python benchmarks/gallery.py ditch RUN --water="-1.5 m,-1 m,-0.5 m" --columns 2
+python benchmarks/gallery.py ditch RUN --seasons --level="-1 m" --columns 2
 
 Each sheet is a JPEG of at most 150 KB, marked as simulated. NAME.jpg has the rows clean, flood,
 smog, snow and all at once, and columns along the camera path. With --surfaces, NAME-surfaces.jpg
@@ -20,7 +21,8 @@ completed ground. With --before, NAME-before-after.jpg shows each weather in an 
 this one; levels count from the datum of each. With --light, NAME-light.jpg shows the place in the
 light of the photos, under other skies, in fog and under snow. With --depths, NAME-snow.jpg shows
 2, 10 and 30 cm of snow in the light of the photos and under an overcast sky. With --water,
-NAME-water.jpg shows rising muddy water, then clear water at the highest of the levels.
+NAME-water.jpg shows rising muddy water, then clear water at the highest of the levels. With
+--seasons, NAME-seasons.jpg shows the place in each season, flooded in autumn and snowy in winter.
 """
 
 import argparse
@@ -44,6 +46,7 @@ from climatenerf.studies.ablation import depth_picture, normal_picture
 from climatenerf.training.folder import OPTIMISER
 from climatenerf.training.transients import MASK_THRESHOLD, TransientMasks
 from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.season.palettes import SEASONS
 from climatenerf.weather.units import LENGTH, parse_quantity
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import World
@@ -99,6 +102,14 @@ def water(run: Path, options: argparse.Namespace) -> Rows:
     levels = [level.strip() for level in options.water.split(",")]
     flags = {level: [f"--flood.level={level}"] for level in levels}
     flags["clear"] = [f"--flood.level={levels[-1]}", "--flood.clarity", CLEAR]
+    return along_path(run, options, flags)
+
+
+def seasons(run: Path, options: argparse.Namespace) -> Rows:
+    """Render frames along the path in each season, and two of them in weather."""
+    flags = {season: ["--season.kind", season] for season in ("captured", *SEASONS)}
+    flags["autumn, flood"] = [*flags["autumn"], f"--flood.level={options.level}"]
+    flags["winter, snow"] = [*flags["winter"], "--snow.depth", options.snow]
     return along_path(run, options, flags)
 
 
@@ -216,6 +227,7 @@ def main() -> None:
     kinds.add_argument("--light", action="store_true")
     kinds.add_argument("--depths", action="store_true")
     kinds.add_argument("--water", metavar="LEVELS", help="such as '20 cm,50 cm'")
+    kinds.add_argument("--seasons", action="store_true")
     kinds.add_argument("--before", type=Path, metavar="RUN", help="an earlier run")
     options = parser.parse_args()
     name = options.name
@@ -231,12 +243,14 @@ def main() -> None:
         name, rows = f"{name}-snow", depths(options.run, options)
     elif options.water:
         name, rows = f"{name}-water", water(options.run, options)
+    elif options.seasons:
+        name, rows = f"{name}-seasons", seasons(options.run, options)
     elif options.before:
         name += "-before-after"
         rows = before_after(options.before, options.run, options)
     else:
         rows = weathers(options.run, options)
-    wide = ("ground", "before", "light", "depths", "water")
+    wide = ("ground", "before", "light", "depths", "water", "seasons")
     width = 480 if any(vars(options)[kind] for kind in wide) else 320
     sheet = contact_sheet(rows, options.columns, cell_width=width)
     path = options.out / f"{name}.jpg"

@@ -25,10 +25,11 @@ MAY_IMPORT = {
     "output": BELOW_RENDER | {"render", "paths", "evaluation"},
     "verification": BELOW_RENDER | {"render"},
     "training": BELOW_TRAINING,
-    "studies": BELOW_STUDIES,
+    "styling": BELOW_STUDIES,
+    "studies": BELOW_STUDIES | {"styling"},
     "extend": BELOW_RENDER,
-    "api": BELOW_STUDIES | {"studies", "sfm", "perception"},
-    "cli": BELOW_STUDIES | {"studies", "sfm", "perception", "verification", "api"},
+    "api": BELOW_STUDIES | {"studies", "styling", "sfm", "perception"},
+    "cli": BELOW_STUDIES | {"studies", "styling", "sfm", "perception", "verification", "api"},
     "__main__": {"cli"},
 }
 

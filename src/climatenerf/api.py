@@ -29,6 +29,7 @@ from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, for_effects, read_weather
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects, layer_table
+from climatenerf.weather.season.style import Style
 from climatenerf.weather.weather import Weather
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ class Run:
         scene: The capture, in world metres with z up.
         digest: Hash of the files that both were read from; None takes that of the folder's files.
         checkpoint: Identity of the field's checkpoint; "" for runs of earlier versions.
+        style: New colours that `stylize` gave the run; None: those of the photos.
     """
 
     folder: Path
@@ -57,6 +59,7 @@ class Run:
     scene: Scene
     digest: str | None = None
     checkpoint: str = ""
+    style: Style | None = None
 
     def completed(self, progress: Progress | None = None) -> "Field | CompletedField":
         """Return the field with ground where no photo shows it.
@@ -219,6 +222,8 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
     from climatenerf.training.snapshot import CONFIG, FIELD, SCENE, identity_of, read_together
+    from climatenerf.weather.season.style import FILE_NAME as STYLE
+    from climatenerf.weather.season.style import style_in
 
     where = resolve_device(device)
     folder = Path(folder)
@@ -227,8 +232,10 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
         field = load_field(folder, where)
         check_config(paths[CONFIG].parent)
         scene = load_scene(paths[SCENE])
-        digest = hash_of_files([paths[FIELD], paths[SCENE]])
-        return Run(folder, field, scene, digest, identity_of(paths[FIELD]) or "")
+        style = style_in(folder)
+        about = [paths[FIELD], paths[SCENE], *([folder / STYLE] if style else [])]
+        identity = identity_of(paths[FIELD]) or ""
+        return Run(folder, field, scene, hash_of_files(about), identity, style)
 
     return read_together(folder, read)
 
@@ -334,7 +341,8 @@ def render_movie(
         from climatenerf.weather.world import Kept
 
         field = run.completed(progress) if complete_ground else run.field
-        return jobs.frame_source(job, field, run.scene, progress, Kept(run.folder, job.run))
+        kept = Kept(run.folder, job.run)
+        return jobs.frame_source(job, field, run.scene, progress, kept, run.style)
 
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)

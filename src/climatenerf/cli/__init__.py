@@ -55,6 +55,7 @@ VERBS = {
     "check": Verb("climatenerf.cli.check", "Check", "check that the parts of a capture agree"),
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
+    "stylize": Verb("climatenerf.cli.stylize", "Stylize", "give a run the colours of a season"),
     "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),
     "verify": Verb("climatenerf.cli.verify", "Verify", "check the physics of this installation"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),

@@ -42,6 +42,8 @@ from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import COMPLETED_GROUND, EFFECTS, MEAN_TRANSMITTANCE, layer_table
+from climatenerf.weather.season.style import FILE_NAME as STYLE
+from climatenerf.weather.season.style import Style
 
 if TYPE_CHECKING:
     from climatenerf.field.protocol import RadianceField
@@ -263,12 +265,13 @@ def appearance_index(name: str, scene: Scene) -> int | None:
 
 
 def hash_of_run(run: Path) -> str:
-    """Return the hash of a run's field and scene.
+    """Return the hash of a run's field and scene, and of its style if it has one.
 
     Raises:
-        UserError: the run lacks one of them.
+        UserError: the run lacks field or scene.
     """
-    return hash_of_files([run / name for name in ("field.safetensors", "scene.json")])
+    style = [run / STYLE] if (run / STYLE).is_file() else []
+    return hash_of_files([run / "field.safetensors", run / "scene.json", *style])
 
 
 def frames_of_part(job: RenderJob, part: tuple[int, int] | None = None) -> range:
@@ -436,6 +439,7 @@ def frame_source(
     scene: Scene,
     progress: Progress | None = None,
     kept: "Kept | None" = None,
+    style: Style | None = None,
 ) -> FrameSource:
     """Prepare light, waves and snow for a job, and return what renders its frames.
 
@@ -445,6 +449,7 @@ def frame_source(
         scene: the capture of its run.
         progress: called with what is being prepared and the fraction that is done.
         kept: the run folder, where what is found in the field is kept; None: nowhere.
+        style: new colours of the scene; None: those of the photos.
 
     Raises:
         UserError: the weather does not fit the scene.
@@ -459,7 +464,7 @@ def frame_source(
     times = np.array([job.time(index) for index in range(len(job))])
     positions = job.path.c2w[:, :3, 3]
     session = RenderSession(
-        field, scene, job.weather, positions, times, appearance, progress, job.effects, kept
+        field, scene, job.weather, positions, times, appearance, progress, job.effects, kept, style
     )
 
     def render(index: int, preview: Preview | None) -> RenderedFrame:

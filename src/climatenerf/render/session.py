@@ -23,6 +23,7 @@ from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, for_effects
 from climatenerf.weather.effect import Effect, Entity
 from climatenerf.weather.registry import check_effects, in_order, installed_effects, layer_table
+from climatenerf.weather.season.style import Style
 from climatenerf.weather.weather import Weather, check
 from climatenerf.weather.world import Kept, Preparation, World
 
@@ -61,6 +62,7 @@ class RenderSession:
         progress: Callable[[str, float], None] | None = None,
         effects: Sequence[Effect] | None = None,
         kept: Kept | None = None,
+        style: Style | None = None,
     ):
         """Prepare everything that is computed once: light, waves, snowfall.
 
@@ -76,6 +78,7 @@ class RenderSession:
             effects: the effects to render with; None takes the installed ones. A section of the
                 weather that has values of its own needs its effect among them.
             kept: the run folder, where what is found in the field is kept; None: nowhere.
+            style: new colours of the scene, see `climatenerf stylize`; None: those of the photos.
 
         Raises:
             UserError: a value out of its range, a level above the whole scene, effects that clash,
@@ -94,6 +97,7 @@ class RenderSession:
         self._appearance = appearance
         self._progress = progress or (lambda what, fraction: None)
         self._kept = kept
+        self._style = style
         self._photos: list[PhotoRays] | None = None
         self._light: Float[Tensor, 3] | None = None
         self._keys: dict[str, Key] = {}
@@ -202,6 +206,7 @@ class RenderSession:
             self._progress,
             self._photo_rays if self.field.capabilities & {NORMALS, CLASSES} else None,
             self._kept,
+            self._style,
         )
 
     def _photo_rays(self) -> list[PhotoRays]:

@@ -20,6 +20,7 @@ from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import RadianceField
 from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
+from climatenerf.weather.season.style import Style
 from climatenerf.weather.weather import Weather
 
 SKY_OPACITY = 0.5  # rays whose sky weighs more have no surface
@@ -346,6 +347,7 @@ class Preparation:
         photo_rays: gives where the rays of the photos end on the field; None for a field that has
             neither normals nor classes.
         kept: where to keep what was found; None: nowhere.
+        style: new colours of the scene, of the run; None: those of the photos.
     """
 
     field: RadianceField
@@ -357,3 +359,4 @@ class Preparation:
     progress: Callable[[str, float], None]
     photo_rays: Callable[[], list[PhotoRays]] | None = None
     kept: Kept | None = None
+    style: Style | None = None

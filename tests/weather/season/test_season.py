@@ -21,6 +21,7 @@ from climatenerf.weather.season import recolouring as r
 from climatenerf.weather.season.entity import SeasonEntity
 from climatenerf.weather.season.palettes import SEASONS, palettes_of, read_palettes
 from climatenerf.weather.season.parameters import Season
+from climatenerf.weather.season.style import seasonal_style
 from climatenerf.weather.season.styled_field import ClassColours, StyledField
 from climatenerf.weather.weather import Weather
 
@@ -30,17 +31,22 @@ def session(field, **table):
 
 
 LEAF = (0.10, 0.16, 0.03)
+PLANTS = (VEGETATION, TERRAIN)
 
 
 def colours(n=500, seed=0):
     return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed)) ** 2
 
 
+def style(kind="autumn"):
+    return seasonal_style(kind, palettes_of(kind), dict.fromkeys(PLANTS, np.array(LEAF)), 4.0, 0)
+
+
 def autumn(c, share=0.85):
-    palette = torch.tensor(palettes_of("autumn").vegetation.palette)[:1]
-    mean = torch.tensor([LEAF]) / luma(torch.tensor(LEAF))
+    part = style().classes[0]
+    palette = torch.tensor(part.palette[:1]).float().expand(len(c), 1, 3)
     gate = (share * r.green(c))[:, None]
-    return r.recoloured(c, gate, palette.expand(len(c), 1, 3), mean, torch.tensor([1.1]))
+    return r.recoloured(c, gate, palette, torch.tensor(part.matrix[None]).float())
 
 
 # --- recolouring ----------------------------------------------------------------------------------
@@ -153,13 +159,15 @@ def garden():
 
 
 def styled(inner, kind="autumn", white=(1.0, 1.0, 1.0)):
-    mean = torch.tensor(LEAF) / luma(torch.tensor(LEAF))
-    palettes = palettes_of(kind)
     classes = tuple(
         ClassColours(
-            int(SOLID_OF[k]), torch.tensor(p.palette), mean, p.strength, p.brightness, p.gate
+            int(SOLID_OF[each.kind]),
+            torch.tensor(each.palette).float(),
+            torch.tensor(each.matrix).float(),
+            each.strength,
+            each.gate,
         )
-        for k, p in ((VEGETATION, palettes.vegetation), (TERRAIN, palettes.terrain))
+        for each in style(kind).classes
     )
     return StyledField(inner, classes, 4.0, r.mottle(0), torch.tensor(white))
 

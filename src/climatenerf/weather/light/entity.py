@@ -162,12 +162,16 @@ class LightEntity:
         azimuth = found[1] if sun.azimuth is None else sun.azimuth
         return sun_direction(Sun(elevation, azimuth))
 
+    def _seasonal(self, weather: Weather) -> bool:
+        """Whether the season, or the style of the run, brings a sky of its own."""
+        return sky_of(weather.season, self._given.style) is not None
+
     # --- one moment ---------------------------------------------------------------------------
 
     def place(self, world: World, weather: Weather, time: float) -> World:
         """The world in the light of the moment."""
         new_sky = weather.sky.kind != "captured"
-        seasonal = not new_sky and sky_of(weather.season) is not None  # the season's sky
+        seasonal = not new_sky and self._seasonal(weather)
         snow = weather.snow.depth or 0.0
         if not (
             new_sky or seasonal or snow > 0 or weather.flood.level is not None or _lit_smog(weather)
@@ -204,7 +208,7 @@ class LightEntity:
         hidden = functools.partial(snow_cover, weather.snow, cover)
         surfaces = Surfaces(hidden, albedo) if cover else None
         if weather.sky.kind == "captured":
-            changed = under_season(weather.season, old)
+            changed = under_season(weather.season, self._given.style, old)
             return relit(self._gathered, old, below_smog(weather, changed), surfaces)
         sky = self._sky(weather)
         direct = torch.tensor(sky.sun_irradiance, device=device_of(self._given.field))

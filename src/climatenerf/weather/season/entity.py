@@ -3,25 +3,26 @@
 import functools
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from climatenerf.core.classes import SOLID_OF, TERRAIN, VEGETATION
-from climatenerf.core.colour import luma
-from climatenerf.core.device import to_device
+from climatenerf.core.classes import SOLID, SOLID_OF
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import CLASSES
-from climatenerf.field.protocol import device_of
+from climatenerf.field.protocol import RadianceField, device_of
+from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.weather.light.relit_field import RelitField
-from climatenerf.weather.season.palettes import ClassPalette, palettes_of
+from climatenerf.weather.season.palettes import palettes_of
 from climatenerf.weather.season.recolouring import mottle
+from climatenerf.weather.season.style import Style, seasonal_style
 from climatenerf.weather.season.styled_field import ClassColours, StyledField
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
 
 EVERY = 7  # ends of photo rays from one whose colour is looked up to the next
-GREEN_LAWN = (0.75, 1.1, 0.45)  # mean colour of a class that no photo shows
 
 
 class SeasonEntity:
@@ -33,23 +34,12 @@ class SeasonEntity:
         self._noise: tuple[int, Float[Tensor, "z y x"]] | None = None
 
     @functools.cached_property
-    def _means(self) -> dict[int, Float[Tensor, "3"]]:
-        """Mean colours of classes over all photos, luminance 1."""
-        field, photo_rays = self._given.field, self._given.photo_rays
-        assert photo_rays is not None, "`check` refuses fields without classes"
-        total = {kind: torch.zeros(3, device=device_of(field)) for kind in (VEGETATION, TERRAIN)}
-        for photo in photo_rays():
-            for kind, sums in total.items():
-                shown = (photo.label == kind) & (photo.t < float("inf"))
-                x, d = (
-                    to_device(each[shown][::EVERY].astype("float32"), device_of(field))
-                    for each in (photo.x, photo.d)
-                )
-                if x.shape[0]:
-                    sums += field.colour(x, d, appearance=self._given.appearance).sum(0)
-        white = torch.tensor(GREEN_LAWN, device=device_of(field))
-        means = {kind: sums if float(luma(sums)) > 0 else white for kind, sums in total.items()}
-        return {kind: mean / luma(mean) for kind, mean in means.items()}
+    def _means(self) -> dict[int, Float[np.ndarray, "3"]]:
+        """Mean linear colours of the classes that a season changes, over all photos."""
+        given = self._given
+        assert given.photo_rays is not None, "`check` refuses fields without classes"
+        colours = photographed_colours(given.field, given.photo_rays(), given.appearance)
+        return {kind: shown.mean(0) for kind, shown in colours.items() if len(shown)}
 
     def _mottle(self, seed: int) -> Float[Tensor, "z y x"]:
         """The noise of a seed; the last one is kept."""
@@ -57,36 +47,38 @@ class SeasonEntity:
             self._noise = seed, mottle(seed).to(device_of(self._given.field))
         return self._noise[1]
 
+    def _style(self, weather: Weather) -> Style | None:
+        """The new colours: of the season, or of the run."""
+        season = weather.season
+        if season.strength == 0:
+            return None
+        if season.kind == "captured":
+            return self._given.style
+        palettes = palettes_of(season.kind)
+        return seasonal_style(season.kind, palettes, self._means, season.patch, weather.seed)
+
     def place(self, world: World, weather: Weather, time: float) -> World:
         """The world with the field in the season's colours."""
-        season = weather.season
-        if season.kind == "captured" or season.strength == 0:
+        style = self._style(weather)
+        if style is None:
             return world
-        palettes = palettes_of(season.kind)
-        classes = [
-            self._colours(kind, palette, season.strength)
-            for kind, palette in ((VEGETATION, palettes.vegetation), (TERRAIN, palettes.terrain))
-            if palette is not None
-        ]
-        white = torch.ones(3, device=device_of(world.field))
+        device = device_of(world.field)
+        white = torch.ones(3, device=device)
         if isinstance(world.field, RelitField):
             old, new = world.field.old.open_irradiance(), world.field.new.open_irradiance()
             white = new / old.clamp_min(1e-6)  # a black scene: 0/0
-        field = StyledField(
-            world.field, tuple(classes), season.patch, self._mottle(weather.seed), white
+        classes = tuple(
+            ClassColours(
+                int(SOLID_OF[each.kind]),
+                to_device(each.palette.astype(np.float32), device),
+                to_device(each.matrix.astype(np.float32), device),
+                each.strength * weather.season.strength,
+                each.gate,
+            )
+            for each in style.classes
         )
-        return replace(world, field=field)
-
-    def _colours(self, kind: int, palette: ClassPalette, strength: float) -> ClassColours:
-        mean = self._means[kind]
-        return ClassColours(
-            int(SOLID_OF[kind]),
-            mean.new_tensor(palette.palette),
-            mean,
-            palette.strength * strength,
-            palette.brightness,
-            palette.gate,
-        )
+        noise = self._mottle(style.seed)
+        return replace(world, field=StyledField(world.field, classes, style.patch, noise, white))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a season where the field does not know plants from walls.
@@ -96,10 +88,7 @@ class SeasonEntity:
         """
         asked = {moment.season.kind for moment in moments} - {"captured"}
         if asked and CLASSES not in self._given.field.capabilities:
-            raise UserError(
-                f"--season.kind {min(asked)} needs a field that knows plants from walls; fit it"
-                " without --loss classes=0, to a capture with labels"
-            )
+            raise no_classes(f"--season.kind {min(asked)}")
 
     def facts(self) -> dict[str, float]:
         """Nothing is measured."""
@@ -109,3 +98,38 @@ class SeasonEntity:
 def prepare(preparation: Preparation) -> SeasonEntity:
     """Colours are found when a frame first needs them."""
     return SeasonEntity(preparation)
+
+
+def no_classes(what: str) -> UserError:
+    """Return the error of a season or style on a field that has no classes."""
+    return UserError(
+        f"{what} needs a field that knows plants from walls; fit it without --loss classes=0, to a"
+        " capture with labels"
+    )
+
+
+@torch.no_grad()
+def photographed_colours(
+    field: RadianceField, photos: list[PhotoRays], appearance: Float[Tensor, "1 e"] | None
+) -> dict[int, Float[np.ndarray, "n 3"]]:
+    """Return linear colours of each class where photo rays end on a field, some of them.
+
+    Args:
+        field: the fitted field.
+        photos: where its photo rays end.
+        appearance: exposure and light of the colours; None: the mean of all photos.
+    """
+    device = device_of(field)
+    found: dict[int, list[Float[np.ndarray, "n 3"]]] = {int(kind): [] for kind in SOLID}
+    for photo in photos:
+        for kind, parts in found.items():
+            shown = (photo.label == kind) & (photo.t < float("inf"))
+            x, d = (
+                to_device(each[shown][::EVERY].astype(np.float32), device)
+                for each in (photo.x, photo.d)
+            )
+            if x.shape[0]:
+                parts.append(to_numpy(field.colour(x, d, appearance=appearance)))
+    return {
+        kind: np.concatenate(parts) if parts else np.zeros((0, 3)) for kind, parts in found.items()
+    }

@@ -113,12 +113,18 @@ def _colour(value: Any, where: str) -> Colour:
     """Three numbers, scaled to a luminance of 1."""
     if not (isinstance(value, list) and len(value) == 3 and all(map(_is_number, value))):
         raise UserError(f"each colour in {where} must be three numbers, such as [1.1, 1.0, 0.9]")
-    luminance = sum(a * b for a, b in zip(value, LUMA, strict=True))
-    if min(value) < 0 or luminance <= 0:
+    if min(value) < 0 or max(value) <= 0:
         raise UserError(
             f"the colour {value} in {where} must have no negative part and not be black"
         )
-    red, green, blue = (float(part / luminance) for part in value)
+    red, green, blue = map(float, value)
+    return unit_luminance((red, green, blue))
+
+
+def unit_luminance(colour: Colour) -> Colour:
+    """Return a linear colour, not black, scaled to a luminance of 1."""
+    luminance = sum(a * b for a, b in zip(colour, LUMA, strict=True))
+    red, green, blue = (part / luminance for part in colour)
     return red, green, blue
 
 

@@ -13,7 +13,7 @@ class Season:
     """Colours of another season: of leaves and lawns, and of the sky. Shapes stay."""
 
     kind: Annotated[str, choice("captured", *SEASONS)] = "captured"
-    """captured: the season of the photos."""
+    """captured: the season of the photos, or the style that the run was given."""
     strength: Annotated[float, number(0.0, 1.0)] = 1.0
     """How far the colours change; 0: not at all."""
     patch: Annotated[float, quantity(LENGTH, 0.1, 1e3)] = 4.0

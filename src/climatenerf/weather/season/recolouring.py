@@ -1,12 +1,12 @@
 """Recolouring of radiance by class: pure functions of linear colours.
 
 T(c) = c + sum over classes k of p_k s_k w_k(c) (r_k(c) - c),
-r_k(c) = kappa_k (Y(c) a_k + delta (c - Y(c) m_k)),
+r_k(c) = max(0, Y(c) a_k + M_k c),
 
-with probability p, strength s, brightness kappa, palette colour a (luminance 1), luminance Y and
-the mean colour m of the class (luminance 1), so that differences between leaves stay. The gate w
-sees hue and saturation alone. Hence T(g c) = g T(c) for any exposure g, and T(0) = 0: shadows stay
-shadows.
+with probability p, strength s, luminance Y, palette colour a and matrix M. A season with
+brightness kappa and palette a' has a = kappa a' and M c = kappa delta (c - Y(c) m) with the mean
+colour m of the class, so that differences between leaves stay. The gate w depends on hue and
+saturation alone. Hence T(g c) = g T(c) for any exposure g, and T(0) = 0: shadows stay shadows.
 """
 
 import torch
@@ -15,7 +15,6 @@ from torch import Tensor
 
 from climatenerf.core.colour import luma
 
-KEPT = 0.25  # delta: fraction of the differences between leaves of a class that is kept
 HUES = (68.0, 95.0, 160.0, 190.0)  # degrees in Oklab: yellow, first green; last green, cyan
 SATURATIONS = (0.03, 0.09)  # chroma over lightness: grey, coloured
 
@@ -39,20 +38,17 @@ def recoloured(
     c: Float[Tensor, "n 3"],
     share: Float[Tensor, "n k"],
     palette: Float[Tensor, "n k 3"],
-    mean: Float[Tensor, "k 3"],
-    brightness: Float[Tensor, "k"],
+    matrix: Float[Tensor, "k 3 3"],
 ) -> Float[Tensor, "n 3"]:
     """Return T(c) of linear colours.
 
     Args:
         c: linear radiance, at least 0.
         share: p_k s_k w_k of each class; their sum is at most 1.
-        palette: colour a_k of each class at this place, luminance 1.
-        mean: mean colour m_k of each class, luminance 1.
-        brightness: kappa_k of each class.
+        palette: colour a_k of each class at this place.
+        matrix: M_k of each class.
     """
-    y = luma(c)[:, None, None]
-    new = brightness[:, None] * (y * palette + KEPT * (c[:, None] - y * mean))
+    new = luma(c)[:, None, None] * palette + torch.einsum("kij,nj->nki", matrix, c)
     return c + (share[..., None] * (new.clamp_min(0) - c[:, None])).sum(1)
 
 

@@ -10,22 +10,30 @@ from climatenerf.core.colour import luma
 from climatenerf.weather.light.scene_light import SceneLight
 from climatenerf.weather.season.palettes import SkyPalette, palettes_of
 from climatenerf.weather.season.parameters import Season
+from climatenerf.weather.season.style import Style
 
 
-def sky_of(season: Season) -> SkyPalette | None:
-    """The sky that a season brings; None if it leaves that of the photos."""
-    if season.kind == "captured" or season.strength == 0:
+def sky_of(season: Season, style: Style | None) -> SkyPalette | None:
+    """The sky that a season brings, or the style of the run; None if it stays that of the photos.
+
+    Args:
+        season: as asked for.
+        style: of the run; None: it has none.
+    """
+    if season.strength == 0:
         return None
+    if season.kind == "captured":
+        return None if style is None else style.sky
     return palettes_of(season.kind).sky
 
 
-def under_season(season: Season, light: SceneLight) -> SceneLight:
+def under_season(season: Season, style: Style | None, light: SceneLight) -> SceneLight:
     """The light of the photos under the season's sky; what surfaces send back is still the old.
 
     L'(d) = (1 - u) L(d) + u l a (1 + g z), with the sky's share u, colour a, gradient g and the
     height z of the direction. Its level l keeps the luminance of open ground, as a camera would.
     """
-    palette = sky_of(season)
+    palette = sky_of(season, style)
     if palette is None:
         return light
     share = palette.share * season.strength

@@ -20,18 +20,16 @@ class ClassColours:
 
     Attributes:
         index: of the class in `core.classes.SOLID`.
-        palette: linear colours of luminance 1.
-        mean: mean colour of the class in the photos, luminance 1.
+        palette: linear colours a.
+        matrix: M, see `recolouring`.
         strength: fraction of the change that is made.
-        brightness: new over old luminance.
         gate: fraction of the change on what is not green.
     """
 
     index: int
     palette: Float[Tensor, "j 3"]
-    mean: Float[Tensor, "3"]
+    matrix: Float[Tensor, "3 3"]
     strength: float
-    brightness: float
     gate: float
 
 
@@ -70,9 +68,8 @@ class StyledField(RecolouredField):
         place = recolouring.mottled(self.mottle, x[rows], self.patch)
         palettes = [recolouring.palette_at(place, each.palette) for each in self.classes]
         palette = torch.stack(palettes, dim=1)
-        mean = torch.stack([each.mean for each in self.classes])
-        brightness = colour.new_tensor([each.brightness for each in self.classes])
-        new = recolouring.recoloured(photographed[rows], share[rows], palette, mean, brightness)
+        matrix = torch.stack([each.matrix for each in self.classes])
+        new = recolouring.recoloured(photographed[rows], share[rows], palette, matrix)
         return colour.index_copy(0, rows, new * self.white)
 
     def _shares(

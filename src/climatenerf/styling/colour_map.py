@@ -1,0 +1,97 @@
+"""A style from photos: the linear map that gives a class the colours of the same class elsewhere.
+
+With the uncentred second moments S of our colours and R of theirs, the map of least change is
+A = S^-1/2 (S^1/2 R S^1/2)^1/2 S^-1/2 (Monge-Kantorovich, Pitie and Kokaram 2007, without means). It
+is linear, so black stays black and the exposure passes through.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from climatenerf.core.classes import CLASS_NAMES, SKY, SOLID
+from climatenerf.core.srgb import LUMA
+from climatenerf.styling.style_photos import StylePhotos
+from climatenerf.weather.season.palettes import SkyPalette
+from climatenerf.weather.season.style import ClassStyle, Style
+
+FLOOR = 1e-5  # added to the moments' diagonal: a class without blue has a singular matrix
+GAINS = (0.2, 5.0)  # bounds of the map's eigenvalues
+MIN_PIXELS = 500  # of a class in the style photos
+MAX_RATIO = 100.0  # of the fractions of a class here and there
+SKY_SHARE = 0.75  # of the photographed sky that the style's replaces
+
+
+def colour_map(
+    ours: Float[np.ndarray, "n 3"], theirs: Float[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the map A of linear colours c to A c.
+
+    Args:
+        ours: linear colours of a class in the scene.
+        theirs: linear colours of it in the style photos.
+    """
+    floor = FLOOR * np.eye(3)
+    s = ours.T @ ours / len(ours) + floor
+    r = theirs.T @ theirs / len(theirs) + floor
+    root = _power(s, 0.5)
+    inverse = _power(s, -0.5)
+    full = inverse @ _power(root @ r @ root, 0.5) @ inverse
+    values, vectors = np.linalg.eigh((full + full.T) / 2)
+    return vectors @ np.diag(values.clip(*GAINS)) @ vectors.T
+
+
+def _power(matrix: Float[np.ndarray, "3 3"], exponent: float) -> Float[np.ndarray, "3 3"]:
+    """Return a power of a positive matrix."""
+    values, vectors = np.linalg.eigh(matrix)
+    # 1e-12: rounding can make the least eigenvalue negative, which has no root.
+    return vectors @ np.diag(values.clip(1e-12) ** exponent) @ vectors.T
+
+
+def photo_style(
+    name: str,
+    ours: dict[int, Float[np.ndarray, "n 3"]],
+    photos: StylePhotos,
+    strength: float,
+    patch: float,
+    seed: int,
+) -> tuple[Style, tuple[str, ...]]:
+    """Return the style of photos for a scene, and a sentence for each class that stays.
+
+    Args:
+        name: of the style.
+        ours: linear colours of the scene's classes.
+        photos: colours of the style photos.
+        strength: fraction of the change that is made.
+        patch: size of places that turn alike, m; kept for seasons.
+        seed: of their noise.
+    """
+    notes = list(photos.notes)
+    here, there = (
+        sum(len(colours) for colours in each.values()) for each in (ours, photos.colours)
+    )
+    classes = []
+    for kind in map(int, SOLID):
+        own, new = ours.get(kind, np.zeros((0, 3))), photos.colours.get(kind, np.zeros((0, 3)))
+        if not len(own):
+            continue
+        if len(new) < MIN_PIXELS:
+            notes.append(f"{CLASS_NAMES[kind]} stays: the style photos do not show it")
+            continue
+        ratio = (len(own) / here) / (len(new) / there)
+        if not 1 / MAX_RATIO < ratio < MAX_RATIO:
+            notes.append(
+                f"{CLASS_NAMES[kind]} stays: the style photos show {100 * len(new) / there:.2g} %"
+                f" of it, the scene {100 * len(own) / here:.2g} %"
+            )
+            continue
+        matrix = colour_map(own, new)
+        classes.append(ClassStyle(kind, np.zeros((1, 3)), matrix, strength, 1.0))
+    sky = None
+    colours = photos.colours.get(SKY, np.zeros((0, 3)))
+    if len(colours) >= MIN_PIXELS:
+        mean = colours.mean(0)
+        red, green, blue = (mean / (mean @ np.array(LUMA))).tolist()
+        sky = SkyPalette((red, green, blue), 0.0, SKY_SHARE * strength)
+    else:
+        notes.append("the sky stays: the style photos do not show it")
+    return Style(name, tuple(classes), sky, patch, seed, photos.sources), tuple(notes)

@@ -1,0 +1,201 @@
+"""Photos of another place as the source of a style: their colours by class. No torch.
+
+Classes come from label files beside the photos, from regions that the user names, or from a
+network. Without any, all pixels stand for vegetation and for terrain.
+"""
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from climatenerf.core.classes import (
+    CLASS_NAMES,
+    MERGED,
+    TERRAIN,
+    UNKNOWN,
+    VEGETATION,
+)
+from climatenerf.core.errors import UserError
+from climatenerf.core.listing import visible
+from climatenerf.core.srgb import to_linear
+from climatenerf.scene.image_files import PHOTO_SUFFIXES
+from climatenerf.scene.images import read_labels, read_rgb
+from climatenerf.weather.season.style import Source
+
+MAX_PIXELS = 40_000  # of one photo that are used
+MAX_LICENCE = 400  # characters
+MIN_SPREAD = 1e-3  # of linear values; below it a photo has one colour
+DARK = 1e-3  # mean linear value of a black photo
+
+Labeller = Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w"]]
+"""Maps a picture to Cityscapes train ids."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle of the photos that shows one class.
+
+    Attributes:
+        kind: the class, see `core.classes`.
+        box: left, top, right and bottom, as fractions of width and height.
+    """
+
+    kind: int
+    box: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class StylePhotos:
+    """Linear colours of photos by class.
+
+    Attributes:
+        colours: of each class that the photos show, in [0, 1].
+        sources: the files.
+        notes: what was assumed, one sentence each.
+    """
+
+    colours: dict[int, Float[np.ndarray, "n 3"]]
+    sources: tuple[Source, ...]
+    notes: tuple[str, ...] = field(default=())
+
+
+def parse_region(text: str) -> Region:
+    """Return a region given as "vegetation=0,0.5,1,1".
+
+    Raises:
+        UserError: it has another form, or names no class.
+    """
+    name, _, numbers = text.partition("=")
+    try:
+        box = tuple(float(word) for word in numbers.split(","))
+    except ValueError:
+        box = ()
+    kinds = {each: index for index, each in enumerate(CLASS_NAMES)}
+    if len(box) == 4 and name in kinds:
+        left, top, right, bottom = box
+        if 0 <= left < right <= 1 and 0 <= top < bottom <= 1:
+            return Region(kinds[name], (left, top, right, bottom))
+    raise UserError(
+        "--style-region must be a class and left,top,right,bottom as fractions of the photo, such"
+        f" as vegetation=0,0.5,1,1, with a class of {', '.join(CLASS_NAMES)}; got"
+        f' "{text[:60]}"'
+    )
+
+
+def photo_files(paths: Sequence[Path]) -> list[Path]:
+    """Return the photos among files and folders; a folder may hold them in `images`.
+
+    Raises:
+        UserError: a path does not exist, or holds no photo.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_file():
+            files.append(path)
+            continue
+        if not path.is_dir():
+            raise UserError(f"there is no style photo {path}; name a photo or a folder of photos")
+        inner = path / "images" if (path / "images").is_dir() else path
+        found = [p for p in sorted(visible(inner.iterdir())) if p.suffix.lower() in PHOTO_SUFFIXES]
+        if not found:
+            raise UserError(f"{path} holds no photo; name a photo or a folder of photos")
+        files += found
+    return files
+
+
+def read_style_photos(
+    paths: Sequence[Path], regions: Sequence[Region] = (), labeller: Labeller | None = None
+) -> StylePhotos:
+    """Read photos and sort their colours by class.
+
+    Args:
+        paths: photos, or folders of photos.
+        regions: rectangles of known class; they replace labels.
+        labeller: finds classes of photos without label file; None: none does.
+
+    Raises:
+        UserError: a file cannot be read, a photo is black or of one colour, or labels do not fit.
+    """
+    found: dict[int, list[Float[np.ndarray, "n 3"]]] = {}
+    sources, unlabelled = [], 0
+    files = photo_files(paths)
+    for path in files:
+        picture = read_rgb(path)
+        linear = to_linear(picture / 255)
+        check_photo(path, linear)
+        sources.append(Source(path.name, _sha256(path), licence_beside(path)))
+        if regions:
+            parts = [(each.kind, _cut(linear, each).reshape(-1, 3)) for each in regions]
+        else:
+            labels = _labels(path, picture, labeller)
+            if labels is None:
+                unlabelled += 1
+                parts = [(kind, linear.reshape(-1, 3)) for kind in (VEGETATION, TERRAIN)]
+            else:
+                kinds = set(np.unique(labels).tolist()) - {UNKNOWN}
+                parts = [(kind, linear[labels == kind]) for kind in kinds]
+        for kind, pixels in parts:
+            every = max(1, len(pixels) // MAX_PIXELS)
+            found.setdefault(int(kind), []).append(pixels[::every])
+    notes = ()
+    if unlabelled:
+        notes = (
+            f"{unlabelled} of {len(files)} style photos have no labels: all their pixels stand for"
+            " vegetation and terrain; name classes with --style-region or --labels",
+        )
+    colours = {kind: np.concatenate(parts) for kind, parts in sorted(found.items())}
+    return StylePhotos(colours, tuple(sources), notes)
+
+
+def check_photo(path: Path, linear: Float[np.ndarray, "h w 3"]) -> None:
+    """Refuse a photo that has no colours to give.
+
+    Raises:
+        UserError: it is black or of one colour.
+    """
+    if linear.mean() < DARK:
+        raise UserError(f"the style photo {path} is black; give another photo")
+    if np.ptp(linear.reshape(-1, 3), axis=0).max() < MIN_SPREAD:
+        raise UserError(f"the style photo {path} has one colour only; give another photo")
+
+
+def licence_beside(path: Path) -> str:
+    """Return the text of a licence file in the photo's folder or the one above, shortened."""
+    for folder in (path.parent, path.parent.parent):
+        for name in ("LICENSE.md", "LICENSE.txt", "LICENSE", "LICENCE.md", "LICENCE.txt"):
+            if (folder / name).is_file():
+                text = (folder / name).read_text("utf-8", errors="replace")[: 4 * MAX_LICENCE]
+                return " ".join(text.split())[:MAX_LICENCE]
+    return ""
+
+
+def _labels(
+    path: Path, picture: UInt8[np.ndarray, "h w 3"], labeller: Labeller | None
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the classes of a photo; None if nothing tells them."""
+    for folder in (path.parent / "labels", path.parent.parent / "labels"):
+        file = folder / f"{path.stem}.png"
+        if file.is_file():
+            labels = read_labels(file)
+            if labels.shape != picture.shape[:2]:
+                raise UserError(
+                    f"the labels {file} have another size than their photo; make them anew"
+                )
+            return MERGED[labels]
+    return None if labeller is None else MERGED[labeller(picture)]
+
+
+def _cut(linear: Float[np.ndarray, "h w 3"], region: Region) -> Float[np.ndarray, "a b 3"]:
+    height, width = linear.shape[:2]
+    left, top, right, bottom = region.box
+    rows = slice(int(top * height), max(int(bottom * height), int(top * height) + 1))
+    columns = slice(int(left * width), max(int(right * width), int(left * width) + 1))
+    return linear[rows, columns]
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,64 @@
+"""A run in new colours: a copy of a run folder with a style, which weather renders on as on any."""
+
+import os
+import shutil
+from pathlib import Path
+
+from climatenerf.core.errors import UserError
+from climatenerf.core.locks import only_writer
+from climatenerf.core.storage import explain, make_folder
+from climatenerf.scene.scene import OBSERVATIONS_NAME, POINTS_NAME, Scene
+from climatenerf.training.snapshot import CONFIG, FIELD, identity_of, new_checkpoint, stage_scene
+from climatenerf.weather.season.style import FILE_NAME, Style, write_style
+
+KEPT = (POINTS_NAME, OBSERVATIONS_NAME)
+BESIDE = ("terrain.npz",)
+"""Files that were found in the field, and hold for the copy as well."""
+
+
+def check_out(run: Path, out: Path) -> None:
+    """Refuse a folder that cannot become the styled run; write nothing.
+
+    Args:
+        run: the run.
+        out: the folder.
+
+    Raises:
+        UserError: it is the run itself or lies in it, or it holds anything but an unfinished copy.
+    """
+    if out.resolve() == run.resolve() or out.resolve().is_relative_to(run.resolve()):
+        raise UserError(f"-o {out} is the run itself or lies in it; choose another folder")
+    if (out / FIELD).exists():
+        raise UserError(f"{out} already holds a run; choose another -o, or remove it")
+    ours = {FILE_NAME, ".lock", ".next", *BESIDE, *KEPT}
+    foreign = sorted({path.name for path in out.iterdir()} - ours) if out.is_dir() else []
+    if foreign:
+        raise UserError(f"{out} holds other files, such as {foreign[0]}; choose another -o")
+
+
+def write_styled_run(run: Path, scene: Scene, style: Style, out: Path) -> None:
+    """Copy a run and give the copy a style. The field's bytes stay.
+
+    Args:
+        run: folder of the run.
+        scene: its scene.
+        style: the new colours.
+        out: folder of the copy.
+
+    Raises:
+        UserError: the folder cannot be used or written.
+    """
+    check_out(run, out)
+    make_folder(out)
+    with only_writer(out):
+        write_style(out, style)
+        try:
+            for name in BESIDE:
+                if (run / name).is_file():
+                    shutil.copyfile(run / name, out / name)
+            with new_checkpoint(out) as staging:
+                shutil.copyfile(run / FIELD, staging / FIELD)
+                shutil.copyfile(run / CONFIG, staging / CONFIG)
+                stage_scene(scene, out, staging, identity_of(run / FIELD) or "")
+        except OSError as error:
+            raise explain(error, Path(os.fsdecode(error.filename or out))) from error
