@@ -29,7 +29,7 @@ from climatenerf.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, for_effects, read_weather
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects, layer_table
-from climatenerf.weather.season.style import Style
+from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
 
 if TYPE_CHECKING:
@@ -222,8 +222,8 @@ def load_run(folder: PathText, *, device: Literal["cpu", "cuda"] = "cpu") -> Run
     from climatenerf.scene import load_scene
     from climatenerf.training.folder import check_config
     from climatenerf.training.snapshot import CONFIG, FIELD, SCENE, identity_of, read_together
-    from climatenerf.weather.season.style import FILE_NAME as STYLE
-    from climatenerf.weather.season.style import style_in
+    from climatenerf.weather.style import FILE_NAME as STYLE
+    from climatenerf.weather.style import style_in
 
     where = resolve_device(device)
     folder = Path(folder)

@@ -90,7 +90,8 @@ def stylize(options: Stylize, folder: Path, out: Path) -> int:
     from climatenerf.api import load_run
     from climatenerf.styling.scene_colours import colours_of_run
     from climatenerf.styling.styled_run import write_styled_run
-    from climatenerf.weather.season.style import seasonal_style, weakened
+    from climatenerf.weather.season.palettes import seasonal_style
+    from climatenerf.weather.style import weakened
 
     run = load_run(folder)
     with progress.StageBars() as bars:

@@ -42,8 +42,8 @@ from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import COMPLETED_GROUND, EFFECTS, MEAN_TRANSMITTANCE, layer_table
-from climatenerf.weather.season.style import FILE_NAME as STYLE
-from climatenerf.weather.season.style import Style
+from climatenerf.weather.style import FILE_NAME as STYLE
+from climatenerf.weather.style import Style
 
 if TYPE_CHECKING:
     from climatenerf.field.protocol import RadianceField

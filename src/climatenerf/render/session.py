@@ -23,7 +23,7 @@ from climatenerf.scene.scene import Scene
 from climatenerf.weather.description import KeyframedWeather, for_effects
 from climatenerf.weather.effect import Effect, Entity
 from climatenerf.weather.registry import check_effects, in_order, installed_effects, layer_table
-from climatenerf.weather.season.style import Style
+from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather, check
 from climatenerf.weather.world import Kept, Preparation, World
 

@@ -11,8 +11,7 @@ from jaxtyping import Float
 from climatenerf.core.classes import CLASS_NAMES, SKY, SOLID
 from climatenerf.core.srgb import LUMA
 from climatenerf.styling.style_photos import StylePhotos
-from climatenerf.weather.season.palettes import SkyPalette
-from climatenerf.weather.season.style import ClassStyle, Style
+from climatenerf.weather.style import ClassStyle, SkyPalette, Style
 
 FLOOR = 1e-5  # added to the moments' diagonal: a class without blue has a singular matrix
 GAINS = (0.2, 5.0)  # bounds of the map's eigenvalues

@@ -24,7 +24,7 @@ from climatenerf.core.listing import visible
 from climatenerf.core.srgb import to_linear
 from climatenerf.scene.image_files import PHOTO_SUFFIXES
 from climatenerf.scene.images import read_labels, read_rgb
-from climatenerf.weather.season.style import Source
+from climatenerf.weather.style import Source
 
 MAX_PIXELS = 40_000  # of one photo that are used
 MAX_LICENCE = 400  # characters

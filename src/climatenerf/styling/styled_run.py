@@ -9,7 +9,7 @@ from climatenerf.core.locks import only_writer
 from climatenerf.core.storage import explain, make_folder
 from climatenerf.scene.scene import OBSERVATIONS_NAME, POINTS_NAME, Scene
 from climatenerf.training.snapshot import CONFIG, FIELD, identity_of, new_checkpoint, stage_scene
-from climatenerf.weather.season.style import FILE_NAME, Style, write_style
+from climatenerf.weather.style import FILE_NAME, Style, write_style
 
 KEPT = (POINTS_NAME, OBSERVATIONS_NAME)
 BESIDE = ("terrain.npz",)

@@ -10,12 +10,11 @@ from dataclasses import dataclass, replace
 from climatenerf.core.errors import UserError
 from climatenerf.weather.season.palettes import (
     ClassPalette,
-    Colour,
     Palettes,
-    SkyPalette,
     palettes_of,
     unit_luminance,
 )
+from climatenerf.weather.style import Colour, SkyPalette
 
 SEASONS = {
     "autumn": "autumn", "autumnal": "autumn", "fall": "autumn", "october": "autumn",

@@ -20,7 +20,7 @@ from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import RadianceField
 from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene
-from climatenerf.weather.season.style import Style
+from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
 
 SKY_OPACITY = 0.5  # rays whose sky weighs more have no surface

@@ -19,9 +19,8 @@ from climatenerf.render.session import RenderSession
 from climatenerf.weather.description import weather_from_table
 from climatenerf.weather.season import recolouring as r
 from climatenerf.weather.season.entity import SeasonEntity
-from climatenerf.weather.season.palettes import SEASONS, palettes_of, read_palettes
+from climatenerf.weather.season.palettes import SEASONS, palettes_of, read_palettes, seasonal_style
 from climatenerf.weather.season.parameters import Season
-from climatenerf.weather.season.style import seasonal_style
 from climatenerf.weather.season.styled_field import ClassColours, StyledField
 from climatenerf.weather.weather import Weather
 

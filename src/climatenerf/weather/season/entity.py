@@ -15,10 +15,10 @@ from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.protocol import RadianceField, device_of
 from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.weather.light.relit_field import RelitField
-from climatenerf.weather.season.palettes import palettes_of
+from climatenerf.weather.season.palettes import palettes_of, seasonal_style
 from climatenerf.weather.season.recolouring import mottle
-from climatenerf.weather.season.style import Style, seasonal_style
 from climatenerf.weather.season.styled_field import ClassColours, StyledField
+from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
 

@@ -6,13 +6,18 @@ from dataclasses import dataclass, fields
 from importlib import resources
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
+from climatenerf.core.classes import TERRAIN, VEGETATION
 from climatenerf.core.errors import UserError
 from climatenerf.core.parsing import read_toml
 from climatenerf.core.srgb import LUMA
+from climatenerf.weather.style import MAX_COLOURS, ClassStyle, Colour, SkyPalette, Style
 
 SEASONS = ("autumn", "winter", "drought", "wildfire")
-MAX_COLOURS = 16
-Colour = tuple[float, float, float]
+KEPT = 0.25  # fraction of the differences between leaves of a class that is kept
+GREEN_LAWN = (0.75, 1.1, 0.45)  # mean colour of a class that no photo shows
 
 
 @dataclass(frozen=True)
@@ -27,18 +32,6 @@ class ClassPalette:
     """New over old luminance, 0 to 4."""
     gate: float
     """Fraction of the change on what is not green, 0 to 1; green changes wholly."""
-
-
-@dataclass(frozen=True)
-class SkyPalette:
-    """The sky of a season."""
-
-    colour: Colour
-    """Linear RGB of luminance 1."""
-    gradient: float
-    """Luminance of the zenith over that of the horizon, less 1; -1 to 4."""
-    share: float
-    """Fraction of the photographed sky, its sun included, that is replaced, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +79,44 @@ def read_palettes(table: dict[str, Any], where: str) -> Palettes:
     parts = {name: _section(table[name], kind, f"[{name}] of {where}")
              for name, kind in known.items() if name in table}  # fmt: skip
     return Palettes(note=note, **parts)
+
+
+def seasonal_style(
+    name: str,
+    palettes: Palettes,
+    means: dict[int, Float[np.ndarray, "3"]],
+    patch: float,
+    seed: int,
+) -> Style:
+    """Return a season as a style of one scene.
+
+    Args:
+        name: of the season.
+        palettes: its colours.
+        means: mean linear colour of classes in the photos; absent or black: none shows it.
+        patch: size of places that turn alike, m.
+        seed: of the noise that tells these places apart.
+    """
+    parts = ((VEGETATION, palettes.vegetation), (TERRAIN, palettes.terrain))
+    classes = tuple(
+        _class_style(kind, part, means.get(kind)) for kind, part in parts if part is not None
+    )
+    return Style(name, classes, palettes.sky, patch, seed, note=palettes.note)
+
+
+def _class_style(kind: int, part: ClassPalette, mean: Float[np.ndarray, "3"] | None) -> ClassStyle:
+    luma = np.array(LUMA)
+    if mean is None or mean @ luma <= 0:
+        mean = np.array(GREEN_LAWN)
+    # c - Y(c) m: how the colour differs from the mean of its class at the same luminance.
+    difference = np.eye(3) - np.outer(mean / (mean @ luma), luma)
+    return ClassStyle(
+        kind,
+        part.brightness * np.array(part.palette),
+        part.brightness * KEPT * difference,
+        part.strength,
+        part.gate,
+    )
 
 
 def _section(table: Any, kind: type, where: str) -> Any:

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from climatenerf.core.colour import luma
 from climatenerf.weather.light.scene_light import SceneLight
-from climatenerf.weather.season.palettes import SkyPalette, palettes_of
+from climatenerf.weather.season.palettes import palettes_of
 from climatenerf.weather.season.parameters import Season
-from climatenerf.weather.season.style import Style
+from climatenerf.weather.style import SkyPalette, Style
 
 
 def sky_of(season: Season, style: Style | None) -> SkyPalette | None:

@@ -13,24 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from climatenerf.core import parsing
-from climatenerf.core.classes import CLASS_NAMES, SOLID, TERRAIN, VEGETATION
+from climatenerf.core.classes import CLASS_NAMES, SOLID
 from climatenerf.core.errors import UserError
-from climatenerf.core.srgb import LUMA
 from climatenerf.core.storage import check_schema, write_json
-from climatenerf.weather.season.palettes import (
-    MAX_COLOURS,
-    RANGES,
-    ClassPalette,
-    Palettes,
-    SkyPalette,
-    read_palettes,
-)
+
+Colour = tuple[float, float, float]
 
 FILE_NAME = "style.json"
 SCHEMA_VERSION = 1
-KEPT = 0.25  # fraction of the differences between leaves of a class that is kept
 MAX_ENTRY = 100.0  # of palettes and matrices in a file
-GREEN_LAWN = (0.75, 1.1, 0.45)  # mean colour of a class that no photo shows
+MAX_COLOURS = 16  # of a palette
 
 
 @dataclass(frozen=True)
@@ -50,6 +42,18 @@ class ClassStyle:
     matrix: Float[np.ndarray, "3 3"]
     strength: float
     gate: float
+
+
+@dataclass(frozen=True)
+class SkyPalette:
+    """A sky that takes the place of part of the photographed one."""
+
+    colour: Colour
+    """Linear RGB of luminance 1."""
+    gradient: float
+    """Luminance of the zenith over that of the horizon, less 1; -1 to 4."""
+    share: float
+    """Fraction of the photographed sky, its sun included, that is replaced, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -88,44 +92,6 @@ class Style:
     seed: int
     sources: tuple[Source, ...] = ()
     note: str = ""
-
-
-def seasonal_style(
-    name: str,
-    palettes: Palettes,
-    means: dict[int, Float[np.ndarray, "3"]],
-    patch: float,
-    seed: int,
-) -> Style:
-    """Return a season as a style of one scene.
-
-    Args:
-        name: of the season.
-        palettes: its colours.
-        means: mean linear colour of classes in the photos; absent or black: none shows it.
-        patch: size of places that turn alike, m.
-        seed: of the noise that tells these places apart.
-    """
-    parts = ((VEGETATION, palettes.vegetation), (TERRAIN, palettes.terrain))
-    classes = tuple(
-        _class_style(kind, part, means.get(kind)) for kind, part in parts if part is not None
-    )
-    return Style(name, classes, palettes.sky, patch, seed, note=palettes.note)
-
-
-def _class_style(kind: int, part: ClassPalette, mean: Float[np.ndarray, "3"] | None) -> ClassStyle:
-    luma = np.array(LUMA)
-    if mean is None or mean @ luma <= 0:
-        mean = np.array(GREEN_LAWN)
-    # c - Y(c) m: how the colour differs from the mean of its class at the same luminance.
-    difference = np.eye(3) - np.outer(mean / (mean @ luma), luma)
-    return ClassStyle(
-        kind,
-        part.brightness * np.array(part.palette),
-        part.brightness * KEPT * difference,
-        part.strength,
-        part.gate,
-    )
 
 
 def weakened(style: Style, strength: float) -> Style:
@@ -188,7 +154,7 @@ def style_in(folder: Path) -> Style | None:
         classes.append(_read_class(names[name], table, f"{name} of {where}"))
     sky = None
     if data.get("sky") is not None:
-        sky = read_palettes({"sky": parsing.entries(data, "sky", where)}, where).sky
+        sky = _read_sky(parsing.entries(data, "sky", where), f"the sky of {where}")
     sources = []
     for table in parsing.items(data, "sources", where, []):
         if not isinstance(table, dict):
@@ -215,6 +181,16 @@ def _read_class(kind: int, table: dict[str, Any], where: str) -> ClassStyle:
         kind,
         parsing.matrix(colours, [shape], f"the palette of {where}", MAX_ENTRY).clip(0),
         parsing.matrix(table.get("matrix"), [(3, 3)], f"the matrix of {where}", MAX_ENTRY),
-        parsing.number(table, "strength", where, *RANGES["strength"]),
-        parsing.number(table, "gate", where, *RANGES["gate"]),
+        parsing.number(table, "strength", where, 0, 1),
+        parsing.number(table, "gate", where, 0, 1),
+    )
+
+
+def _read_sky(table: dict[str, Any], where: str) -> SkyPalette:
+    colour = parsing.matrix([table.get("colour")], [(1, 3)], f"the colour of {where}", MAX_ENTRY)
+    red, green, blue = colour[0].clip(0).tolist()
+    return SkyPalette(
+        (red, green, blue),
+        parsing.number(table, "gradient", where, -1, 4),
+        parsing.number(table, "share", where, 0, 1),
     )
