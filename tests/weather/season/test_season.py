@@ -11,17 +11,17 @@ import torch
 from support.holed_ground import LabelledField
 from support.sunlit_yard import sunlit_yard, yard_scene
 
-from climatenerf.core.classes import BUILDING, SOLID_OF, TERRAIN, VEGETATION
+from climatenerf.core.classes import BUILDING, TERRAIN, VEGETATION
 from climatenerf.core.colour import luma
 from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import Box, HalfSpace
+from climatenerf.ops import recolouring as r
 from climatenerf.render.session import RenderSession
 from climatenerf.weather.description import weather_from_table
-from climatenerf.weather.season import recolouring as r
-from climatenerf.weather.season.entity import SeasonEntity
+from climatenerf.weather.season.entity import SeasonEntity, class_colours
 from climatenerf.weather.season.palettes import SEASONS, palettes_of, read_palettes, seasonal_style
 from climatenerf.weather.season.parameters import Season
-from climatenerf.weather.season.styled_field import ClassColours, StyledField
+from climatenerf.weather.season.styled_field import StyledField
 from climatenerf.weather.weather import Weather
 
 
@@ -158,16 +158,7 @@ def garden():
 
 
 def styled(inner, kind="autumn", white=(1.0, 1.0, 1.0)):
-    classes = tuple(
-        ClassColours(
-            int(SOLID_OF[each.kind]),
-            torch.tensor(each.palette).float(),
-            torch.tensor(each.matrix).float(),
-            each.strength,
-            each.gate,
-        )
-        for each in style(kind).classes
-    )
+    classes = class_colours(style(kind), 1.0, torch.device("cpu"))
     return StyledField(inner, classes, 4.0, r.mottle(0), torch.tensor(white))
 
 
@@ -285,4 +276,4 @@ def test_floods_mirror_the_season(yard):
     field, _ = yard
     world = session(field, season={"kind": "autumn"}, flood={"level": "0.2 m"}).world(0.0)
     assert isinstance(world.field.field, StyledField)
-    assert len(world.field.field.classes) == 2
+    assert len(world.field.field.classes.index) == 2

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +14,11 @@ from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.protocol import RadianceField, device_of
+from climatenerf.ops.recolouring import ClassColours, mottle
 from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.weather.light.relit_field import RelitField
 from climatenerf.weather.season.palettes import palettes_of, seasonal_style
-from climatenerf.weather.season.recolouring import mottle
-from climatenerf.weather.season.styled_field import ClassColours, StyledField
+from climatenerf.weather.season.styled_field import StyledField
 from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
@@ -67,16 +68,7 @@ class SeasonEntity:
         if isinstance(world.field, RelitField):
             old, new = world.field.old.open_irradiance(), world.field.new.open_irradiance()
             white = new / old.clamp_min(1e-6)  # a black scene: 0/0
-        classes = tuple(
-            ClassColours(
-                int(SOLID_OF[each.kind]),
-                to_device(each.palette.astype(np.float32), device),
-                to_device(each.matrix.astype(np.float32), device),
-                each.strength * weather.season.strength,
-                each.gate,
-            )
-            for each in style.classes
-        )
+        classes = class_colours(style, weather.season.strength, device)
         noise = self._mottle(style.seed)
         return replace(world, field=StyledField(world.field, classes, style.patch, noise, white))
 
@@ -98,6 +90,30 @@ class SeasonEntity:
 def prepare(preparation: Preparation) -> SeasonEntity:
     """Colours are found when a frame first needs them."""
     return SeasonEntity(preparation)
+
+
+def class_colours(style: Style, strength: float, device: torch.device) -> ClassColours:
+    """Return the classes of a style as tensors, of which a fraction is made, 0 to 1."""
+    longest = max((len(each.palette) for each in style.classes), default=1)
+    parts = style.classes
+
+    def tensor(values: list[Any], *shape: int) -> Tensor:
+        return to_device(np.array(values, np.float32).reshape(len(parts), *shape), device)
+
+    def whole(values: list[int]) -> Tensor:
+        return to_device(np.array(values, np.int64), device)
+
+    padded = [
+        [*each.palette, *[each.palette[-1]] * (longest - len(each.palette))] for each in parts
+    ]
+    return ClassColours(
+        whole([int(SOLID_OF[each.kind]) for each in parts]),
+        tensor([each.strength * strength for each in parts]),
+        tensor([each.gate for each in parts]),
+        tensor(padded, longest, 3),
+        whole([len(each.palette) for each in parts]),
+        tensor([each.matrix for each in parts], 3, 3),
+    )
 
 
 def no_classes(what: str) -> UserError:

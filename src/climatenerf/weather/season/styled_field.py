@@ -9,28 +9,9 @@ from torch import Tensor
 from climatenerf.core.samples import Samples
 from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.wrapped import RecolouredField
-from climatenerf.weather.season import recolouring
+from climatenerf.ops.recolouring import ClassColours, recoloured_samples
 
 SHARED = 0.3  # m along a ray, within which samples share their class
-
-
-@dataclass(frozen=True)
-class ClassColours:
-    """What a season does to one class, as tensors.
-
-    Attributes:
-        index: of the class in `core.classes.SOLID`.
-        palette: linear colours a.
-        matrix: M, see `recolouring`.
-        strength: fraction of the change that is made.
-        gate: fraction of the change on what is not green.
-    """
-
-    index: int
-    palette: Float[Tensor, "j 3"]
-    matrix: Float[Tensor, "3 3"]
-    strength: float
-    gate: float
 
 
 @dataclass(frozen=True)
@@ -40,13 +21,13 @@ class StyledField(RecolouredField):
     Attributes:
         classes: the classes that change.
         patch: size of places that turn alike, m.
-        mottle: noise that tells these places apart.
+        noise: tells these places apart, see `recolouring.mottle`.
         white: light that the field is shown in over that of its photos; hues are judged without it.
     """
 
-    classes: tuple[ClassColours, ...]
+    classes: ClassColours
     patch: float
-    mottle: Float[Tensor, "z y x"]
+    noise: Float[Tensor, "z y x"]
     white: Float[Tensor, "3"]
 
     def recoloured(
@@ -57,25 +38,8 @@ class StyledField(RecolouredField):
         ray: Int[Tensor, "s"] | None,
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance in the season's colours."""
-        if not self.classes or not x.shape[0]:
+        if not self.classes.index.shape[0] or not x.shape[0]:
             return colour
-        photographed = colour / self.white
-        share = self._shares(x, d, ray)
-        greenness = recolouring.green(photographed)
-        gates = colour.new_tensor([each.gate for each in self.classes])
-        share = share * torch.maximum(greenness[:, None], gates)
-        rows = (share.sum(-1) > 1e-3).nonzero()[:, 0]
-        place = recolouring.mottled(self.mottle, x[rows], self.patch)
-        palettes = [recolouring.palette_at(place, each.palette) for each in self.classes]
-        palette = torch.stack(palettes, dim=1)
-        matrix = torch.stack([each.matrix for each in self.classes])
-        new = recolouring.recoloured(photographed[rows], share[rows], palette, matrix)
-        return colour.index_copy(0, rows, new * self.white)
-
-    def _shares(
-        self, x: Float[Tensor, "s 3"], d: Float[Tensor, "n 3"], ray: Int[Tensor, "s"] | None
-    ) -> Float[Tensor, "s k"]:
-        """Probability of each changing class at positions, times its strength."""
         middle = group = torch.arange(x.shape[0], device=x.device)
         along = d
         if ray is not None:
@@ -86,5 +50,6 @@ class StyledField(RecolouredField):
         zero = torch.zeros(count, device=x.device)
         samples = Samples(index, zero, zero, zero)
         _, logits = self.field.surface_heads(x[middle], along, samples, index[:-1])
-        probability = logits.softmax(-1)[:, [each.index for each in self.classes]]
-        return (probability * probability.new_tensor([c.strength for c in self.classes]))[group]
+        return recoloured_samples(
+            colour, logits, group, x, self.noise, self.patch, self.white, self.classes
+        )

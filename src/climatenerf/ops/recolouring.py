@@ -1,4 +1,4 @@
-"""Recolouring of radiance by class: pure functions of linear colours.
+"""Recolouring of samples by class: pure functions of linear colours. No gradients.
 
 T(c) = c + sum over classes k of p_k s_k w_k(c) (r_k(c) - c),
 r_k(c) = max(0, Y(c) a_k + M_k c),
@@ -9,11 +9,14 @@ colour m of the class, so that differences between leaves stay. The gate w depen
 saturation alone. Hence T(g c) = g T(c) for any exposure g, and T(0) = 0: shadows stay shadows.
 """
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.colour import luma
+from climatenerf.ops import dispatch
 
 HUES = (68.0, 95.0, 160.0, 190.0)  # degrees in Oklab: yellow, first green; last green, cyan
 SATURATIONS = (0.03, 0.09)  # chroma over lightness: grey, coloured
@@ -22,16 +25,78 @@ PATCHES, TEXELS = 16, 8  # along a side of the noise, and nodes along a patch
 OCTAVES = ((0.35, 0.8), (0.12, 0.6))  # deviation of the smoothing in patches, and its part
 
 # Oklab (Ottosson 2020): linear sRGB to cone responses, their cube roots to L, a, b.
-_CONES = (
+CONES = (
     (0.4122214708, 0.5363325363, 0.0514459929),
     (0.2119034982, 0.6806995451, 0.1073969566),
     (0.0883024619, 0.2817188376, 0.6299787005),
 )
-_OKLAB = (
+OKLAB = (
     (0.2104542553, 0.7936177850, -0.0040720468),
     (1.9779984951, -2.4285922050, 0.4505937099),
     (0.0259040371, 0.7827717662, -0.8086757660),
 )
+
+
+@dataclass(frozen=True)
+class ClassColours:
+    """What a style does to the classes that it changes.
+
+    Attributes:
+        index: of each class among the logits.
+        strength: fraction of the change that is made.
+        gate: fraction of the change on what is not green.
+        palette: linear colours a; shorter palettes repeat their last colour.
+        count: number of colours of each palette.
+        matrix: M.
+    """
+
+    index: Int[Tensor, "k"]
+    strength: Float[Tensor, "k"]
+    gate: Float[Tensor, "k"]
+    palette: Float[Tensor, "k j 3"]
+    count: Int[Tensor, "k"]
+    matrix: Float[Tensor, "k 3 3"]
+
+
+def recoloured_samples(
+    colour: Float[Tensor, "s 3"],
+    logits: Float[Tensor, "g c"],
+    group: Int[Tensor, "s"],
+    x: Float[Tensor, "s 3"],
+    noise: Float[Tensor, "z y x"],
+    patch: float,
+    white: Float[Tensor, "3"],
+    classes: ClassColours,
+) -> Float[Tensor, "s 3"]:
+    """Return T(c) of samples of a field.
+
+    Args:
+        colour: linear radiance, at least 0.
+        logits: of the classes, one row for each group of samples.
+        group: of each sample.
+        x: positions, world m.
+        noise: from `mottle`.
+        patch: size of places that turn alike, m.
+        white: light that the field is shown in over that of its photos, in which hue is judged.
+        classes: what changes.
+    """
+    frame = torch.cat([white, white.new_tensor([1 / (patch * PATCHES)])])
+    about = (classes.index, classes.count, classes.strength, classes.gate)
+    tensors = colour, logits, group, x, noise, frame, *about, classes.palette, classes.matrix
+    if dispatch.backend(*tensors) == "cpu":
+        from climatenerf.ops.cpu import recolouring as kernel
+
+        found = torch.empty_like(colour)
+        arrays = dispatch.kernel_arrays(*tensors, found)
+        kernel.recolour(*arrays[:6], arrays[6:10], *arrays[10:])  # type: ignore
+        return found
+    photographed = colour / white
+    share = logits.softmax(-1)[:, classes.index][group] * classes.strength
+    share = share * torch.maximum(green(photographed)[:, None], classes.gate)
+    place = mottled(noise, x, patch)
+    parts = zip(classes.palette, classes.count.tolist(), strict=True)
+    palette = torch.stack([palette_at(place, each[:count]) for each, count in parts], dim=1)
+    return recoloured(photographed, share, palette, classes.matrix) * white
 
 
 def recoloured(
@@ -70,9 +135,9 @@ def smoothstep(x: Float[Tensor, "*n"], low: float, high: float) -> Float[Tensor,
 
 
 def _oklab(c: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    cones = c @ c.new_tensor(_CONES).T
+    cones = c @ c.new_tensor(CONES).T
     root = cones.clamp_min(0) ** (1 / 3)
-    return root @ c.new_tensor(_OKLAB).T
+    return root @ c.new_tensor(OKLAB).T
 
 
 def palette_at(place: Float[Tensor, "n"], palette: Float[Tensor, "j 3"]) -> Float[Tensor, "n 3"]:
