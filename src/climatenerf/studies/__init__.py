@@ -1,1 +1,1 @@
-"""Experiments that compare many fits."""
+"""Experiments that compare many fits, or many methods."""
