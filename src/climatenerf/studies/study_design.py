@@ -1,0 +1,169 @@
+"""The pairs of a user study, after the paper's protocol: ours against every other method. No torch.
+
+What participants see goes by opaque ids. The plan of each participant (order, sides, repeats) is
+computed in the page, from hashes of study and participant.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from climatenerf.core.errors import UserError
+from climatenerf.studies.compare_folder import CompareFolder, Item
+
+VOTES = 72
+"""Pairs that a participant judges by default, as in the paper."""
+MAX_VOTES = 1000
+REPEATS = 3
+"""Hidden repeats with exchanged sides."""
+CATCHES = 2
+"""Pairs of a clean and a noisy picture."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures or movies that are compared."""
+
+    id: str
+    first: Item
+    """By the method that the others are compared with."""
+    second: Item
+
+    @property
+    def comparison(self) -> tuple[str, str, str]:
+        """What a vote counts for: effect, kind, other method."""
+        return self.second.effect, self.second.kind, self.second.method
+
+
+@dataclass(frozen=True)
+class Study:
+    """The pairs of a study."""
+
+    folders: tuple[CompareFolder, ...]
+    pairs: tuple[Pair, ...]
+    """In the order of their ids."""
+    alone: int
+    """Number of pictures and movies without a counterpart."""
+    seed: int
+    votes: int
+    """Pairs that a participant judges; hidden repeats and catch pairs come on top."""
+
+    def votes_by_comparison(self) -> dict[tuple[str, str, str], float]:
+        """Return each comparison's votes by one participant, on average."""
+        sizes = Counter(pair.comparison for pair in self.pairs)
+        return dict(zip(sizes, share_turns(list(sizes.values()), self.votes), strict=True))
+
+    def media(self) -> dict[str, Item]:
+        """Return all pictures and movies of the pairs by their opaque ids."""
+        return {
+            self.medium_id(item): item for pair in self.pairs for item in (pair.first, pair.second)
+        }
+
+    def medium_id(self, item: Item) -> str:
+        """Return the opaque id of a picture or movie."""
+        return opaque(self.seed, "medium", *_place(item))
+
+    def catch_items(self) -> list[Item]:
+        """Return what catch pairs are made of: our pictures, as far as there are, or movies."""
+        own = {self.medium_id(pair.first): pair.first for pair in self.pairs}
+        best = sorted(own.items(), key=lambda entry: (entry[1].kind != "picture", entry[0]))
+        return [best[number % len(best)][1] for number in range(CATCHES)]
+
+
+def share_turns(sizes: Sequence[int], votes: int) -> list[float]:
+    """Return how many votes each group gets if groups of these sizes take turns.
+
+    In the last round, which may not be complete, each group that is left is equally likely.
+    """
+    given = [0.0] * len(sizes)
+    left = min(votes, sum(sizes))
+    for turn in range(max(sizes, default=0)):
+        waiting = [group for group, size in enumerate(sizes) if size > turn]
+        for group in waiting:
+            given[group] += min(1.0, left / len(waiting))
+        left = max(0, left - len(waiting))
+    return given
+
+
+def plan_study(folders: Sequence[CompareFolder], seed: int = 0, votes: int = VOTES) -> Study:
+    """Pair our pictures and movies with those of every other method.
+
+    Args:
+        folders: one for each scene.
+        seed: changes ids, and with them order and sides.
+        votes: pairs that a participant judges, at most; 1 to `MAX_VOTES`.
+
+    Raises:
+        UserError: two folders have the same scene, our method has two names, nothing can be paired,
+            or a text that the page shows names a method.
+    """
+    if not folders:
+        raise UserError("no comparison is given; give folders that `climatenerf compare` wrote")
+    if not 1 <= votes <= MAX_VOTES:
+        raise UserError(f"--votes must lie between 1 and {MAX_VOTES}; got {votes}")
+    for scene, count in Counter(each.scene for each in folders).items():
+        if count > 1:
+            raise UserError(f"{count} folders show the scene {scene}; give one for each scene")
+    names = sorted({folder.ours for folder in folders})
+    if len(names) > 1:
+        raise UserError(
+            f"the method of kind ours has several names ({', '.join(names)}); make the comparisons"
+            " with the same one"
+        )
+    _refuse_named_methods(folders)
+    pairs, alone = [], 0
+    for folder in folders:
+        own = {
+            (item.effect, item.kind, item.view): item
+            for item in folder.items
+            if item.method == folder.ours
+        }
+        others = [item for item in folder.items if item.method != folder.ours]
+        paired = set()
+        for item in others:
+            place = (item.effect, item.kind, item.view)
+            if place not in own:
+                alone += 1
+                continue
+            paired.add(place)
+            pairs.append(Pair(opaque(seed, "pair", *_place(item)), own[place], item))
+        alone += len(own.keys() - paired)
+    if not pairs:
+        raise UserError(
+            "nothing can be paired: no other method has a picture or movie of the same effect and"
+            " view as ours; make the comparison with another method"
+        )
+    ordered = tuple(sorted(pairs, key=lambda pair: pair.id))
+    return Study(tuple(folders), ordered, alone, seed, min(votes, len(ordered)))
+
+
+def opaque(seed: int, *words: str) -> str:
+    """Return a short id that shows nothing of what it stands for."""
+    return digest([str(seed), *words])[:10]
+
+
+def digest(words: Iterable[str]) -> str:
+    """Return a hash of words."""
+    return hashlib.sha256(json.dumps(list(words)).encode()).hexdigest()
+
+
+def _refuse_named_methods(folders: Sequence[CompareFolder]) -> None:
+    """Refuse texts that the page shows and that name a method."""
+    methods = {method.name for folder in folders for method in folder.methods}
+    for folder in folders:
+        texts = {"scene": {folder.scene}, "licence": {folder.licence or ""}}
+        texts["effect"] = {item.effect for item in folder.items}
+        for what, values in texts.items():
+            for value in values:
+                for method in methods:
+                    if method.casefold() in value.casefold():
+                        raise UserError(
+                            f"participants would see the method {method} in the {what} {value!r} of"
+                            f" {folder.folder}; rename one of them in compare.json"
+                        )
+
+
+def _place(item: Item) -> tuple[str, ...]:
+    return item.scene, item.effect, item.kind, item.view, item.method
