@@ -22,7 +22,9 @@ SOURCE = Path(climatenerf.__file__).parent
 TOP = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
 PAGES = [*(p for p in TOP if p.exists()), *sorted((ROOT / "docs").rglob("*.md"))]
 USER_PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
-VERBS = ("capture", "check", "fit", "render", "evaluate", "verify", "export", "demo")
+VERBS = ("capture", "check", "fit", "render", "evaluate", "verify", "study", "export", "demo")
+PARTS = {"study": ("make", "score")}
+"""The verbs inside a verb."""
 OTHER_PROGRAMS = {"--index-url", "--extra-index-url"}
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^[ \t]*```(\w*)\n(.*?)^[ \t]*```$", re.MULTILINE | re.DOTALL)
@@ -41,10 +43,13 @@ def anchors_of(page: Path) -> set[str]:
 
 @cache
 def options_of(verb: str) -> frozenset[str]:
-    command = [sys.executable, "-m", "climatenerf", verb, "--help"]
     environment = {**os.environ, "COLUMNS": "200"}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
-    return frozenset(re.findall(r"--[a-z][\w.-]*", done.stdout))
+    found = set()
+    for words in ([verb, part] for part in PARTS.get(verb, ("--help",))):
+        command = [sys.executable, "-m", "climatenerf", *words, "--help"]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment, check=True)
+        found.update(re.findall(r"--[a-z][\w.-]*", done.stdout))
+    return frozenset(found)
 
 
 def test_readme_is_short():

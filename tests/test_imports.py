@@ -14,7 +14,8 @@ SLOW = {"torch", "numba", "mitsuba", "scipy"}
         "climatenerf",
         "climatenerf.scene",
         "climatenerf.weather.registry climatenerf.weather.units climatenerf.weather.description",
-        "climatenerf.cli.fit climatenerf.cli.render climatenerf.cli.verify climatenerf.cli.demo",
+        "climatenerf.cli.fit climatenerf.cli.render climatenerf.cli.verify climatenerf.cli.demo"
+        " climatenerf.cli.study",
         "climatenerf.core.storage climatenerf.field.presets climatenerf.evaluation.metrics",
     ],
 )

@@ -58,6 +58,7 @@ VERBS = {
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
     "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),
     "verify": Verb("climatenerf.cli.verify", "Verify", "check the physics of this installation"),
+    "study": Verb("climatenerf.cli.study", "Study", "compare methods by a user study"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),
     "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the embedded street"),
 }
