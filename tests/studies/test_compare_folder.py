@@ -60,6 +60,7 @@ def test_a_folder_is_read(folder):
         (lambda t: t["items"][0].update(file="flood\\m0\\0.jpg"), "inside the folder"),
         (lambda t: t["items"][0].update(file="a\0.jpg"), "inside the folder"),
         (lambda t: t["items"][0].update(file="n" * 300 + ".jpg"), "item 0"),
+        (lambda t: t["items"][0].update(file="\ud800.jpg"), "is missing or no file"),
         (lambda t: t["items"][0].update(file=""), "inside the folder"),
     ],
 )

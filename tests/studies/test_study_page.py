@@ -74,7 +74,6 @@ def test_comparisons_take_turns():
     [
         (lambda t: t.update(scene="ditch"), "2 folders show the scene ditch"),
         (lambda t: t.update(scene="by ClimateNeRF"), "the method climatenerf in the scene"),
-        (lambda t: t.update(licence="CC0, ARF-9"), "the method ARF-9 in the licence"),
         (lambda t: t["items"][0].update(effect="global mk"), "the method global MK in the effect"),
     ],
 )
@@ -87,6 +86,16 @@ def test_what_participants_could_tell_methods_by_is_refused(tmp_path, change, ex
     both = [read_compare_folder(tmp_path / scene) for scene in ("ditch", "road")]
     with pytest.raises(UserError, match=expected):
         plan_study(both)
+
+
+def test_licence_lines_that_name_a_method_are_hidden_and_parts_of_words_are_no_names(tmp_path):
+    folders(tmp_path, effects=("flood",), views=1)
+    file = tmp_path / "road" / "compare.json"
+    table = json.loads(file.read_text())
+    table |= {"licence": "Apache-2.0, part of ClimateNeRF", "scene": "ARF-99"}
+    file.write_text(json.dumps(table))
+    both = [read_compare_folder(tmp_path / scene) for scene in ("ditch", "road")]
+    assert plan_study(both).sources() == (["ditch: photos of ditch, CC0"], ["ARF-99"])
 
 
 def test_studies_that_cannot_be(tmp_path):

@@ -120,6 +120,14 @@ def test_intervals_of_participants_are_repeatable_and_contain_the_share():
     assert 0.4 < low < found.ours.share < high < 0.9
 
 
+def test_bootstrap_samples_without_votes_for_a_comparison_are_left_out():
+    """One of three participants judged pair b, so most samples miss that vote at times."""
+    votes = [vote(1, 1, "b"), vote(1, 2, "b", first=False)]
+    votes += [vote(person, 3, "a") for person in (1, 2, 3)]
+    scores = score(votes, KEY, resamples=200)
+    assert scores.comparisons[0].interval_of_participants == (0.5, 0.5)
+
+
 def test_files_are_read_in_any_number_and_repeated_lines_count_once(tmp_path):
     votes = [vote(1, 1, "a"), vote(1, 2, "b", left_first=False), vote(2, 1, "c", first=False)]
     early = write_votes(tmp_path / "early.csv", [row(votes[0])])

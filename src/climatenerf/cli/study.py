@@ -90,6 +90,11 @@ def run_make(options: Make) -> int:
         progress.warn(
             f"the sides of {written.unequal} pairs differ in size, which participants may notice"
         )
+    for scene in study.sources()[1]:
+        progress.warn(
+            f"the licence line of {scene} names a method, so the page does not show it; give it to"
+            " the participants after the study"
+        )
     progress.result(f"page for participants: {options.out / PAGE}")
     if not written.inline:
         progress.result(f"  with its media beside it in {options.out / 'media'}")
@@ -168,7 +173,8 @@ def write_scores(scores: "Scores", out: Path) -> None:
 
 def table(scores: "Scores") -> str:
     """Return the scores as aligned lines."""
-    rows = [("effect", "kind", "against", "votes", "for ours", "95 %", "participants", "p", "Holm")]
+    intervals = ("95 % by votes", "by participants")
+    rows = [("effect", "kind", "against", "votes", "for ours", *intervals, "p", "Holm")]
     for each in scores.comparisons:
         ours, people = each.ours, each.interval_of_participants
         name = (each.effect, each.kind, each.other, str(ours.votes))

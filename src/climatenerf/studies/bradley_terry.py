@@ -74,8 +74,6 @@ def bootstrap_interval(
     """
     if participants < 2:
         return None
-    reach = stats.t.ppf(1 - level / 2, participants - 1) * np.sqrt(
-        participants / (participants - 1)
-    )
-    tail = float(stats.norm.cdf(-reach))
-    return np.quantile(values, [tail, 1 - tail], axis=0)
+    wider = np.sqrt(participants / (participants - 1))
+    tail = float(stats.norm.cdf(-wider * stats.t.ppf(1 - level / 2, participants - 1)))
+    return np.nanquantile(values, [tail, 1 - tail], axis=0)

@@ -142,7 +142,7 @@ def _inside(folder: Path, name: str, where: str) -> Path:
     check_regular(path, where)
     try:
         exists = path.is_file()
-        inside = path.resolve().is_relative_to(folder.resolve())
+        inside = exists and path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError) as error:  # a name too long; a loop of links
         raise UserError(
             f"file in {where}: {excerpt(name)} cannot be used; correct it or make it again"

@@ -6,6 +6,7 @@ computed in the page, from hashes of study and participant.
 
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -55,6 +56,16 @@ class Study:
         sizes = Counter(pair.comparison for pair in self.pairs)
         return dict(zip(sizes, share_turns(list(sizes.values()), self.votes), strict=True))
 
+    def sources(self) -> tuple[list[str], list[str]]:
+        """Return scenes with their licence lines, and scenes whose line names a method."""
+        shown, hidden = [], []
+        for folder in self.folders:
+            if folder.licence and names_a_method(folder.licence, self.folders):
+                hidden.append(folder.scene)
+            elif folder.licence:
+                shown.append(f"{folder.scene}: {folder.licence}")
+        return shown, hidden
+
     def media(self) -> dict[str, Item]:
         """Return all pictures and movies of the pairs by their opaque ids."""
         return {
@@ -97,7 +108,7 @@ def plan_study(folders: Sequence[CompareFolder], seed: int = 0, votes: int = VOT
 
     Raises:
         UserError: two folders have the same scene, our method has two names, nothing can be paired,
-            or a text that the page shows names a method.
+            or a scene or effect, which the page shows, names a method.
     """
     if not folders:
         raise UserError("no comparison is given; give folders that `climatenerf compare` wrote")
@@ -113,23 +124,9 @@ def plan_study(folders: Sequence[CompareFolder], seed: int = 0, votes: int = VOT
             " with the same one"
         )
     _refuse_named_methods(folders)
-    pairs, alone = [], 0
-    for folder in folders:
-        own = {
-            (item.effect, item.kind, item.view): item
-            for item in folder.items
-            if item.method == folder.ours
-        }
-        others = [item for item in folder.items if item.method != folder.ours]
-        paired = set()
-        for item in others:
-            place = (item.effect, item.kind, item.view)
-            if place not in own:
-                alone += 1
-                continue
-            paired.add(place)
-            pairs.append(Pair(opaque(seed, "pair", *_place(item)), own[place], item))
-        alone += len(own.keys() - paired)
+    paired = [_pairs_of(folder, seed) for folder in folders]
+    pairs = [pair for found, _ in paired for pair in found]
+    alone = sum(left for _, left in paired)
     if not pairs:
         raise UserError(
             "nothing can be paired: no other method has a picture or movie of the same effect and"
@@ -149,20 +146,43 @@ def digest(words: Iterable[str]) -> str:
     return hashlib.sha256(json.dumps(list(words)).encode()).hexdigest()
 
 
+def _pairs_of(folder: CompareFolder, seed: int) -> tuple[list[Pair], int]:
+    """Return the pairs of a scene, and the number of items without a counterpart."""
+    own, others = {}, []
+    for item in folder.items:
+        if item.method == folder.ours:
+            own[item.effect, item.kind, item.view] = item
+        else:
+            others.append(item)
+    pairs = []
+    for item in others:
+        first = own.get((item.effect, item.kind, item.view))
+        if first is not None:
+            pairs.append(Pair(opaque(seed, "pair", *_place(item)), first, item))
+    used = {pair.first for pair in pairs}
+    return pairs, len(others) - len(pairs) + len(own) - len(used)
+
+
+def names_a_method(text: str, folders: Sequence[CompareFolder]) -> str | None:
+    """Return a method whose name a text has as whole words, in any case; None if there is none."""
+    for method in sorted({method.name for folder in folders for method in folder.methods}):
+        if re.search(rf"(?<!\w){re.escape(method)}(?!\w)", text, re.IGNORECASE):
+            return method
+    return None
+
+
 def _refuse_named_methods(folders: Sequence[CompareFolder]) -> None:
-    """Refuse texts that the page shows and that name a method."""
-    methods = {method.name for folder in folders for method in folder.methods}
+    """Refuse scenes and effects, which the page shows, that name a method."""
     for folder in folders:
-        texts = {"scene": {folder.scene}, "licence": {folder.licence or ""}}
-        texts["effect"] = {item.effect for item in folder.items}
-        for what, values in texts.items():
-            for value in values:
-                for method in methods:
-                    if method.casefold() in value.casefold():
-                        raise UserError(
-                            f"participants would see the method {method} in the {what} {value!r} of"
-                            f" {folder.folder}; rename one of them in compare.json"
-                        )
+        shown = {"scene": {folder.scene}, "effect": {item.effect for item in folder.items}}
+        for what, texts in shown.items():
+            for text in sorted(texts):
+                method = names_a_method(text, folders)
+                if method is not None:
+                    raise UserError(
+                        f"participants would see the method {method} in the {what} {text!r} of"
+                        f" {folder.folder}; rename one of them in compare.json"
+                    )
 
 
 def _place(item: Item) -> tuple[str, ...]:

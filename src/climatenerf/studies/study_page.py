@@ -162,7 +162,7 @@ def _page_data(study: Study, name: str, contents: Contents) -> dict[str, Any]:
         "repeats": REPEATS,
         "pairs": [shown(pair) for pair in contents.pairs if not pair["catch"]],
         "catches": [shown(pair) for pair in contents.pairs if pair["catch"]],
-        "sources": [f"{each.scene}: {each.licence}" for each in study.folders if each.licence],
+        "sources": study.sources()[0],
         "media": {each: medium(each) for each in sorted(contents.media)},
     }
 

@@ -153,7 +153,8 @@ function loaded(id, label) {
     node.draggable = false;
   }
   return new Promise((resolve, reject) => {
-    node.addEventListener(movie ? "canplaythrough" : "load", () => resolve(node), { once: true });
+    // Phones load no more than the head of a movie before it plays.
+    node.addEventListener(movie ? "loadedmetadata" : "load", () => resolve(node), { once: true });
     node.addEventListener("error", () => reject(new Error(id)), { once: true });
     node.src = urlOf(id);
     if (movie) node.load();
