@@ -104,6 +104,8 @@ def test_a_participant_judges_72_pairs_with_a_reload(browser, study, tmp_path):
         left, _ = shown(page)
         pair = key.pairs[page.evaluate("trials[votes.length].pair.id")]
         first = pair.catch or pair.effect != "snow"
+        question = f"{pair.effect.capitalize()}: which one looks more realistic?"
+        assert page.inner_text("#question") == question
         assert not [name for name in METHODS if name.casefold() in page.content().casefold()]
         vote(page, "1" if (left == pair.first) == first else "2")
     page.wait_for_selector("#end:not([hidden])")

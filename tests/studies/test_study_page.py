@@ -61,6 +61,21 @@ def test_what_has_no_counterpart_is_left_out_and_counted(tmp_path):
     assert len(study.pairs) == 4 and study.alone == 4
 
 
+def test_methods_can_be_left_out(tmp_path):
+    both = folders(tmp_path, effects=("flood",), views=1)
+    study = plan_study(both, without=METHODS[2:4])
+    assert {pair.second.method for pair in study.pairs} == {METHODS[1], METHODS[4]}
+    assert study.alone == 0 and len(study.pairs) == 4
+    written(study, tmp_path / "out")
+    text = (tmp_path / "out" / "key.json").read_text()
+    assert METHODS[4] in text and METHODS[2] not in text
+    for name in ("painter", METHODS[0]):
+        with pytest.raises(UserError, match=f"no method '{name}' to leave out; use one of ARF-9"):
+            plan_study(both, without=[name])
+    with pytest.raises(UserError, match="nothing can be paired"):
+        plan_study(both, without=METHODS[1:])
+
+
 def test_comparisons_take_turns():
     assert share_turns([4, 4, 4], 12) == [4, 4, 4]
     assert share_turns([4, 4, 4], 6) == [2, 2, 2]

@@ -33,6 +33,8 @@ class Make:
     votes: int = 72
     """Pairs that each participant judges, at most. Three hidden repeats and two catch pairs come on
     top."""
+    without: tuple[str, ...] = ()
+    """Methods to leave out, such as frame-noise."""
     seed: int = 0
     """Changes ids, order and sides."""
 
@@ -78,7 +80,7 @@ def run_make(options: Make) -> int:
     from climatenerf.studies.study_page import KEY, PAGE, write_study
 
     folders = [read_compare_folder(folder) for folder in options.folders]
-    study = plan_study(folders, options.seed, options.votes)
+    study = plan_study(folders, options.seed, options.votes, options.without)
     with progress.Bar("study", 1.0) as bar:
         written = write_study(study, options.out, lambda done, total: bar.update(done / total))
     if study.alone:
@@ -113,8 +115,8 @@ def size_text(study: "Pairs") -> str:
     lines = [
         f"{len(study.pairs)} pairs in {len(counts)} comparisons of effect, kind and method.",
         f"Each participant judges {study.votes} pairs, up to {REPEATS} of them twice, and"
-        f" {CATCHES} catch pairs:",
-        f"at least {fewest:.3g} votes for each comparison.",
+        f" {CATCHES} catch pairs.",
+        f"Votes of a participant for each comparison, on average: {fewest:.3g} or more.",
         "",
         "Votes that show a share for ours with 80 % power (two-sided binomial test, 5 %), and the",
         f"participants for them; the last column holds for the strictest of {len(counts)} tests.",

@@ -9,9 +9,9 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, excerpt
 from climatenerf.studies.compare_folder import CompareFolder, Item
 
 VOTES = 72
@@ -98,17 +98,24 @@ def share_turns(sizes: Sequence[int], votes: int) -> list[float]:
     return given
 
 
-def plan_study(folders: Sequence[CompareFolder], seed: int = 0, votes: int = VOTES) -> Study:
+def plan_study(
+    folders: Sequence[CompareFolder],
+    seed: int = 0,
+    votes: int = VOTES,
+    without: Sequence[str] = (),
+) -> Study:
     """Pair our pictures and movies with those of every other method.
 
     Args:
         folders: one for each scene.
         seed: changes ids, and with them order and sides.
         votes: pairs that a participant judges, at most; 1 to `MAX_VOTES`.
+        without: names of other methods that are left out.
 
     Raises:
-        UserError: two folders have the same scene, our method has two names, nothing can be paired,
-            or a scene or effect, which the page shows, names a method.
+        UserError: a method to leave out does not exist or is ours, two folders have the same scene,
+            our method has two names, nothing can be paired, or a scene or effect, which the page
+            shows, names a method.
     """
     if not folders:
         raise UserError("no comparison is given; give folders that `climatenerf compare` wrote")
@@ -123,6 +130,7 @@ def plan_study(folders: Sequence[CompareFolder], seed: int = 0, votes: int = VOT
             f"the method of kind ours has several names ({', '.join(names)}); make the comparisons"
             " with the same one"
         )
+    folders = _left_out(folders, without)
     _refuse_named_methods(folders)
     paired = [_pairs_of(folder, seed) for folder in folders]
     pairs = [pair for found, _ in paired for pair in found]
@@ -144,6 +152,25 @@ def opaque(seed: int, *words: str) -> str:
 def digest(words: Iterable[str]) -> str:
     """Return a hash of words."""
     return hashlib.sha256(json.dumps(list(words)).encode()).hexdigest()
+
+
+def _left_out(folders: Sequence[CompareFolder], without: Sequence[str]) -> list[CompareFolder]:
+    """Return the folders without some methods."""
+    others = {method.name for folder in folders for method in folder.methods} - {folders[0].ours}
+    unknown = sorted(set(without) - others)
+    if unknown:
+        raise UserError(
+            f"--without: there is no method {excerpt(unknown[0])} to leave out; use one of"
+            f" {', '.join(sorted(others))}"
+        )
+    return [
+        replace(
+            folder,
+            methods=tuple(each for each in folder.methods if each.name not in without),
+            items=tuple(each for each in folder.items if each.method not in without),
+        )
+        for folder in folders
+    ]
 
 
 def _pairs_of(folder: CompareFolder, seed: int) -> tuple[list[Pair], int]:

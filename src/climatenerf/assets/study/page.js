@@ -174,6 +174,10 @@ async function showTrial() {
   if (votes.length >= trials.length) return showEnd();
   show("trial");
   const number = ++shown, trial = trials[votes.length];
+  // Without the effect, a picture that shows none would look the most realistic.
+  const { effect } = trial.pair;
+  element("question").textContent =
+    `${effect[0].toUpperCase()}${effect.slice(1)}: which one looks more realistic?`;
   element("position").textContent = `${votes.length + 1} of ${trials.length}`;
   const bar = document.querySelector(".bar");
   bar.setAttribute("aria-valuemax", trials.length);
