@@ -176,7 +176,8 @@ def write_scores(scores: "Scores", out: Path) -> None:
 def table(scores: "Scores") -> str:
     """Return the scores as aligned lines."""
     intervals = ("95 % by votes", "by participants")
-    rows = [("effect", "kind", "against", "votes", "for ours", *intervals, "p", "Holm")]
+    heads = ("effect", "kind", "against", "votes", "for ours", *intervals, "p", "Holm")
+    rows: list[tuple[str, ...]] = [heads]
     for each in scores.comparisons:
         ours, people = each.ours, each.interval_of_participants
         name = (each.effect, each.kind, each.other, str(ours.votes))
