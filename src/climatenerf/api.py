@@ -335,14 +335,14 @@ def render_movie(
         effects=used,
         digest=run.digest,
         complete_ground=complete_ground,
+        style=run.style,
     )
 
     def prepare() -> "jobs.FrameSource":
         from climatenerf.weather.world import Kept
 
         field = run.completed(progress) if complete_ground else run.field
-        kept = Kept(run.folder, job.run)
-        return jobs.frame_source(job, field, run.scene, progress, kept, run.style)
+        return jobs.frame_source(job, field, run.scene, progress, Kept(run.folder, job.run))
 
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)

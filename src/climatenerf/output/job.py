@@ -93,6 +93,7 @@ class RenderJob:
             the mean.
         effects: The effects that the weather has sections for.
         complete_ground: Whether the terrain stands in where no photo shows the ground.
+        style: New colours of the run, of which `run` is a hash as well; None: those of the photos.
     """
 
     run: str
@@ -105,6 +106,7 @@ class RenderJob:
     appearance: int | None = None
     effects: tuple[Effect, ...] = EFFECTS
     complete_ground: bool = True
+    style: Style | None = None
 
     @property
     def table(self) -> dict[str, Layer]:
@@ -164,6 +166,7 @@ def plan(
     effects: Sequence[Effect] = EFFECTS,
     digest: str | None = None,
     complete_ground: bool = True,
+    style: Style | None = None,
 ) -> RenderJob:
     """Return the job that renders a fitted run along a path.
 
@@ -179,6 +182,7 @@ def plan(
         effects: the effects that the weather has sections for.
         digest: hash of the run's files that were read; None takes that of the files as they are.
         complete_ground: whether the terrain stands in where no photo shows the ground.
+        style: new colours of the run; None: those of the photos.
 
     Raises:
         UserError: a value is out of range, the frames are too large, the run is incomplete, or EXR
@@ -203,6 +207,7 @@ def plan(
         appearance,
         tuple(effects),
         complete_ground,
+        style,
     )
 
 
@@ -439,7 +444,6 @@ def frame_source(
     scene: Scene,
     progress: Progress | None = None,
     kept: "Kept | None" = None,
-    style: Style | None = None,
 ) -> FrameSource:
     """Prepare light, waves and snow for a job, and return what renders its frames.
 
@@ -449,7 +453,6 @@ def frame_source(
         scene: the capture of its run.
         progress: called with what is being prepared and the fraction that is done.
         kept: the run folder, where what is found in the field is kept; None: nowhere.
-        style: new colours of the scene; None: those of the photos.
 
     Raises:
         UserError: the weather does not fit the scene.
@@ -464,7 +467,16 @@ def frame_source(
     times = np.array([job.time(index) for index in range(len(job))])
     positions = job.path.c2w[:, :3, 3]
     session = RenderSession(
-        field, scene, job.weather, positions, times, appearance, progress, job.effects, kept, style
+        field,
+        scene,
+        job.weather,
+        positions,
+        times,
+        appearance,
+        progress,
+        job.effects,
+        kept,
+        job.style,
     )
 
     def render(index: int, preview: Preview | None) -> RenderedFrame:
@@ -533,6 +545,8 @@ def _sidecar(job: RenderJob, scene: Scene, out: Path) -> dict[str, Any]:
     about: dict[str, Any] = {"path": job.path.name, "notes": list(job.path.notes), "fps": job.fps}
     about["appearance_of_training_view"] = job.appearance  # null: the mean
     about["complete_ground"] = job.complete_ground
+    if job.style is not None:
+        about["style"] = {name: getattr(job.style, name) for name in ("name", "sources", "note")}
     about |= {"supersample": job.supersample, "frames_wanted": len(job), "render": job.key, **facts}
     seed = job.weather.base.seed
     weather = weather_to_table(job.weather, job.effects)
