@@ -22,7 +22,19 @@ SOURCE = Path(climatenerf.__file__).parent
 TOP = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
 PAGES = [*(p for p in TOP if p.exists()), *sorted((ROOT / "docs").rglob("*.md"))]
 USER_PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
-VERBS = ("capture", "check", "fit", "render", "evaluate", "verify", "study", "export", "demo")
+VERBS = (
+    "capture",
+    "check",
+    "fit",
+    "stylize",
+    "render",
+    "evaluate",
+    "compare",
+    "verify",
+    "study",
+    "export",
+    "demo",
+)
 PARTS = {"study": ("make", "score")}
 """The verbs inside a verb."""
 OTHER_PROGRAMS = {"--index-url", "--extra-index-url"}

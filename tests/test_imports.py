@@ -15,7 +15,7 @@ SLOW = {"torch", "numba", "mitsuba", "scipy"}
         "climatenerf.scene",
         "climatenerf.weather.registry climatenerf.weather.units climatenerf.weather.description",
         "climatenerf.cli.fit climatenerf.cli.render climatenerf.cli.verify climatenerf.cli.demo"
-        " climatenerf.cli.study",
+        " climatenerf.cli.study climatenerf.cli.compare climatenerf.cli.stylize",
         "climatenerf.core.storage climatenerf.field.presets climatenerf.evaluation.metrics",
     ],
 )

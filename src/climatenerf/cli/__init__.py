@@ -57,6 +57,7 @@ VERBS = {
     "stylize": Verb("climatenerf.cli.stylize", "Stylize", "give a run the colours of a season"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
     "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),
+    "compare": Verb("climatenerf.cli.compare", "Compare", "compare weather with other methods"),
     "verify": Verb("climatenerf.cli.verify", "Verify", "check the physics of this installation"),
     "study": Verb("climatenerf.cli.study", "Study", "compare methods by a user study"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),

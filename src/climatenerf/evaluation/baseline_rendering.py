@@ -1,6 +1,7 @@
-"""Apply the picture baselines to one weather of the reference set, with tuned constants."""
+"""Apply the picture baselines to one weather, with tuned constants."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -9,12 +10,34 @@ from jaxtyping import Float, UInt8
 from climatenerf.core.srgb import linear_colour, to_display
 from climatenerf.evaluation import baselines
 from climatenerf.evaluation.baselines import CleanView
-from climatenerf.evaluation.reference import WeatherTruth
 from climatenerf.ops.wave_tracing import surface as wave_surface
+from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.flood import optics, waves
 from climatenerf.weather.smog import medium as smog
 
 Picture = UInt8[np.ndarray, "h w 3"]
+
+
+class WeatherAtTime(Protocol):
+    """A weather and the moment that is shown: a `WeatherMoment`, or one of the reference set."""
+
+    @property
+    def weather(self) -> KeyframedWeather:
+        """The weather over time."""
+        ...
+
+    @property
+    def time(self) -> float:
+        """The moment, s."""
+        ...
+
+
+@dataclass(frozen=True)
+class WeatherMoment:
+    """A weather and the moment that is shown, s."""
+
+    weather: KeyframedWeather
+    time: float
 
 
 @dataclass(frozen=True)
@@ -35,7 +58,7 @@ class Constants:
 
 
 def tune(
-    case: WeatherTruth, ground_z: float, views: list[CleanView], true: list[Picture]
+    case: WeatherAtTime, ground_z: float, views: list[CleanView], true: list[Picture]
 ) -> Constants:
     """Fit the baselines' constants for one weather to its true pictures.
 
@@ -75,7 +98,12 @@ def _without(
 
 
 def render_baseline(
-    case: WeatherTruth, ground_z: float, view: CleanView, constants: Constants, name: str, seed: int
+    case: WeatherAtTime,
+    ground_z: float,
+    view: CleanView,
+    constants: Constants,
+    name: str,
+    seed: int,
 ) -> Float[np.ndarray, "h w 3"] | None:
     """Return the display picture of a baseline; None where it cannot show this weather.
 
@@ -115,7 +143,7 @@ def render_baseline(
 
 
 def _reflection(
-    case: WeatherTruth, ground_z: float, view: CleanView
+    case: WeatherAtTime, ground_z: float, view: CleanView
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Return reflected radiance and reflectance in screen space, with the waves of our renders."""
     weather = case.weather.at(case.time)

@@ -34,9 +34,7 @@ class Frame:
 def warp_error(frame: Frame, other: Frame) -> float:
     """Return the RMS difference between a frame and another one warped to it, over its contrast.
 
-    The surface point of each pixel is projected into the other frame, whose colour is interpolated
-    bilinearly. Water, sky and points hidden from the other camera are left out. The contrast is the
-    standard deviation of the frame's colours over the same pixels.
+    The contrast is the standard deviation of the frame's colours over the compared pixels.
 
     Args:
         frame: at time t.
@@ -44,6 +42,36 @@ def warp_error(frame: Frame, other: Frame) -> float:
 
     Returns:
         0 for a rigid scene of diffuse surfaces; NaN if fewer than `MIN_PIXELS` are common.
+    """
+    compared = _compared(frame, other)
+    if compared is None:
+        return float("nan")
+    colour, warped = compared
+    contrast = np.sqrt(((colour - colour.mean(0)) ** 2).mean())
+    # 1e-6: a frame of one colour has no contrast, 0/0.
+    return float(np.sqrt(((colour - warped) ** 2).mean()) / max(contrast, 1e-6))
+
+
+def warp_difference(frame: Frame, other: Frame) -> float:
+    """Return the RMS difference between a frame and another one warped to it, display value.
+
+    Arguments and NaN are those of `warp_error`. This is for surfaces that may be of one colour.
+    """
+    compared = _compared(frame, other)
+    if compared is None:
+        return float("nan")
+    colour, warped = compared
+    return float(np.sqrt(((colour - warped) ** 2).mean()))
+
+
+def _compared(
+    frame: Frame, other: Frame
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]] | None:
+    """Return the colours of a frame, and those of another frame at the same surface points.
+
+    The surface point of each pixel is projected into the other frame, whose colour is interpolated
+    bilinearly. Excluded pixels, sky and points hidden from the other camera are left out. None if
+    fewer than `MIN_PIXELS` are common.
     """
     compared = np.isfinite(frame.depth) & ~frame.excluded
     rays = frame.camera.directions() @ frame.c2w[:3, :3].T
@@ -54,12 +82,8 @@ def warp_error(frame: Frame, other: Frame) -> float:
     visible = np.abs(other.depth[row, column] - distance) < DEPTH_TOLERANCE * distance
     compared &= inside & visible & ~other.excluded[row, column]
     if compared.sum() < MIN_PIXELS:
-        return float("nan")
-    warped = bilinear(other.picture, other.camera.project(local[compared]))
-    colour = frame.picture[compared]
-    contrast = np.sqrt(((colour - colour.mean(0)) ** 2).mean())
-    # 1e-6: a frame of one colour has no contrast, 0/0.
-    return float(np.sqrt(((colour - warped) ** 2).mean()) / max(contrast, 1e-6))
+        return None
+    return frame.picture[compared], bilinear(other.picture, other.camera.project(local[compared]))
 
 
 def bilinear(

@@ -135,7 +135,7 @@ def check_foreign_files(
 
 def is_simulated(path: Path) -> bool:
     """Return whether a file is a PNG that this program wrote, such as a killed render's preview."""
-    return _png_text(path, "simulated") is not None
+    return png_text(path, "simulated") is not None
 
 
 def working_folder(out: Path, key: str) -> Path:
@@ -208,7 +208,7 @@ def frame_record(out: Path, index: int, key: str) -> dict[str, Any] | None:
             sound = record["key"] == key and sizes == list(files.values())
         except (UserError, OSError, KeyError, TypeError, ValueError, AttributeError):
             continue
-        if sound and _png_text(folder / picture, "key") == key:
+        if sound and png_text(folder / picture, "key") == key:
             return record
     return None
 
@@ -365,7 +365,7 @@ def locked(out: Path, *, wait: float | None = None) -> Iterator[None]:
         yield
 
 
-def _png_text(path: Path, name: str) -> str | None:
+def png_text(path: Path, name: str) -> str | None:
     """Return a text chunk of a PNG; None where there is no such file or chunk."""
     from PIL import Image
 
