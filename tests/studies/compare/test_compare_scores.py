@@ -32,7 +32,9 @@ def test_noise_of_each_frame_is_seen_by_every_score(flood):
     clean = movie_scores(flood, flood.clean.picture, own_depth=False)
     scores = movie_scores(flood, noisy, own_depth=False)
     assert scores.warp_next > 5 * clean.warp_next and scores.warp_far > 5 * clean.warp_far
-    assert scores.water_warp_next > 0.3 and scores.water_warp_far > 0.3
+    # Noise of 23.4 levels rms in one frame, less in the interpolated one; 20 more at odd frames.
+    assert 0.1 < scores.water_warp_far < np.sqrt(2) * 23.4 / 255 + 0.01
+    assert scores.water_warp_far < scores.water_warp_next < 0.16
     assert scores.edge_ssim < 0.7
     assert scores.flicker * 255 == pytest.approx(20, abs=4)
 

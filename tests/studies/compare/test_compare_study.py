@@ -198,9 +198,10 @@ def test_a_method_that_stops_goes_on_where_it_was(tmp_path):
     assert store.missing() == [2, 3]
     further = Counting()
     fractions = []
-    assert make_frames(further, material, store, fractions.append)
+    make_frames(further, material, store, fractions.append)
     assert further.edited == [2, 3] and fractions == [0.5, 0.75, 1.0]
-    assert store.missing() == [] and not make_frames(Counting(), material, store, said)
+    assert store.missing() == []
+    make_frames(Counting(fails_at=0), material, store, said)  # nothing is left to edit
     assert [store.picture(i)[0, 0, 0] for i in range(4)] == [0, 1, 2, 3]
     record = json.loads((store.folder / "frames.json").read_text())
     assert len(record["seconds"]) == 4 and store.mean_seconds() >= 0
@@ -208,6 +209,26 @@ def test_a_method_that_stops_goes_on_where_it_was(tmp_path):
     assert other.missing() == [0, 1] and np.isnan(other.mean_seconds())
     other.remove_surplus()
     assert sorted(p.name for p in (store.folder / "frames").iterdir()) == ["0000.png", "0001.png"]
+
+
+def test_a_movie_is_written_again_when_a_frame_or_the_rate_has_changed(tmp_path):
+    material = make_material(tmp_path, "flood", frames=2)
+    store = store_of(Counting(), material, tmp_path / "frames-of-it")
+    make_frames(Counting(), material, store, said)
+
+    def written():
+        store.write_movie(material.size, 12.0)
+        return (store.folder / "movie.mp4").stat().st_mtime_ns
+
+    first = written()
+    assert written() == first
+    store.save(1, material.clean.picture(1), 0.1)
+    second = written()
+    assert second > first and written() == second
+    store.write_movie(material.size, 6.0)
+    assert written() > second
+    (store.folder / "movie.mp4").unlink()
+    assert written() > second
 
 
 def test_times_are_shared_by_what_is_made_at_once(tmp_path):

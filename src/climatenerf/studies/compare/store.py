@@ -65,10 +65,10 @@ class FrameStore:
         self.keep_seconds(index, seconds)
 
     def keep_seconds(self, index: int, seconds: float) -> None:
-        """Record the seconds that a frame took."""
+        """Record the seconds that a frame took, and that the movie is out of date."""
         times = self._seconds()
         times[index] = seconds
-        write_json(self.folder / RECORD, {"schema_version": 1, "key": self.key, "seconds": times})
+        self._write_record({"seconds": times})
 
     def timed(self, source: FrameSource) -> FrameSource:
         """Return a source of rendered frames that records the seconds of each."""
@@ -92,29 +92,39 @@ class FrameStore:
             if path.stem.isdecimal() and int(path.stem) >= self.count:
                 path.unlink(missing_ok=True)
 
-    def write_movie(self, size: tuple[int, int], fps: float, changed: bool) -> Path:
-        """Write the movie if a frame has changed or it is absent, and return its path.
+    def write_movie(self, size: tuple[int, int], fps: float) -> None:
+        """Write the movie, unless it was written from these frames.
 
         Raises:
             UserError: ffmpeg fails, or a disk error.
         """
-        path = self.folder / MOVIE
-        if changed or not path.is_file():
-            with MovieWriter(path, size, fps) as movie:
-                for index in range(self.count):
-                    movie.add(self.picture(index))
-        return path
+        path, record = self.folder / MOVIE, self._record()
+        if path.is_file() and record.get("movie") == [fps, path.stat().st_size]:
+            return
+        with MovieWriter(path, size, fps) as movie:
+            for index in range(self.count):
+                movie.add(self.picture(index))
+        self._write_record({**record, "movie": [fps, path.stat().st_size]})
 
     def _key(self, index: int) -> str:
         return hash_of([self.key, index])
 
     def _seconds(self) -> list[float | None]:
         with contextlib.suppress(UserError):
-            record = read_json(self.folder / RECORD)
-            times = parsing.items(record, "seconds", RECORD)
-            if record.get("key") == self.key and len(times) == self.count:
+            times = parsing.items(self._record(), "seconds", RECORD)
+            if len(times) == self.count:
                 return [None if each is None else _time(each) for each in times]
         return [None] * self.count
+
+    def _record(self) -> dict[str, Any]:
+        """Return the record of these frames; empty if it is absent, damaged or of others."""
+        with contextlib.suppress(UserError):
+            record = read_json(self.folder / RECORD)
+            return record if record.get("key") == self.key else {}
+        return {}
+
+    def _write_record(self, record: dict[str, Any]) -> None:
+        write_json(self.folder / RECORD, {**record, "schema_version": 1, "key": self.key})
 
 
 def store_of(method: Method, material: Material, folder: Path) -> FrameStore:
@@ -133,8 +143,8 @@ def store_of(method: Method, material: Material, folder: Path) -> FrameStore:
 
 def make_frames(
     method: Method, material: Material, store: FrameStore, progress: Callable[[float], None]
-) -> bool:
-    """Let a method edit the frames that are missing; return whether there were any.
+) -> None:
+    """Let a method edit the frames that are missing.
 
     Args:
         method: the method.
@@ -154,7 +164,6 @@ def make_frames(
             store.save(index, picture, seconds)
             progress(1 - (len(missing) - done - 1) / store.count)
     store.remove_surplus()
-    return bool(missing)
 
 
 def _timed(pictures: Iterator[Picture], count: int) -> Iterator[tuple[Picture, float]]:

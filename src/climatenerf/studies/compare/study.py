@@ -235,11 +235,9 @@ class _Comparison:
         """Let a method edit the frames that are missing, and write its movie."""
         place = Path(material.reel, material.effect, method.name)
         store = store_of(method, material, self.out / place)
-        changed = make_frames(
-            method, material, store, lambda fraction: self.progress(str(place), fraction)
-        )
+        make_frames(method, material, store, lambda done: self.progress(str(place), done))
         if not material.reel:
-            store.write_movie(material.size, self.plan.fps, changed)
+            store.write_movie(material.size, self.plan.fps)
         return store
 
     def score_truth(self, truth: TrueViews, made: dict[str, list[report.Made]]) -> None:
