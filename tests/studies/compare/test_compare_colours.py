@@ -8,6 +8,7 @@ from support.compared_frames import BLUE, WATER_X, eight_bit, make_material
 
 from climatenerf.core.classes import BUILDING, ROAD, SKY, VEGETATION
 from climatenerf.core.srgb import LUMA
+from climatenerf.evaluation.baselines import depth_fog
 from climatenerf.output.video import write_png
 from climatenerf.studies.compare import colours
 from climatenerf.studies.compare.stand_ins import SHOWN, STAND_INS, StandIn, fitted_frames
@@ -121,6 +122,19 @@ def test_the_flat_plane_gets_the_colour_of_our_water(materials, tmp_path):
     assert np.abs(picture[ground].astype(int) - eight_bit(BLUE)).max() <= 6
     np.testing.assert_array_equal(picture[~ground], material.clean.picture(0)[~ground])
     assert WATER_X > 0
+
+
+def test_the_fog_finds_the_colour_and_the_extinction_of_its_target(tmp_path):
+    """The target is such a fog, of half the nominal extinction and of a blue colour."""
+    material = make_material(tmp_path, "smog")
+    nominal = -np.log(0.05) / 30.0  # of the visibility of 30 m
+    views = [material.view(i) for i in range(3)]
+    true = tuple(eight_bit(depth_fog(view, nominal / 2, BLUE)) for view in views)
+    pictures = edited(replace(material, true=true), "depth-fog", tmp_path)
+    for picture, wanted in zip(pictures, true, strict=True):
+        assert np.abs(picture.astype(int) - wanted).mean() < 3
+    plain = edited(material, "depth-fog", tmp_path)
+    assert np.abs(plain[0].astype(int) - true[0]).mean() > 10
 
 
 def test_white_paint_covers_level_ground_in_one_colour(materials, tmp_path):

@@ -1,6 +1,7 @@
 """A whole comparison of the toy scene: what it writes, and that it resumes."""
 
 import json
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +46,10 @@ def plan_of(scene, **changes):
     return replace(study.Plan(path, 12.0, {"smog": SMOG}, 0), **changes)
 
 
+def no_network(*_, **__):
+    raise AssertionError("a network connection was opened")
+
+
 def never(progress):
     raise AssertionError("a finished frame is rendered again")
 
@@ -64,7 +69,15 @@ def made(scene, tmp_path_factory):
     truth = cases.TrueViews(path, {"smog": SMOG}, {"smog": true})
     method = FrameFolder("theirs", theirs)
     plan = plan_of(scene, methods=(method,), truth=truth, licence="CC BY 4.0")
-    data = study.compare(fitted_of(scene, folder / "run"), folder / "out", plan, said, said)
+    stale = folder / "out" / "smog" / "depth-fog" / "0009.jpg"
+    stale.parent.mkdir(parents=True)
+    stale.write_bytes(b"a picture of a longer movie")
+    (folder / "out" / study.MARKER).write_text("{}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(socket.socket, "connect", no_network)
+        patch.setattr(socket, "getaddrinfo", no_network)
+        data = study.compare(fitted_of(scene, folder / "run"), folder / "out", plan, said, said)
+    assert not stale.exists()
     return folder / "out", plan, data
 
 
@@ -205,6 +218,7 @@ def test_a_method_that_stops_goes_on_where_it_was(tmp_path):
     assert [store.picture(i)[0, 0, 0] for i in range(4)] == [0, 1, 2, 3]
     record = json.loads((store.folder / "frames.json").read_text())
     assert len(record["seconds"]) == 4 and store.mean_seconds() >= 0
+    assert np.isnan(FrameStore(store.folder, "another key", 4).mean_seconds())
     other = FrameStore(store.folder, "another key", 2)
     assert other.missing() == [0, 1] and np.isnan(other.mean_seconds())
     other.remove_surplus()

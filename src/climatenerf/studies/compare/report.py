@@ -138,6 +138,9 @@ def _items(out: Path, effect: str, made: Made) -> list[dict[str, str]]:
         entry = {"method": made.name, "effect": effect, "kind": kind, "view": view, "file": file}
         found.append(entry)
 
+    for earlier in made.folder.glob("*.jpg"):
+        if earlier.stem.isdecimal():
+            earlier.unlink(missing_ok=True)
     for index in sorted({round(i) for i in np.linspace(0, count - 1, min(PICTURES, count))}):
         path = made.folder / f"{index:04d}.jpg"
         write_jpeg(path, made.picture(index))
