@@ -8,6 +8,9 @@ import transformers as tf
 from diffusers import (
     AutoencoderKL,
     DDIMScheduler,
+    FlowMatchEulerDiscreteScheduler,
+    FluxFillPipeline,
+    FluxTransformer2DModel,
     StableDiffusionInpaintPipeline,
     StableDiffusionPipeline,
     UNet2DConditionModel,
@@ -46,18 +49,9 @@ def save_pipeline(folder: Path, inpainting: bool = True, seed: int = 0) -> Path:
         cross_attention_dim=16,
         attention_head_dim=2,
     )
-    vae = AutoencoderKL(
-        block_out_channels=(8, 8, 8, 8),
-        norm_num_groups=4,
-        in_channels=3,
-        out_channels=3,
-        down_block_types=("DownEncoderBlock2D",) * 4,
-        up_block_types=("UpDecoderBlock2D",) * 4,
-        latent_channels=4,
-    )
     kind = StableDiffusionInpaintPipeline if inpainting else StableDiffusionPipeline
     pipeline = kind(
-        vae=vae,
+        vae=_autoencoder(),
         text_encoder=tf.CLIPTextModel(text),
         tokenizer=tf.CLIPTokenizer.from_pretrained(words, model_max_length=77),
         unet=unet,
@@ -68,3 +62,49 @@ def save_pipeline(folder: Path, inpainting: bool = True, seed: int = 0) -> Path:
     )
     pipeline.save_pretrained(folder / "pipeline")
     return folder / "pipeline"
+
+
+def save_flux_fill(folder: Path) -> Path:
+    """Save a FluxFillPipeline: another text encoder, a transformer, 16 pixels a token."""
+    words = StableDiffusionInpaintPipeline.from_pretrained(save_pipeline(folder / "words"))
+    torch.manual_seed(0)
+    letters = [(letter, -1.0) for letter in "\u2581abcdefghijklmnopqrstuvwxyz"]
+    vocabulary = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), *letters]
+    text = tf.T5Config(vocab_size=64, d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
+    transformer = FluxTransformer2DModel(
+        patch_size=1,
+        in_channels=16 + 16 + 256,  # noise, masked picture, and the mask of 16 x 16 pixels
+        out_channels=16,
+        num_layers=1,
+        num_single_layers=1,
+        attention_head_dim=16,
+        num_attention_heads=2,
+        joint_attention_dim=32,
+        pooled_projection_dim=16,
+        guidance_embeds=True,
+        axes_dims_rope=[4, 4, 8],
+    )
+    pipeline = FluxFillPipeline(
+        scheduler=FlowMatchEulerDiscreteScheduler(),
+        vae=_autoencoder(use_quant_conv=False, use_post_quant_conv=False, shift_factor=0.1),
+        text_encoder=words.text_encoder,
+        tokenizer=words.tokenizer,
+        text_encoder_2=tf.T5EncoderModel(text),
+        tokenizer_2=tf.T5Tokenizer(vocab=vocabulary, extra_ids=0, model_max_length=32),
+        transformer=transformer,
+    )
+    pipeline.save_pretrained(folder / "flux")
+    return folder / "flux"
+
+
+def _autoencoder(**changes) -> AutoencoderKL:
+    return AutoencoderKL(
+        block_out_channels=(8, 8, 8, 8),
+        norm_num_groups=4,
+        in_channels=3,
+        out_channels=3,
+        down_block_types=("DownEncoderBlock2D",) * 4,
+        up_block_types=("UpDecoderBlock2D",) * 4,
+        latent_channels=4,
+        **changes,
+    )

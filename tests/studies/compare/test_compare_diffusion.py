@@ -16,7 +16,7 @@ from climatenerf.studies.compare.settings import DiffusionSettings
 
 pytest.importorskip("diffusers", reason="pip install .[diffusion]")
 pytest.importorskip("transformers", reason="pip install .[diffusion]")
-from support.tiny_pipeline import save_pipeline
+from support.tiny_pipeline import save_flux_fill, save_pipeline
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,24 @@ def test_a_pipeline_from_text_alone_is_turned_into_an_inpainting_one(tmp_path, m
     picture, mask = material.clean.picture(0), material.mask(0)
     painted = diffusion.inpainted(pipeline, picture, mask, settings_for(tmp_path), 0)
     assert not np.array_equal(painted, picture)
+
+
+def test_a_pipeline_of_another_class_paints_with_its_own_guidance(tmp_path, material, no_network):
+    """FluxFillPipeline has other text encoders, and a usual guidance of 30."""
+    method = method_of(save_flux_fill(tmp_path))
+    assert "non-commercial" in method.licence
+    clean, mask = material.clean.picture(0), material.mask(0)
+    first, again = (next(method.pictures(material, [0], tmp_path)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first[mask == 0], clean[mask == 0])
+    assert np.abs(first[mask == 1].astype(int) - clean[mask == 1]).mean() > 5
+    pipeline = diffusion.load_pipeline(method.folder)
+    usual, low = (
+        diffusion.inpainted(pipeline, clean, mask, settings_for(method.folder, guidance=g), 0)
+        for g in (30.0, 1.0)
+    )
+    np.testing.assert_array_equal(usual, first)
+    assert not np.array_equal(low, first)
 
 
 def test_licences_come_from_the_model_card_or_are_the_usual_ones(folder, tmp_path):

@@ -1,6 +1,6 @@
 """Inpainting pipelines of `diffusers` from local folders: they paint our water mask.
 
-No pipeline was run with real weights here; the tests load a tiny one of the real class.
+No pipeline was run with real weights here; the tests load tiny ones of the real classes.
 """
 
 import importlib.util
@@ -31,6 +31,7 @@ LICENCES = {
     "StableDiffusionInpaintPipeline": "CreativeML OpenRAIL-M",
     "StableDiffusionXLInpaintPipeline": "CreativeML OpenRAIL++-M",
     "FluxFillPipeline": "FLUX.1 [dev] Non-Commercial License: non-commercial",
+    "Flux2KleinInpaintPipeline": "Apache-2.0 (4B); non-commercial (9B)",
     "QwenImageEditInpaintPipeline": "Apache-2.0",
     "ZImageInpaintPipeline": "Apache-2.0",
 }
@@ -152,7 +153,10 @@ def load_pipeline(folder: Path, device: Literal["cpu", "cuda"] = "cpu") -> Any:
     unusable = (OSError, ValueError, RuntimeError, ImportError, KeyError, AttributeError)
     try:
         pipeline = DiffusionPipeline.from_pretrained(
-            str(folder), local_files_only=True, use_safetensors=True
+            str(folder),
+            local_files_only=True,
+            use_safetensors=True,
+            low_cpu_mem_usage=importlib.util.find_spec("accelerate") is not None,
         )
         if not _paints_masks(pipeline):
             pipeline = AutoPipelineForInpainting.from_pipe(pipeline)
