@@ -89,8 +89,7 @@ def test_missing_and_unknown_verbs_are_refused(capsys):
     assert cli.main(["xyzzy"]) == 2
     assert (
         "use one of capture, check, fit, stylize, render, evaluate, compare, verify, study, export,"
-        " demo"
-        in capsys.readouterr().err
+        " demo" in capsys.readouterr().err
     )
 
 
