@@ -9,7 +9,7 @@ from support.compare_folders import METHODS, write_compare_folder
 from support.processes import holder
 
 from climatenerf.cli.study import aligned, p_text
-from climatenerf.studies.votes import COLUMNS
+from climatenerf.studies.user_study.votes import COLUMNS
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.input_limits import check_seed
 
 if TYPE_CHECKING:
-    from climatenerf.studies.study_design import Study as Pairs
-    from climatenerf.studies.study_scores import Scores, Share
+    from climatenerf.studies.user_study.design import Study as Pairs
+    from climatenerf.studies.user_study.scores import Scores, Share
 
 PARTICIPANTS = 37  # of the paper
 SHARES = (0.55, 0.6, 0.65, 0.7, 0.75)
@@ -75,9 +75,9 @@ def run(options: Study) -> int:
 
 def run_make(options: Make) -> int:
     """Write the page and the key; print where they are and what the size of the study can show."""
-    from climatenerf.studies.compare_folder import read_compare_folder
-    from climatenerf.studies.study_design import plan_study
-    from climatenerf.studies.study_page import KEY, PAGE, write_study
+    from climatenerf.studies.user_study.compare_folder import read_compare_folder
+    from climatenerf.studies.user_study.design import plan_study
+    from climatenerf.studies.user_study.page import KEY, PAGE, write_study
 
     folders = [read_compare_folder(folder) for folder in options.folders]
     study = plan_study(folders, options.seed, options.votes, options.without)
@@ -107,8 +107,8 @@ def run_make(options: Make) -> int:
 
 def size_text(study: "Pairs") -> str:
     """Return how large a study is, and what that can show."""
-    from climatenerf.studies.preference import share_shown, votes_needed
-    from climatenerf.studies.study_design import CATCHES, REPEATS
+    from climatenerf.studies.user_study.design import CATCHES, REPEATS
+    from climatenerf.studies.user_study.preference import share_shown, votes_needed
 
     counts = study.votes_by_comparison()
     fewest = min(counts.values())
@@ -136,9 +136,9 @@ def size_text(study: "Pairs") -> str:
 
 def run_score(options: Score) -> int:
     """Print the scores, and write them as JSON with -o."""
-    from climatenerf.studies.study_page import KEY
-    from climatenerf.studies.study_scores import score
-    from climatenerf.studies.votes import read_key, read_votes
+    from climatenerf.studies.user_study.page import KEY
+    from climatenerf.studies.user_study.scores import score
+    from climatenerf.studies.user_study.votes import read_key, read_votes
 
     if not options.votes:
         raise UserError("no votes are given; give the CSV files that the page saved")

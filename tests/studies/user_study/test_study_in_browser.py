@@ -10,11 +10,11 @@ from support.browser import chromium
 from support.command_line import run_cli
 from support.compare_folders import METHODS, write_compare_folder
 
-from climatenerf.studies.compare_folder import read_compare_folder
-from climatenerf.studies.study_design import plan_study
-from climatenerf.studies.study_page import write_study
-from climatenerf.studies.study_scores import score
-from climatenerf.studies.votes import read_key, read_votes
+from climatenerf.studies.user_study.compare_folder import read_compare_folder
+from climatenerf.studies.user_study.design import plan_study
+from climatenerf.studies.user_study.page import write_study
+from climatenerf.studies.user_study.scores import score
+from climatenerf.studies.user_study.votes import read_key, read_votes
 
 SCENES = ("ditch", "stone, sign", "road")
 READY = "#choose-left[aria-disabled=false]"

@@ -10,7 +10,7 @@ from support.compare_folders import write_movie, write_picture
 
 from climatenerf.core.errors import UserError
 from climatenerf.output.video import find_ffmpeg
-from climatenerf.studies.study_media import (
+from climatenerf.studies.user_study.media import (
     NOISE,
     catch_picture,
     read_media,

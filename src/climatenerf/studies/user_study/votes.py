@@ -11,7 +11,7 @@ from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.parsing import entries, flag, items, read_bytes, read_json, text
 from climatenerf.core.storage import check_schema
 from climatenerf.core.text import decode
-from climatenerf.studies.study_page import SCHEMA_VERSION
+from climatenerf.studies.user_study.page import SCHEMA_VERSION
 
 COLUMNS = ("study", "participant", "order", "pair", "kind", "effect", "scene", "left", "right",
            "choice", "ms", "repeat", "catch")  # fmt: skip

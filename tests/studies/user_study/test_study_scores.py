@@ -6,8 +6,15 @@ import json
 import pytest
 
 from climatenerf.core.errors import UserError
-from climatenerf.studies.study_scores import score
-from climatenerf.studies.votes import COLUMNS, KeyPair, StudyKey, Vote, read_key, read_votes
+from climatenerf.studies.user_study.scores import score
+from climatenerf.studies.user_study.votes import (
+    COLUMNS,
+    KeyPair,
+    StudyKey,
+    Vote,
+    read_key,
+    read_votes,
+)
 
 PAIRS = (
     KeyPair("a", "flood", "picture", "painter", "a1", "a2", False),

@@ -9,10 +9,10 @@ import pytest
 from support.compare_folders import METHODS, write_compare_folder, write_picture
 
 from climatenerf.core.errors import UserError
-from climatenerf.studies.compare_folder import read_compare_folder
-from climatenerf.studies.study_design import plan_study, share_turns
-from climatenerf.studies.study_page import page, write_study
-from climatenerf.studies.votes import read_key
+from climatenerf.studies.user_study.compare_folder import read_compare_folder
+from climatenerf.studies.user_study.design import plan_study, share_turns
+from climatenerf.studies.user_study.page import page, write_study
+from climatenerf.studies.user_study.votes import read_key
 
 
 def folders(tmp_path, **settings):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from climatenerf.studies.preference import (
+from climatenerf.studies.user_study.preference import (
     binomial_p,
     clopper_pearson,
     holm,

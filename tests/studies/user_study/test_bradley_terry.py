@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from climatenerf.studies import bradley_terry
-from climatenerf.studies.bradley_terry import (
+from climatenerf.studies.user_study import bradley_terry
+from climatenerf.studies.user_study.bradley_terry import (
     bootstrap_interval,
     log_strengths,
     resample,
     with_pseudo_votes,
 )
-from climatenerf.studies.preference import clopper_pearson
+from climatenerf.studies.user_study.preference import clopper_pearson
 
 PLANTED = np.array([0.9, 0.2, -0.1, -0.4, -0.6])  # mean 0; the first is compared with all others
 STAR = np.zeros((5, 5), bool)

@@ -16,9 +16,9 @@ import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
 from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
-from climatenerf.studies.compare_folder import Item
-from climatenerf.studies.study_design import REPEATS, Pair, Study, digest, opaque
-from climatenerf.studies.study_media import (
+from climatenerf.studies.user_study.compare_folder import Item
+from climatenerf.studies.user_study.design import REPEATS, Pair, Study, digest, opaque
+from climatenerf.studies.user_study.media import (
     SUFFIXES,
     Media,
     catch_picture,

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from climatenerf.core.errors import UserError, excerpt
-from climatenerf.studies.compare_folder import CompareFolder, Item
+from climatenerf.studies.user_study.compare_folder import CompareFolder, Item
 
 VOTES = 72
 """Pairs that a participant judges by default, as in the paper."""

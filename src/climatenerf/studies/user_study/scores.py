@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from climatenerf.studies.bradley_terry import (
+from climatenerf.studies.user_study.bradley_terry import (
     bootstrap_interval,
     log_strengths,
     resample,
     with_pseudo_votes,
 )
-from climatenerf.studies.preference import LEVEL, binomial_p, clopper_pearson, holm
-from climatenerf.studies.votes import StudyKey, Vote
+from climatenerf.studies.user_study.preference import LEVEL, binomial_p, clopper_pearson, holm
+from climatenerf.studies.user_study.votes import StudyKey, Vote
 
 RESAMPLES = 2000
 Interval = tuple[float, float]

@@ -7,7 +7,7 @@ import pytest
 from support.compare_folders import METHODS, write_compare_folder
 
 from climatenerf.core.errors import UserError
-from climatenerf.studies.compare_folder import read_compare_folder
+from climatenerf.studies.user_study.compare_folder import read_compare_folder
 
 
 @pytest.fixture

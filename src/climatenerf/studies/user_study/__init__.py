@@ -1,0 +1,1 @@
+"""A user study: pairs of pictures for participants, and the statistics of their votes."""
