@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from climatenerf.core.errors import UserError
-from climatenerf.output.contact_sheet import GAP, contact_sheet, write_jpeg
+from climatenerf.output.contact_sheet import GAP, contact_sheet, labelled_grid, write_jpeg
 
 
 def frame(grey, width=160, height=90):
@@ -41,3 +41,18 @@ def test_jpeg_stays_below_its_size_limit(tmp_path):
     with pytest.raises(UserError, match="does not fit"):
         write_jpeg(tmp_path / "c.jpg", noise, 100)
     assert not (tmp_path / "c.jpg").exists()
+
+
+def test_each_picture_of_a_grid_has_its_own_label():
+    grid = labelled_grid([("a", frame(0)), ("", frame(60)), ("c", frame(0))], 2, 80)
+    assert grid.shape == (2 * (45 + GAP) + GAP, 2 * (80 + GAP) + GAP, 3)
+
+    def corner(row, column):
+        top, left = GAP + row * (45 + GAP), GAP + column * (80 + GAP)
+        return grid[top : top + 20, left : left + 40]
+
+    assert corner(0, 0).max() > 200 < corner(1, 0).max(), "white on black"
+    assert corner(0, 1).min() == corner(0, 1).max() == 60, "no label"
+    assert corner(1, 1).min() == 255, "an empty place is white"
+    with pytest.raises(ValueError, match="at least one"):
+        labelled_grid([], 2)

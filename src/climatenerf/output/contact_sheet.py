@@ -1,4 +1,4 @@
-"""Contact sheets: a row for each movie, a column for each moment."""
+"""Contact sheets: rows of frames with a label each, or a grid of labelled pictures."""
 
 import io
 from collections.abc import Sequence
@@ -33,22 +33,51 @@ def contact_sheet(
     if not rows or any(len(frames) == 0 for _, frames in rows):
         raise ValueError("a contact sheet needs at least one frame in every row")
     count = min(columns or 10**9, max(len(frames) for _, frames in rows))
-    height, width = rows[0][1][0].shape[:2]
-    cell = (min(cell_width, width), max(1, round(height * min(cell_width, width) / width)))
-    sheet = Image.new(
-        "RGB",
-        (count * (cell[0] + GAP) + GAP, len(rows) * (cell[1] + GAP) + GAP),
-        (255, 255, 255),
-    )
-    font = ImageFont.load_default(size=max(10, cell[1] // 14))
+    cells = []
     for r, (label, frames) in enumerate(rows):
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round())
         for c, index in enumerate(chosen.astype(int)):
-            picture = Image.fromarray(np.ascontiguousarray(frames[index]))
-            corner = (GAP + c * (cell[0] + GAP), GAP + r * (cell[1] + GAP))
-            sheet.paste(picture.resize(cell, Image.Resampling.LANCZOS), corner)
-            if c == 0:
-                _label(ImageDraw.Draw(sheet), corner, label, font)
+            cells.append((r, c, label if c == 0 else "", frames[index]))
+    return _composed(cells, cell_width)
+
+
+def labelled_grid(
+    pictures: Sequence[tuple[str, UInt8[np.ndarray, "h w 3"]]],
+    columns: int,
+    cell_width: int = 320,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Arrange pictures row by row in one picture, each with a label of its own.
+
+    Args:
+        pictures: label and picture, all of one shape.
+        columns: pictures in a row.
+        cell_width: as in `contact_sheet`.
+
+    Returns:
+        The grid, 8-bit RGB.
+    """
+    if not pictures:
+        raise ValueError("a grid needs at least one picture")
+    cells = [(i // columns, i % columns, *each) for i, each in enumerate(pictures)]
+    return _composed(cells, cell_width)
+
+
+def _composed(
+    cells: Sequence[tuple[int, int, str, UInt8[np.ndarray, "h w 3"]]], cell_width: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Paste pictures at their row and column on white, with their labels where there are any."""
+    height, width = cells[0][3].shape[:2]
+    cell = (min(cell_width, width), max(1, round(height * min(cell_width, width) / width)))
+    rows, columns = 1 + max(r for r, *_ in cells), 1 + max(c for _, c, *_ in cells)
+    size = (columns * (cell[0] + GAP) + GAP, rows * (cell[1] + GAP) + GAP)
+    sheet = Image.new("RGB", size, (255, 255, 255))
+    font = ImageFont.load_default(size=max(10, cell[1] // 14))
+    for r, c, label, pixels in cells:
+        picture = Image.fromarray(np.ascontiguousarray(pixels))
+        corner = (GAP + c * (cell[0] + GAP), GAP + r * (cell[1] + GAP))
+        sheet.paste(picture.resize(cell, Image.Resampling.LANCZOS), corner)
+        if label:
+            _label(ImageDraw.Draw(sheet), corner, label, font)
     return np.asarray(sheet)
 
 
