@@ -165,7 +165,7 @@ class Water:
         normal = optics.normal_of(slope)
 
         # --- Reflected rays, traced like any other: one from each part of the pixel ---------------
-        count = 1 if self._even() else PARTS
+        count = self.reflected_rays()
         parts = optics.subpixels(rays_d, hits.pixel_angle, count)
         origins = hits.rays_o[:, None].expand_as(parts).reshape(-1, 3)
         found = first_hits(
@@ -217,10 +217,10 @@ class Water:
         shaded = optics.shade(reflected, reflectance, background, passed, body)
         return shaded, normal, {"water_depth": depth}
 
-    def _even(self) -> bool:
-        """Whether one reflected ray shows what a pixel does."""
+    def reflected_rays(self) -> int:
+        """Number of reflected rays for a pixel: one for still water, else one for each part."""
         still = not self.waves.start.numel() and self.waves.unresolved == 0
-        return self.mirror_only or (still and self.flood.gloss >= SHARP)
+        return 1 if self.mirror_only or (still and self.flood.gloss >= SHARP) else PARTS
 
     def _on_mean_surface(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """The same places on the surface without waves, where further rays begin."""
