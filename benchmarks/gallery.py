@@ -42,7 +42,7 @@ from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.render.session import RenderSession
 from climatenerf.scene import load_scene
 from climatenerf.scene.images import load_image
-from climatenerf.studies.ablation import depth_picture, normal_picture
+from climatenerf.studies.geometry_ablation import depth_picture, normal_picture
 from climatenerf.training.folder import OPTIMISER
 from climatenerf.training.transients import MASK_THRESHOLD, TransientMasks
 from climatenerf.weather.flood.parameters import Flood

@@ -24,7 +24,7 @@ from climatenerf.evaluation.evaluated_run import EvaluatedRun
 from climatenerf.evaluation.reference import read_reference
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene, read_scene
-from climatenerf.studies.ablation import score_row
+from climatenerf.studies.geometry_ablation import score_row
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 

@@ -20,7 +20,7 @@ from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views, rend
 from climatenerf.evaluation.reference import Truth, read_reference
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import Camera, load_scene
-from climatenerf.studies.ablation import density_normals
+from climatenerf.studies.geometry_ablation import density_normals
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 

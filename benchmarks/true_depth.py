@@ -22,7 +22,7 @@ from climatenerf.evaluation.reference import read_reference
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene, read_scene
 from climatenerf.scene.scene import Scene
-from climatenerf.studies.ablation import score_row
+from climatenerf.studies.geometry_ablation import score_row
 from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 

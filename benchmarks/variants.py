@@ -24,7 +24,7 @@ from climatenerf.evaluation.reference import read_reference
 from climatenerf.evaluation.scores import frame_scores, geometry_scores, picture_scores
 from climatenerf.field.checkpoint import load_field
 from climatenerf.scene import load_scene
-from climatenerf.studies.ablation import fit_row, select_rows
+from climatenerf.studies.geometry_ablation import fit_row, select_rows
 from climatenerf.training.run import METRICS
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"

@@ -32,7 +32,7 @@ def test_export_waits_for_no_other_writer(tmp_path, capsys):
 def test_an_ablation_waits_for_no_other_writer(tmp_path, capsys):
     out = tmp_path / "out"
     with holder(out):
-        said = error_message(capsys, "evaluate", REFERENCE, "--ablation", "-o", out)
+        said = error_message(capsys, "evaluate", REFERENCE, "--ablation", "geometry", "-o", out)
         assert f"another process is writing into {out}" in said and not (out / "runs").exists()
 
 

@@ -1,26 +1,40 @@
 """``climatenerf evaluate RUN --reference -o REPORT``: scores of a run against the ground truth.
 
-``climatenerf evaluate SCENE --ablation -o REPORT`` fits and scores a reference set with one part of
-the method left out at a time.
+``--ablation`` and ``--sweep`` make the paper's figures: one part of the method left out at a time,
+and one parameter of the weather changed at a time.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
+
+PICTURE = frozenset({"weather", "view", "size"})
+FLAGS: Mapping[str, frozenset[str]] = {
+    "--reference": frozenset({"reference", "views", "weathers"}),
+    "--ablation geometry": frozenset({"ablation", "minutes", "downscale", "seeds", "rows"}),
+    "--ablation flood": PICTURE | {"ablation"},
+    "--ablation snow": PICTURE | {"ablation"},
+    "--ablation seasons": PICTURE | {"ablation"},
+    "--sweep": PICTURE | {"sweep"},
+}
+"""Which flags each kind of evaluation reads."""
 
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Score a run against the ground truth: a table, report.json and pictures."""
+    """Score a run against the ground truth, or show what parts of the method and parameters of the
+    weather do: tables, JSON and pictures."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder from `climatenerf fit reference/street`; with --ablation the reference set."""
+    """Run folder from `climatenerf fit`; with `--ablation geometry` the reference set."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
     reference: bool = False
@@ -29,9 +43,22 @@ class Evaluate:
     """Test views to score, such as t01 t04. Default: all."""
     weathers: tuple[str, ...] = ()
     """Weathers to score, such as flood-low smog-near. Default: all."""
-    ablation: bool = False
-    """Fit a reference set with one part of the method left out at a time, and score each fit: eight
-    rows, an hour and a half with the defaults. Re-run the same command to resume."""
+    ablation: Annotated[
+        Literal["geometry", "flood", "snow", "seasons"] | None,
+        optional("{geometry,flood,snow,seasons}"),
+    ] = None
+    """geometry: fit a reference set with one part of the method left out at a time, and score each
+    fit: an hour and a half with the defaults. flood, snow: render a run with one part of the
+    simulation left out at a time. seasons: as it is, with snow, in another season, in both."""
+    sweep: Annotated[str | None, optional("STR")] = None
+    """One picture for each value of a weather flag, such as smog.visibility="50 m,100 m,200 m".
+    paper: all rows of the paper's figures."""
+    weather: Annotated[Path | None, optional("PATH")] = None
+    """Weather file (TOML) for --sweep, or for --ablation flood, snow or seasons."""
+    view: Annotated[str | None, optional("STR")] = None
+    """Photo whose pose they have. Default: the most central one, or a test view."""
+    size: Annotated[str | None, optional("STR")] = None
+    """Size of their pictures, such as 480x270. Default: the photo's own."""
     minutes: float = 4.0
     """Duration of each fit of the ablation, minutes."""
     downscale: int = 2
@@ -39,22 +66,55 @@ class Evaluate:
     seeds: int = 2
     """Number of fits of each row of the ablation."""
     rows: tuple[str, ...] = ()
-    """Rows of the ablation, such as "plain NGP" full. Default: all."""
+    """Rows of the ablation of geometry, such as "plain NGP" full. Default: all."""
+
+
+def kind_of(options: Evaluate) -> str:
+    """Return which evaluation is asked for, a key of `FLAGS`.
+
+    Raises:
+        UserError: none is, or a flag does not belong to it.
+    """
+    kind = "--reference"
+    if options.ablation is not None:
+        kind = f"--ablation {options.ablation}"
+    elif options.sweep is not None:
+        kind = "--sweep"
+    for item in fields(Evaluate):
+        given = item.name not in ("run", "out") and getattr(options, item.name) != item.default
+        if not given or item.name in FLAGS[kind]:
+            continue
+        if item.name in ("reference", "sweep"):
+            raise UserError(f"{kind} excludes --{item.name}; leave out one of them")
+        others = [name for name, flags in FLAGS.items() if item.name in flags]
+        raise UserError(f"--{item.name} belongs to {' and '.join(others)}; leave it out")
+    if kind == "--reference" and not options.reference:
+        raise UserError(
+            "no reference to compare with; use: climatenerf evaluate RUN --reference -o OUT (or"
+            " --ablation, --sweep)"
+        )
+    return kind
 
 
 def run(options: Evaluate) -> int:
-    """Score a run or make an ablation; print the table and the path of the report."""
-    if options.ablation:
-        return run_ablation(options)
-    if (options.minutes, options.downscale, options.seeds, options.rows) != (4.0, 2, 2, ()):
-        raise UserError(
-            "--minutes, --downscale, --seeds and --rows belong to --ablation; leave them out"
-        )
-    if not options.reference:
-        raise UserError(
-            "no reference to compare with; use: climatenerf evaluate RUN --reference -o OUT"
-        )
+    """Score a run or make a study; print the table and the path of the report."""
+    kind = kind_of(options)
+    if kind == "--reference":
+        return run_reference(options)
+    from climatenerf.cli import studies
 
+    if kind == "--ablation geometry":
+        extent = options.minutes, options.downscale, options.seeds
+        return studies.geometry(options.run, options.out, *extent, options.rows)
+    picture = studies.Picture(options.run, options.weather, options.view, options.size)
+    if options.sweep is not None:
+        return studies.sweep(picture, options.out, options.sweep)
+    assert options.ablation is not None, "`kind_of` has found no other"
+    return studies.ablation(picture, options.out, options.ablation)
+
+
+def run_reference(options: Evaluate) -> int:
+    """Score a run; print the table and the path of the report."""
     from climatenerf.api import load_run
     from climatenerf.evaluation.evaluated_run import EvaluatedRun, check_views
     from climatenerf.evaluation.reference import read_reference
@@ -94,37 +154,4 @@ def run(options: Evaluate) -> int:
         write_report(scores, description, options.out, old)
     progress.result(table_text(scores.table))
     progress.result(f"report: {options.out / 'report.md'}")
-    return 0
-
-
-def run_ablation(options: Evaluate) -> int:
-    """Fit and score every row; print the table and the path of the report."""
-    if not 0 < options.minutes < float("inf") or options.downscale < 1 or options.seeds < 1:
-        raise UserError("--minutes must be above 0, --downscale and --seeds at least 1")
-    if options.reference or options.views or options.weathers:
-        raise UserError("--ablation excludes --reference, --views and --weathers; leave them out")
-    from climatenerf.scene import read_scene
-
-    scene = read_scene(options.run)
-
-    from climatenerf.studies.ablation import TEXT_NAME, ablate, markdown, select_rows
-    from climatenerf.training.trainer import Report
-
-    selected = select_rows(options.minutes, options.rows)
-    total = len(selected) * options.seeds
-    with progress.Bar("ablation", float(total)) as bar:
-        done = 0
-
-        def after_step(name: str, state: Report) -> None:
-            bar.update(done + state.progress, {"row": name, "PSNR": f"{state.psnr:.1f}"})
-
-        def scoring(name: str) -> None:
-            nonlocal done
-            done += 1
-            bar.update(float(done), {"scoring": name})
-
-        extent = (options.minutes, options.downscale, options.seeds)
-        data = ablate(scene, options.out, *extent, after_step, scoring, selected)
-    progress.result(markdown(data))
-    progress.result(f"report: {options.out / TEXT_NAME}")
     return 0

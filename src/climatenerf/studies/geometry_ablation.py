@@ -13,9 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
-from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
+from climatenerf.core.parsing import read_json
+from climatenerf.core.storage import make_folder, write_bytes, write_json
 from climatenerf.evaluation import geometry
 from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.evaluated_run import (
@@ -37,15 +39,27 @@ from climatenerf.field.checkpoint import load_field
 from climatenerf.field.hash_field import Field
 from climatenerf.output.contact_sheet import contact_sheet, write_jpeg
 from climatenerf.scene import Scene, load_scene
+from climatenerf.scene.images import RELATIVE_DEPTH
+from climatenerf.studies.study_folder import (
+    ABLATION,
+    MAX_SHEET,
+    SCHEMA_VERSION,
+    SHEET,
+    TEXT,
+    ablation_files,
+    file_name,
+    remove_left_over,
+)
+from climatenerf.studies.study_folder import check_folder as check_files
 from climatenerf.training.folder import OPTIMISER, check_config, checked_metrics
 from climatenerf.training.progress import Report
 from climatenerf.training.run import METRICS, fit_scene
 from climatenerf.training.settings import FitSettings, Losses, as_config, settings_of
 
-SCHEMA_VERSION = 1
-FILE_NAME, TEXT_NAME, SHEET = "ablation.json", "ablation.md", "ablation.jpg"
+KIND = "geometry"
 WEATHERS = ("smog-mid", "flood-low", "snow-deep")
 CELL = 256  # width of each picture in the sheet, pixels
+RELATIVE_DEPTH_ROWS = ("no monocular depth", "monocular depth alone")
 COLUMNS = {
     "psnr": "clean, dB",
     "depth_abs_rel": "depth",
@@ -91,22 +105,47 @@ def rows(minutes: float) -> dict[str, FitSettings]:
         "no planarity": without(planarity=0.0),
         "no occlusion": without(occlusion=0.0),
         "no sky": dataclasses.replace(full, sky_labels=False),
+        "no monocular depth": without(monocular_depth=0.0),
+        "monocular depth alone": without(sparse_depth=0.0, ground_height=0.0),
         "no depth": without(sparse_depth=0.0, ground_height=0.0, monocular_depth=0.0),
         "full": full,
     }
 
 
-def select_rows(minutes: float, names: tuple[str, ...]) -> dict[str, FitSettings]:
+def select_rows(
+    minutes: float, names: tuple[str, ...], relative_depth: bool = True
+) -> dict[str, FitSettings]:
     """Return the rows of some names, in the order of the table; all rows if no name is given.
 
+    "monocular depth alone" beside "no depth" is the paper's pair with and without monocular depth;
+    the paper has no other depth.
+
+    Args:
+        minutes: duration of each fit.
+        names: of rows.
+        relative_depth: whether the capture has what a network for monocular depth makes. Without
+            it, rows that differ from others by its use alone are left out.
+
     Raises:
-        UserError: there is no row of a name.
+        UserError: there is no row of a name, or the capture lacks what it needs.
     """
     existing = rows(minutes)
     for name in names:
         if name not in existing:
             raise UserError(f"there is no row {name!r}; choose from: {', '.join(existing)}")
-    return {name: row for name, row in existing.items() if not names or name in names}
+        if name in RELATIVE_DEPTH_ROWS and not relative_depth:
+            raise UserError(
+                f"the row {name!r} needs a capture with relative depths (folder depth_relative);"
+                " leave it out"
+            )
+    default = [name for name in existing if relative_depth or name not in RELATIVE_DEPTH_ROWS]
+    return {name: existing[name] for name in existing if name in (names or default)}
+
+
+def has_relative_depth(scene: Scene) -> bool:
+    """Whether a capture has depths that can stand for those of a network."""
+    own = (view.depth_path is not None for view in scene.of_split("train"))
+    return (scene.root / RELATIVE_DEPTH).is_dir() or any(own)
 
 
 def ablate(
@@ -157,6 +196,7 @@ def _ablate(
 ) -> dict[str, Any]:
     """Fit, score and write as `ablate` does, in a folder that is checked and locked."""
     make_folder(out / "runs")
+    earlier = check_folder(out, read_reference(scene.root).folder, tuple(selected))
     table: dict[str, list[dict[str, float]]] = {}
     sheet = []
     for name, settings in selected.items():
@@ -174,18 +214,38 @@ def _ablate(
                 sheet.append((name, pictures))
     data = {
         "schema_version": SCHEMA_VERSION,
+        "climatenerf": climatenerf.__version__,
+        "study": KIND,
         "capture": scene.root.name,
         "minutes": minutes,
         "downscale": downscale,
-        "rows": table,
+        "files": ablation_files(table, ".jpg"),
+        "rows": [
+            {
+                "name": name,
+                "picture": file_name(name, ".jpg"),
+                "metrics": means(each),
+                "seeds": each,
+            }
+            for name, each in table.items()
+        ],
     }
-    write_json(out / FILE_NAME, data)
-    write_bytes(out / TEXT_NAME, markdown(data).encode())
+    write_json(out / ABLATION, data)  # first: by it the other files are known as those of a study
+    for name, pictures in sheet:
+        write_jpeg(out / file_name(name, ".jpg"), contact_sheet([(name, pictures)]), MAX_SHEET)
+    write_bytes(out / TEXT, markdown(data).encode())
     write_jpeg(out / SHEET, contact_sheet(sheet, cell_width=CELL), 150_000)
+    remove_left_over(out, earlier, data["files"])
     return data
 
 
-def check_folder(out: Path, reference: Path, names: tuple[str, ...]) -> None:
+def means(seeds: list[dict[str, float]]) -> dict[str, float]:
+    """Return the mean of each score over the fits that have it."""
+    names = dict.fromkeys(name for each in seeds for name in each)
+    return {name: float(np.mean([e[name] for e in seeds if name in e])) for name in names}
+
+
+def check_folder(out: Path, reference: Path, names: tuple[str, ...]) -> set[str]:
     """Refuse a folder whose files the report would overwrite.
 
     Args:
@@ -193,22 +253,32 @@ def check_folder(out: Path, reference: Path, names: tuple[str, ...]) -> None:
         reference: folder of the reference set.
         names: the rows of the report.
 
+    Returns:
+        Names of the files of an earlier report.
+
     Raises:
         UserError: the folder lies in the reference set, holds files of the report's names that no
-            ablation wrote, or a report with rows that are not among `names`.
+            ablation of geometry wrote, or a report with rows that are not among `names`.
     """
     if out.resolve().is_relative_to(reference.resolve()):
         raise UserError(f"{out} lies in the reference set; choose another folder with -o")
-    earlier = read_json(out / FILE_NAME, "an ablation") if (out / FILE_NAME).is_file() else {}
-    more = set(earlier.get("rows", ())) - set(names)
+    earlier = check_files(out, ABLATION, KIND, ablation_files(names, ".jpg"))
+    more = row_names(read_json(out / ABLATION, "an ablation")) - set(names) if earlier else ()
     if more:
         raise UserError(
             f"{out} holds a report of more rows ({', '.join(sorted(more))}); choose another folder"
             " with -o, or add these rows"
         )
-    for name in (FILE_NAME, TEXT_NAME, SHEET):
-        if (out / name).exists() and "rows" not in earlier:
-            raise UserError(f"{out / name} would be overwritten; choose another folder with -o")
+    return earlier
+
+
+def row_names(data: dict[str, Any]) -> set[str]:
+    """Return the names of the rows in an index, also in one of schema 1, a table by name."""
+    listed = data.get("rows")
+    if isinstance(listed, dict):
+        return set(listed)
+    entries = listed if isinstance(listed, list) else []
+    return {str(each["name"]) for each in entries if isinstance(each, dict) and "name" in each}
 
 
 def fit_row(
@@ -321,9 +391,9 @@ def markdown(data: dict[str, Any]) -> str:
         "| row | " + " | ".join(COLUMNS.values()) + " |",
         "|---" * (len(COLUMNS) + 1) + "|",
     ]
-    for name, each in data["rows"].items():
-        cells = [cell([one[key] for one in each if key in one]) for key in COLUMNS]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    for row in data["rows"]:
+        cells = [cell([one[key] for one in row["seeds"] if key in one]) for key in COLUMNS]
+        lines.append(f"| {row['name']} | " + " | ".join(cells) + " |")
     return f"# Ablation\n\n{head}\n\n" + "\n".join(lines) + f"\n\n![pictures]({SHEET})\n"
 
 

@@ -15,7 +15,8 @@ from climatenerf.evaluation.reference import read_reference
 from climatenerf.field.checkpoint import load_field
 from climatenerf.field.presets import PRESETS, FieldSize
 from climatenerf.scene import Camera, load_scene, read_scene
-from climatenerf.studies import ablation
+from climatenerf.studies import geometry_ablation as ablation
+from climatenerf.studies.study_folder import ABLATION, TEXT
 from climatenerf.training import run as run_module
 from climatenerf.training.settings import PAPER, FitSettings, Losses, settings_of
 
@@ -74,6 +75,8 @@ def test_each_row_leaves_out_one_part():
         "no planarity": {"planarity"},
         "no occlusion": {"occlusion"},
         "no sky": {"sky_labels"},
+        "no monocular depth": {"monocular_depth"},
+        "monocular depth alone": {"sparse_depth", "ground_height"},
         "no depth": {"sparse_depth", "ground_height", "monocular_depth"},
         "full": set(),
     }
@@ -157,10 +160,31 @@ def test_the_table_shows_means_and_half_ranges():
         "minutes": 2.0,
         "downscale": 2,
         "capture": "street",
-        "rows": {"plain NGP": [{"psnr": 20.0}, {"psnr": 21.0}], "full": [{"psnr": 25.0}]},
+        "rows": [
+            {"name": "plain NGP", "seeds": [{"psnr": 20.0}, {"psnr": 21.0}]},
+            {"name": "full", "seeds": [{"psnr": 25.0}]},
+        ],
     }
     text = ablation.markdown(data)
     assert "| plain NGP | 20.5 ± 0.5 | - |" in text and "| full | 25 | - |" in text
+
+
+def test_metrics_are_means_over_the_fits_that_have_them():
+    seeds = [{"psnr": 20.0, "miou": 0.5}, {"psnr": 22.0}]
+    assert ablation.means(seeds) == {"psnr": 21.0, "miou": 0.5}
+
+
+def test_rows_of_monocular_depth_need_a_capture_that_has_it(tmp_path):
+    """Without it they would equal other rows."""
+    scene = make_scene(tmp_path / "toy")
+    assert not ablation.has_relative_depth(scene)
+    rest = ablation.select_rows(4.0, (), relative_depth=False)
+    assert set(ablation.rows(4.0)) - set(rest) == {"no monocular depth", "monocular depth alone"}
+    with pytest.raises(UserError, match="needs a capture with relative depths"):
+        ablation.select_rows(4.0, ("full", "monocular depth alone"), relative_depth=False)
+    (scene.root / "depth_relative").mkdir()
+    assert ablation.has_relative_depth(scene)
+    assert "monocular depth alone" in ablation.select_rows(4.0, ("monocular depth alone",))
 
 
 def test_depth_and_normal_pictures_have_known_values():
@@ -180,10 +204,13 @@ def test_two_rows_from_end_to_end(tmp_path, monkeypatch):
     data = ablation.ablate(
         read_scene(REFERENCE), tmp_path, 1.0, 4, 1, lambda *_: None, lambda name: None, chosen
     )
-    rows = {name: each[0] for name, each in data["rows"].items()}
+    rows = {row["name"]: row["metrics"] for row in data["rows"]}
     assert rows["full"]["sky_empty_fraction"] > rows["no sky"]["sky_empty_fraction"]
-    assert json.loads((tmp_path / "ablation.json").read_text())["rows"].keys() == rows.keys()
-    assert (tmp_path / "ablation.jpg").stat().st_size > 10_000
+    written = json.loads((tmp_path / "ablation.json").read_text())["rows"]
+    assert [row["name"] for row in written] == list(rows)
+    assert [row["picture"] for row in written] == ["no-sky.jpg", "full.jpg"]
+    assert all((tmp_path / row["picture"]).stat().st_size > 5_000 for row in written)
+    assert (tmp_path / "contact-sheet.jpg").stat().st_size > 10_000
     assert "smog-mid" in (tmp_path / "ablation.md").read_text()
 
 
@@ -212,8 +239,12 @@ def test_a_short_fit_of_the_reference_street_is_good(tmp_path, monkeypatch):
     assert sky.mean(-1).min() > darkest
 
 
-def test_a_report_of_fewer_rows_does_not_replace_one_of_more(tmp_path):
-    (tmp_path / ablation.FILE_NAME).write_text(json.dumps({"rows": {"full": [], "no sky": []}}))
+@pytest.mark.parametrize("schema", [1, 2])
+def test_a_report_of_fewer_rows_does_not_replace_one_of_more(tmp_path, schema):
+    listed = [{"name": "full"}, {"name": "no sky"}]
+    rows = {"full": [], "no sky": []} if schema == 1 else listed
+    about = {"minutes": 4.0} if schema == 1 else {"study": "geometry", "files": []}
+    (tmp_path / ABLATION).write_text(json.dumps({**about, "rows": rows}))
     ablation.check_folder(tmp_path, REFERENCE, ("no sky", "full", "no depth"))
     with pytest.raises(UserError, match="more rows .no sky.; choose another folder"):
         ablation.check_folder(tmp_path, REFERENCE, ("full",))
@@ -232,8 +263,6 @@ def test_wrong_input_is_refused_before_the_first_fit(tmp_path, monkeypatch):
     refused("was fitted to the test view", tmp_path, dataclasses.replace(scene, views=trained))
     fewer = [view for view in scene.views if view.name != "t03.jpg"]
     refused("lacks the test view", tmp_path, dataclasses.replace(scene, views=fewer))
-    (tmp_path / ablation.TEXT_NAME).write_text("mine")
+    (tmp_path / TEXT).write_text("mine")
     refused("would be overwritten", tmp_path)
-    assert (tmp_path / ablation.TEXT_NAME).read_text() == "mine" and len(
-        list(tmp_path.iterdir())
-    ) == 1
+    assert (tmp_path / TEXT).read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
