@@ -165,7 +165,7 @@ def test_the_gradient_energy_is_that_of_neighbours_in_water(tmp_path):
 
 GOOD = {
     "tilted plane": {"tilt_deg": 1.5, "water_share": 0.5, "psnr_water_db": 21.0},
-    "no waves": {"normal_deviation_deg": 0.0, "psnr_water_db": 17.0},
+    "no waves": {"normal_deviation_deg": 0.0, "mirror_psnr_db": 32.0, "psnr_water_db": 17.0},
     "no Fresnel": {"reflectance_correlation": 0.0, "psnr_water_db": 19.0},
     "no gloss": {"gradient_energy": 3.0, "psnr_water_db": 22.0},
     "no anti-aliasing": {"far_error": 2.5, "psnr_water_db": 25.0},
@@ -189,6 +189,7 @@ def metrics(**changed):
         ("tilted plane", {"tilted plane": {"tilt_deg": 0.2}}),
         ("tilted plane", {"full": {"tilt_deg": 0.6}, "tilted plane": {"tilt_deg": 9.0}}),
         ("no waves", {"no waves": {"normal_deviation_deg": 0.1}}),
+        ("no waves", {"no waves": {"mirror_psnr_db": 15.0}}),
         ("no Fresnel", {"no Fresnel": {"reflectance_correlation": 0.2}}),
         ("no Fresnel", {"full": {"reflectance_correlation": 0.8}}),
         ("no gloss", {"no gloss": {"gradient_energy": 1.05}}),
@@ -224,6 +225,8 @@ def test_all_rows_of_a_yard_show_their_faults(tmp_path):
     full = rows[-1].picture
     for row in rows[:-1]:
         assert not np.array_equal(row.picture, full) and row.shown, row.fault
+    assert rows[1].metrics["mirror_psnr_db"] == a.EXACT, "a mirror image, exactly"
+    assert rows[-1].metrics["mirror_psnr_db"] < 35
     tilt = rows[0].metrics["tilt_deg"]
     assert tilt == pytest.approx(np.degrees(np.arctan(PITCH)), abs=0.2)
 
