@@ -9,7 +9,8 @@ from jaxtyping import Float, UInt8
 
 from climatenerf.core.classes import ROAD, SKY, TERRAIN, VEGETATION
 from climatenerf.core.srgb import LUMA
-from climatenerf.weather.season.recolouring import recoloured
+from climatenerf.ops.recolouring import recoloured
+from climatenerf.weather.season.palettes import kept_differences
 
 EPSILON = 1e-5  # added to variances: a picture of one colour has none, and no inverse root
 WHITENED = (ROAD, TERRAIN, VEGETATION, SKY)
@@ -71,7 +72,7 @@ def whitened(
 ) -> Float[np.ndarray, "h w 3"]:
     """Return linear colours with road, terrain, vegetation and sky recoloured towards white.
 
-    Each class gets a mean luminance of `WHITE_LUMA` by `season.recolouring.recoloured` with a white
+    Each class gets a mean luminance of `WHITE_LUMA` by `ops.recolouring.recoloured` with a white
     palette. Geometry and texture stay, so it is paint and not snow.
 
     Args:
@@ -82,13 +83,13 @@ def whitened(
     luma = means @ np.array(LUMA)
     # 1e-6: an absent or black class, 0/0. Such a class has no pixels that would change.
     brightness = np.minimum(WHITE_LUMA / np.maximum(luma, 1e-6), MAX_BRIGHTNESS)
-    normalised = means / np.maximum(luma, 1e-6)[:, None]
     share = STRENGTH * np.stack([label.ravel() == kind for kind in WHITENED], axis=-1)
-    count = share.shape[0]
-    white = np.ones((count, len(WHITENED), 3))
+    white = np.ones((share.shape[0], 1, 3)) * brightness[:, None]
+    # 1e-6: black classes have no colour, 0/0; they have no pixels that would change.
+    kept = np.stack([kept_differences(mean + 1e-6) for mean in means])
     tensors = (
         torch.from_numpy(np.ascontiguousarray(each, dtype=np.float64))
-        for each in (picture.reshape(-1, 3), share, white, normalised, brightness)
+        for each in (picture.reshape(-1, 3), share, white, brightness[:, None, None] * kept)
     )
     return recoloured(*tensors).numpy().reshape(picture.shape)
 

@@ -105,18 +105,27 @@ def seasonal_style(
 
 
 def _class_style(kind: int, part: ClassPalette, mean: Float[np.ndarray, "3"] | None) -> ClassStyle:
-    luma = np.array(LUMA)
-    if mean is None or mean @ luma <= 0:
+    if mean is None or mean @ np.array(LUMA) <= 0:
         mean = np.array(GREEN_LAWN)
-    # c - Y(c) m: how the colour differs from the mean of its class at the same luminance.
-    difference = np.eye(3) - np.outer(mean / (mean @ luma), luma)
     return ClassStyle(
         kind,
         part.brightness * np.array(part.palette),
-        part.brightness * KEPT * difference,
+        part.brightness * kept_differences(mean),
         part.strength,
         part.gate,
     )
+
+
+def kept_differences(mean: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the map of a linear colour c to a part of how it differs from its class.
+
+    M c = `KEPT` (c - Y(c) m), with luminance Y and the mean colour m of the class at luminance 1.
+
+    Args:
+        mean: linear mean colour of the class, not black.
+    """
+    luma = np.array(LUMA)
+    return KEPT * (np.eye(3) - np.outer(mean / (mean @ luma), luma))
 
 
 def _section(table: Any, kind: type, where: str) -> Any:
