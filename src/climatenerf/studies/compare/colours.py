@@ -85,8 +85,8 @@ def whitened(
     brightness = np.minimum(WHITE_LUMA / np.maximum(luma, 1e-6), MAX_BRIGHTNESS)
     share = STRENGTH * np.stack([label.ravel() == kind for kind in WHITENED], axis=-1)
     white = np.ones((share.shape[0], 1, 3)) * brightness[:, None]
-    # 1e-6: black classes have no colour, 0/0; they have no pixels that would change.
-    kept = np.stack([kept_differences(mean + 1e-6) for mean in means])
+    # Absent and black classes have no colour, 0/0; they have no pixels that would change.
+    kept = np.stack([kept_differences(mean if mean.any() else np.ones(3)) for mean in means])
     tensors = (
         torch.from_numpy(np.ascontiguousarray(each, dtype=np.float64))
         for each in (picture.reshape(-1, 3), share, white, brightness[:, None, None] * kept)
