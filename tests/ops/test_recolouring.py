@@ -48,3 +48,13 @@ def test_no_strength_changes_nothing():
     none = vars(classes()) | {"strength": torch.zeros(3)}
     found = r.recoloured_samples(*given, r.mottle(0), 4.0, torch.ones(3), r.ClassColours(**none))
     assert torch.equal(found, given[0])
+
+
+def test_transposed_colours_are_recoloured():
+    """Networks give colours whose columns are contiguous."""
+    colour, *rest = samples(100)
+    turned = colour.T.contiguous().T
+    assert not turned.is_contiguous()
+    given = r.mottle(0), 4.0, torch.ones(3), classes()
+    expected = r.recoloured_samples(colour, *rest, *given)
+    torch.testing.assert_close(r.recoloured_samples(turned, *rest, *given), expected)

@@ -118,7 +118,7 @@ class _EncodedNetwork(torch.autograd.Function):
         if rays and ctx.needs_input_grad[3]:
             grad_shared = torch.zeros_like(rays[0])
         if ctx.needs_input_grad[0]:
-            grad_u = torch.empty_like(u)
+            grad_u = torch.empty_like(u, memory_format=torch.contiguous_format)
         grad_layers = triton.network_backward(
             u,
             tables,

@@ -86,7 +86,8 @@ def recoloured_samples(
     if dispatch.backend(*tensors) == "cpu":
         from climatenerf.ops.cpu import recolouring as kernel
 
-        found = torch.empty_like(colour)
+        # Transposed as `colour` can be, it would reach the kernel as a copy.
+        found = torch.empty_like(colour, memory_format=torch.contiguous_format)
         arrays = dispatch.kernel_arrays(*tensors, found)
         kernel.recolour(*arrays[:6], arrays[6:10], *arrays[10:])  # type: ignore
         return found
