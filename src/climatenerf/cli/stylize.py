@@ -1,8 +1,9 @@
 """``climatenerf stylize RUN -o RUN2``: a run in the colours of a season, photos or a text."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -12,7 +13,11 @@ from climatenerf.core.errors import UserError
 from climatenerf.weather.units import LENGTH, quantity
 
 if TYPE_CHECKING:
+    from climatenerf.api import Run
+    from climatenerf.styling.paper.shots import Shot
+    from climatenerf.styling.paper.teachers import Teacher
     from climatenerf.styling.style_photos import Labeller, StylePhotos
+    from climatenerf.weather.style import Source, Style
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,24 @@ class Stylize:
     patch: Annotated[float, quantity(LENGTH, 0.1, 1e3)] = 4.0
     """Size of the patches in which leaves turn alike."""
     seed: int = 0
-    """Random seed of these patches."""
+    """Random seed of these patches, and of the paper's way."""
+    method: Literal["operator", "paper"] = "operator"
+    """operator: the field stays, and what is rendered of it changes. paper: the field's colours
+    learn from pictures in the style. Shapes, normals and classes stay in both."""
+    bake: bool = False
+    """Write the operator's colours into the field: --method paper with the operator as teacher."""
+    wct: Annotated[Path | None, optional("PATH")] = None
+    """With --method paper and --style: folder of WCT weights, which make the pictures."""
+    pictures: Annotated[Path | None, optional("PATH")] = None
+    """With --method paper: folder of finished pictures, named as the photos."""
+    editor: Annotated[Path | None, optional("PATH")] = None
+    """With --method paper and --text: local folder of an image-to-image network of diffusers."""
+    steps: int = 400
+    """Steps of the paper's way; 150 show the look."""
+    views: int = 40
+    """The most views that teach."""
+    width: int = 480
+    """The most pixels across of the pictures that teach."""
 
 
 def run(options: Stylize) -> int:
@@ -54,7 +76,8 @@ def run(options: Stylize) -> int:
         "--measure": options.measure,
     }
     given = [name for name, value in asked.items() if value]
-    if len(given) != 1:
+    paper = check_method(options)
+    if len(given) != 1 and not (options.pictures is not None and not given):
         got = " and ".join(given) or "none"
         raise UserError(f"give one of --season, --style, --text and --measure; got {got}")
     if options.out is None:
@@ -70,7 +93,41 @@ def run(options: Stylize) -> int:
         return measure(options, options.out)
     if options.run is None:
         raise UserError("name the run to stylize: climatenerf stylize RUN -o RUN2")
+    if paper:
+        return fine_tune(options, options.run, options.out)
     return stylize(options, options.run, options.out)
+
+
+def check_method(options: Stylize) -> bool:
+    """Return whether the paper's way is asked for.
+
+    Raises:
+        UserError: its options contradict one another, or it is not.
+    """
+    paper = options.method == "paper" or options.bake
+    teachers = {
+        "--wct": options.wct,
+        "--pictures": options.pictures,
+        "--editor": options.editor,
+    }
+    named = [name for name, value in teachers.items() if value is not None]
+    if named and (not paper or options.bake):
+        raise UserError(f"{named[0]} belongs to --method paper; give that, without --bake")
+    if len(named) > 1:
+        raise UserError(f"give one of --wct, --pictures and --editor; got {' and '.join(named)}")
+    if paper and options.measure:
+        raise UserError("--measure makes a season file and no run; leave --method and --bake out")
+    if options.wct is not None and not options.style:
+        raise UserError("--wct needs style photos; name them with --style")
+    if options.editor is not None and options.text is None:
+        raise UserError("--editor needs a text; give it with --text")
+    if options.pictures is not None and (options.season or options.style or options.text):
+        raise UserError("--pictures are the style; leave --season, --style and --text out")
+    for name in ("steps", "views", "width"):
+        least = 16 if name == "width" else 1
+        if getattr(options, name) < least:
+            raise UserError(f"--{name} must be at least {least}; got {getattr(options, name)}")
+    return paper
 
 
 def stylize(options: Stylize, folder: Path, out: Path) -> int:
@@ -78,6 +135,103 @@ def stylize(options: Stylize, folder: Path, out: Path) -> int:
     from climatenerf.styling.styled_run import check_out
 
     check_out(folder, out)
+    make_style = style_maker(options)
+
+    from climatenerf.api import load_run
+    from climatenerf.styling.styled_run import write_styled_run
+
+    run = load_run(folder)
+    write_styled_run(folder, run.scene, make_style(run), out)
+    progress.result(f"run: {out}")
+    return 0
+
+
+def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
+    """Make a run whose colours have learned a style; print how near they came, and where it is."""
+    from climatenerf.styling.styled_run import check_out
+
+    check_out(folder, out)
+    by_operator = options.wct is options.pictures is options.editor is None
+    make_style = style_maker(options) if by_operator else None
+
+    from climatenerf.api import load_run
+    from climatenerf.styling.paper.paper_run import PaperSettings, write_fine_tuned_run
+    from climatenerf.styling.paper.shots import choose_shots
+    from climatenerf.styling.paper.teachers import operator_teacher
+
+    run = load_run(folder)
+    shots = choose_shots(run.scene, options.views, options.width, options.seed)
+    if make_style is not None:
+        style = make_style(run)
+        teacher = operator_teacher(run.field, style)
+    else:
+        style, teacher = picture_style(options, run, shots)
+    if make_style is None:
+        say_licences(style.sources)
+    settings = PaperSettings(options.steps, options.views, options.width, options.seed)
+    place = folder, run.field, run.scene
+    with progress.StageBars() as bars:
+        scores = write_fine_tuned_run(place, style, teacher, shots, settings, out, bars)
+    first, last = scores[0], scores[-1]
+    if last.step < options.steps:
+        progress.say(f"ended after {last.step} steps: other views improved no more")
+    progress.say(f"views that teach: {first.taught:.1f} dB before, {last.taught:.1f} dB after")
+    if last.others == last.others:  # NaN: too few views to set one apart
+        progress.say(f"other views: {first.others:.1f} dB before, {last.others:.1f} dB after")
+    progress.result(f"run: {out}")
+    return 0
+
+
+def picture_style(
+    options: Stylize, run: "Run", shots: "tuple[Shot, ...]"
+) -> "tuple[Style, Teacher]":
+    """Return the style of edited pictures, without classes of its own, and the editor as teacher.
+
+    Raises:
+        UserError: weights, pictures or photos are missing or of no use.
+    """
+    from climatenerf.core.storage import hash_of_files
+    from climatenerf.styling.paper import editor, teachers
+    from climatenerf.styling.style_photos import (
+        parse_region,
+        photo_files,
+        read_labelled_photo,
+        unlabelled_note,
+    )
+    from climatenerf.weather.style import Source, Style
+
+    def style(name: str, *sources: Source) -> Style:
+        return Style(name[:100], (), None, options.patch, options.seed, sources)
+
+    def teacher(kind: str, made_from: str, edit: teachers.Edit) -> teachers.Teacher:
+        return teachers.picture_teacher(run.field, kind, made_from, edit)
+
+    if options.pictures is not None:
+        edit, paths = teachers.folder_editor(options.pictures, shots)
+        made_from = hash_of_files(paths)
+        source = Source(options.pictures.name, made_from, "")
+        return style(options.pictures.name, source), teacher("pictures", made_from, edit)
+    if options.editor is not None:
+        text = options.text or ""
+        edit = editor.diffusion_editor(options.editor, text, options.seed)
+        made_from = f"{options.editor.resolve()}: {text}"
+        return style(text), teacher("editor", made_from, edit)
+    assert options.wct is not None
+    regions = [parse_region(text) for text in options.style_region]
+    labeller = _labeller(options.labels)
+    photos = [read_labelled_photo(path, regions, labeller) for path in photo_files(options.style)]
+    if unlabelled := sum(not photo.labelled for photo in photos):
+        progress.say(unlabelled_note(unlabelled, len(photos)))
+    edit = teachers.wct_editor(run.field, options.wct, photos, options.width)
+    weights = hash_of_files(sorted(options.wct.glob("*.pth")))
+    made_from = f"{weights} {options.style_region} {options.labels}"
+    name = ", ".join(path.name or str(path) for path in options.style)
+    sources = (photo.source for photo in photos)
+    return style(name, *sources), teacher("wct", made_from, edit)
+
+
+def style_maker(options: Stylize) -> "Callable[[Run], Style]":
+    """Return what makes the style of a run; photos, season files and texts are read at once."""
     palettes, name, photos = None, "", None
     if options.season is not None:
         palettes, name = season_palettes(options.season)
@@ -87,33 +241,34 @@ def stylize(options: Stylize, folder: Path, out: Path) -> int:
         photos = read_photos(options, options.style)
         name = ", ".join(path.name or str(path) for path in options.style)
 
-    from climatenerf.api import load_run
-    from climatenerf.styling.scene_colours import colours_of_run
-    from climatenerf.styling.styled_run import write_styled_run
-    from climatenerf.weather.season.palettes import seasonal_style
-    from climatenerf.weather.style import weakened
-
-    run = load_run(folder)
-    with progress.StageBars() as bars:
-        ours = colours_of_run(run.field, run.scene, bars)
-    if photos is not None:
+    def make(run: "Run") -> "Style":
         from climatenerf.styling.colour_map import photo_style
+        from climatenerf.styling.scene_colours import colours_of_run
+        from climatenerf.weather.season.palettes import seasonal_style
+        from climatenerf.weather.style import weakened
 
+        with progress.StageBars() as bars:
+            ours = colours_of_run(run.field, run.scene, bars)
+        if palettes is not None:
+            means = {kind: colours.mean(0) for kind, colours in ours.items() if len(colours)}
+            style = seasonal_style(name, palettes, means, options.patch, options.seed)
+            return weakened(style, options.strength)
+        assert photos is not None
         style, notes = photo_style(
             name, ours, photos, options.strength, options.patch, options.seed
         )
         for note in notes:
             progress.say(note)
-        for licence in {source.licence for source in style.sources} - {""}:
-            progress.say(f"Pictures made with these photos carry their licence: {licence}")
-    else:
-        assert palettes is not None
-        means = {kind: colours.mean(0) for kind, colours in ours.items() if len(colours)}
-        style = seasonal_style(name, palettes, means, options.patch, options.seed)
-        style = weakened(style, options.strength)
-    write_styled_run(folder, run.scene, style, out)
-    progress.result(f"run: {out}")
-    return 0
+        say_licences(style.sources)
+        return style
+
+    return make
+
+
+def say_licences(sources: "tuple[Source, ...]") -> None:
+    """Print the licences of style photos, each once."""
+    for licence in sorted({source.licence for source in sources} - {""}):
+        progress.say(f"Pictures made with these photos carry their licence: {licence}")
 
 
 def measure(options: Stylize, out: Path) -> int:

@@ -10,6 +10,7 @@ grid units.
 """
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -253,6 +254,28 @@ class Field(nn.Module):
         Analytic, from the encoding's slopes; 0 where the density is constant. No gradient.
         """
         return -unit_vector(marching.density_slopes(q, self.density_net))
+
+    def recolourable(self) -> "Field":
+        """Return the same field with an appearance grid of its own, which may then change.
+
+        Normals and classes stay the same to the bit. Where they read the appearance grid (the
+        paper's sizes), the twin's surface grid is the present appearance grid. All other parameters
+        are shared.
+        """
+        twin, size = copy.copy(self), self.size
+        for kind in ("_parameters", "_buffers"):
+            twin.__dict__[kind] = dict(self.__dict__[kind])
+        if not size.surface_levels:
+            twin.size = replace(
+                size,
+                surface_levels=size.appearance_levels,
+                surface_log2_rows=size.appearance_log2_rows,
+                surface_finest=size.appearance_finest,
+            )
+            twin.surface_grid = self.appearance_grid
+            twin.surface_resolutions = self.appearance_resolutions
+        twin.appearance_grid = nn.Parameter(self.appearance_grid.detach().clone())
+        return twin
 
     def observed_only(self) -> "Field":
         """Return the same field without cells that no training image has seen.

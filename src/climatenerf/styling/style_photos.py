@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from climatenerf.core.classes import (
     CLASS_NAMES,
@@ -124,31 +124,67 @@ def read_style_photos(
     sources, unlabelled = [], 0
     files = photo_files(paths)
     for path in files:
-        picture = read_rgb(path)
-        linear = to_linear(picture / 255)
-        check_photo(path, linear)
-        sources.append(Source(path.name, _sha256(path), licence_beside(path)))
-        if regions:
-            parts = [(each.kind, _cut(linear, each).reshape(-1, 3)) for each in regions]
-        else:
-            labels = _labels(path, picture, labeller)
-            if labels is None:
-                unlabelled += 1
-                parts = [(kind, linear.reshape(-1, 3)) for kind in (VEGETATION, TERRAIN)]
-            else:
-                kinds = set(np.unique(labels).tolist()) - {UNKNOWN}
-                parts = [(kind, linear[labels == kind]) for kind in kinds]
-        for kind, pixels in parts:
+        photo = read_labelled_photo(path, regions, labeller)
+        sources.append(photo.source)
+        unlabelled += not photo.labelled
+        for kind, mask in photo.masks.items():
+            pixels = photo.linear[mask]
             every = max(1, len(pixels) // MAX_PIXELS)
-            found.setdefault(int(kind), []).append(pixels[::every])
-    notes = ()
-    if unlabelled:
-        notes = (
-            f"{unlabelled} of {len(files)} style photos have no labels: all their pixels stand for"
-            " vegetation and terrain; name classes with --style-region or --labels",
-        )
+            found.setdefault(kind, []).append(pixels[::every])
+    notes = (unlabelled_note(unlabelled, len(files)),) if unlabelled else ()
     colours = {kind: np.concatenate(parts) for kind, parts in sorted(found.items())}
     return StylePhotos(colours, tuple(sources), notes)
+
+
+def unlabelled_note(unlabelled: int, photos: int) -> str:
+    """Return what a user should know about style photos without classes."""
+    return (
+        f"{unlabelled} of {photos} style photos have no labels: all their pixels stand for"
+        " vegetation and terrain; name classes with --style-region or --labels"
+    )
+
+
+@dataclass(frozen=True)
+class LabelledPhoto:
+    """A style photo and where each class is in it.
+
+    Attributes:
+        linear: its linear colours, in [0, 1].
+        masks: the classes that it shows.
+        labelled: whether something told the classes; if not, all pixels stand for plants.
+        source: the file.
+    """
+
+    linear: Float[np.ndarray, "h w 3"]
+    masks: dict[int, Bool[np.ndarray, "h w"]]
+    labelled: bool
+    source: Source
+
+
+def read_labelled_photo(
+    path: Path, regions: Sequence[Region] = (), labeller: Labeller | None = None
+) -> LabelledPhoto:
+    """Read one style photo with its classes; see `read_style_photos`.
+
+    Raises:
+        UserError: it cannot be read, is black or of one colour, or its labels do not fit.
+    """
+    picture = read_rgb(path)
+    linear = to_linear(picture / 255)
+    check_photo(path, linear)
+    source = Source(path.name, _sha256(path), licence_beside(path))
+    masks: dict[int, Bool[np.ndarray, "h w"]] = {}
+    if regions:
+        for each in regions:
+            mask = masks.setdefault(each.kind, np.zeros(linear.shape[:2], bool))
+            mask[_inside(linear.shape[:2], each)] = True
+        return LabelledPhoto(linear, masks, True, source)
+    labels = _labels(path, picture, labeller)
+    if labels is None:
+        masks = {kind: np.ones(linear.shape[:2], bool) for kind in (VEGETATION, TERRAIN)}
+    else:
+        masks = {int(k): labels == k for k in set(np.unique(labels).tolist()) - {UNKNOWN}}
+    return LabelledPhoto(linear, masks, labels is not None, source)
 
 
 def check_photo(path: Path, linear: Float[np.ndarray, "h w 3"]) -> None:
@@ -189,12 +225,13 @@ def _labels(
     return None if labeller is None else MERGED[labeller(picture)]
 
 
-def _cut(linear: Float[np.ndarray, "h w 3"], region: Region) -> Float[np.ndarray, "a b 3"]:
-    height, width = linear.shape[:2]
+def _inside(size: tuple[int, int], region: Region) -> tuple[slice, slice]:
+    """Return rows and columns of a region, at least one of each."""
+    height, width = size
     left, top, right, bottom = region.box
     rows = slice(int(top * height), max(int(bottom * height), int(top * height) + 1))
     columns = slice(int(left * width), max(int(right * width), int(left * width) + 1))
-    return linear[rows, columns]
+    return rows, columns
 
 
 def _sha256(path: Path) -> str:

@@ -72,6 +72,25 @@ class Source:
 
 
 @dataclass(frozen=True)
+class FineTuned:
+    """How the field itself got the colours: its appearance grid was fitted to pictures.
+
+    Attributes:
+        teacher: what made the pictures: "operator", "wct", "pictures" or "editor".
+        steps: of the fit that were taken.
+        views: that taught.
+        width: of their pictures, pixels.
+        psnr: of other views against their pictures, dB: before, after. None: there were none.
+    """
+
+    teacher: str
+    steps: int
+    views: int
+    width: int
+    psnr: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
 class Style:
     """New colours of a scene.
 
@@ -83,6 +102,7 @@ class Style:
         seed: of the noise that tells these places apart.
         sources: files that it was made from.
         note: what a user should know.
+        fine_tuned: how the field got its colours, if not by `classes`, which are empty then.
     """
 
     name: str
@@ -92,6 +112,7 @@ class Style:
     seed: int
     sources: tuple[Source, ...] = ()
     note: str = ""
+    fine_tuned: FineTuned | None = None
 
 
 def weakened(style: Style, strength: float) -> Style:
@@ -109,30 +130,32 @@ def write_style(folder: Path, style: Style) -> None:
     Raises:
         UserError: the file cannot be written.
     """
+    write_json(folder / FILE_NAME, {"schema_version": SCHEMA_VERSION, **as_table(style)})
+
+
+def as_table(style: Style) -> dict[str, Any]:
+    """Return a style as its file holds it, without the version."""
     sky = style.sky
-    write_json(
-        folder / FILE_NAME,
-        {
-            "schema_version": SCHEMA_VERSION,
-            "name": style.name,
-            "classes": {
-                CLASS_NAMES[each.kind]: {
-                    "palette": each.palette.tolist(),
-                    "matrix": each.matrix.tolist(),
-                    "strength": each.strength,
-                    "gate": each.gate,
-                }
-                for each in style.classes
-            },
-            "sky": None
-            if sky is None
-            else {"colour": list(sky.colour), "gradient": sky.gradient, "share": sky.share},
-            "patch_m": style.patch,
-            "seed": style.seed,
-            "sources": [vars(each) for each in style.sources],
-            "note": style.note,
+    return {
+        "name": style.name,
+        "classes": {
+            CLASS_NAMES[each.kind]: {
+                "palette": each.palette.tolist(),
+                "matrix": each.matrix.tolist(),
+                "strength": each.strength,
+                "gate": each.gate,
+            }
+            for each in style.classes
         },
-    )
+        "sky": None
+        if sky is None
+        else {"colour": list(sky.colour), "gradient": sky.gradient, "share": sky.share},
+        "patch_m": style.patch,
+        "seed": style.seed,
+        "sources": [vars(each) for each in style.sources],
+        "note": style.note,
+        "fine_tuned": None if style.fine_tuned is None else vars(style.fine_tuned),
+    }
 
 
 def style_in(folder: Path) -> Style | None:
@@ -168,6 +191,24 @@ def style_in(folder: Path) -> Style | None:
         parsing.integer(data, "seed", where, -(2**63), 2**63 - 1),
         tuple(sources),
         parsing.text(data, "note", where, ""),
+        _read_fine_tuned(data, where),
+    )
+
+
+def _read_fine_tuned(data: dict[str, Any], where: str) -> FineTuned | None:
+    if data.get("fine_tuned") is None:
+        return None
+    table = parsing.entries(data, "fine_tuned", where)
+    psnr = None
+    if table.get("psnr") is not None:
+        before, after = parsing.matrix([table["psnr"]], [(1, 2)], f"the PSNR of {where}", 1e3)[0]
+        psnr = float(before), float(after)
+    return FineTuned(
+        parsing.text(table, "teacher", where),
+        parsing.integer(table, "steps", where, 0, 10**9),
+        parsing.integer(table, "views", where, 1, 10**6),
+        parsing.integer(table, "width", where, 1, 10**6),
+        psnr,
     )
 
 

@@ -158,7 +158,7 @@ def garden():
 
 
 def styled(inner, kind="autumn", white=(1.0, 1.0, 1.0)):
-    classes = class_colours(style(kind), 1.0, torch.device("cpu"))
+    classes = class_colours(style(kind), torch.device("cpu"))
     return StyledField(inner, classes, 4.0, r.mottle(0), torch.tensor(white))
 
 

@@ -19,7 +19,7 @@ from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.weather.light.relit_field import RelitField
 from climatenerf.weather.season.palettes import palettes_of, seasonal_style
 from climatenerf.weather.season.styled_field import StyledField
-from climatenerf.weather.style import Style
+from climatenerf.weather.style import Style, weakened
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
 
@@ -54,7 +54,8 @@ class SeasonEntity:
         if season.strength == 0:
             return None
         if season.kind == "captured":
-            return self._given.style
+            style = self._given.style
+            return style if style is not None and style.classes else None
         palettes = palettes_of(season.kind)
         return seasonal_style(season.kind, palettes, self._means, season.patch, weather.seed)
 
@@ -63,14 +64,13 @@ class SeasonEntity:
         style = self._style(weather)
         if style is None:
             return world
-        device = device_of(world.field)
-        white = torch.ones(3, device=device)
+        white = torch.ones(3, device=device_of(world.field))
         if isinstance(world.field, RelitField):
             old, new = world.field.old.open_irradiance(), world.field.new.open_irradiance()
             white = new / old.clamp_min(1e-6)  # a black scene: 0/0
-        classes = class_colours(style, weather.season.strength, device)
-        noise = self._mottle(style.seed)
-        return replace(world, field=StyledField(world.field, classes, style.patch, noise, white))
+        shown = weakened(style, weather.season.strength)
+        field = styled_field(world.field, shown, self._mottle(style.seed), white)
+        return replace(world, field=field)
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a season where the field does not know plants from walls.
@@ -87,13 +87,31 @@ class SeasonEntity:
         return {}
 
 
+def styled_field(
+    field: RadianceField,
+    style: Style,
+    noise: Float[Tensor, "z y x"],
+    white: Float[Tensor, "3"],
+) -> StyledField:
+    """Return a field in the colours of a style.
+
+    Args:
+        field: a field with classes.
+        style: the new colours.
+        noise: `mottle` of the style's seed.
+        white: light that the field is shown in over that of its photos.
+    """
+    classes = class_colours(style, device_of(field))
+    return StyledField(field, classes, style.patch, noise, white)
+
+
 def prepare(preparation: Preparation) -> SeasonEntity:
     """Colours are found when a frame first needs them."""
     return SeasonEntity(preparation)
 
 
-def class_colours(style: Style, strength: float, device: torch.device) -> ClassColours:
-    """Return the classes of a style as tensors, of which a fraction is made, 0 to 1."""
+def class_colours(style: Style, device: torch.device) -> ClassColours:
+    """Return the classes of a style as tensors; shorter palettes repeat their last colour."""
     longest = max((len(each.palette) for each in style.classes), default=1)
     parts = style.classes
 
@@ -108,7 +126,7 @@ def class_colours(style: Style, strength: float, device: torch.device) -> ClassC
     ]
     return ClassColours(
         whole([int(SOLID_OF[each.kind]) for each in parts]),
-        tensor([each.strength * strength for each in parts]),
+        tensor([each.strength for each in parts]),
         tensor([each.gate for each in parts]),
         tensor(padded, longest, 3),
         whole([len(each.palette) for each in parts]),
