@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from climatenerf.styling.paper.gain import BOUNDS, DARK, low_frequency_gain
+from climatenerf.styling.paper.gain import BRIGHTNESS, DARK, HUE, low_frequency_gain
 
 SIZE = (40, 260)  # the blur is 2 pixels
 
@@ -25,8 +25,19 @@ def test_gain_of_constant_pictures_is_their_ratio():
     c, y = np.full((*SIZE, 3), 0.2), np.full((*SIZE, 3), 0.05)
     expected = (0.05 + DARK) / (0.2 + DARK)
     assert np.allclose(low_frequency_gain(c, y, full()), expected, rtol=1e-4)
-    assert low_frequency_gain(0 * c, 1 + 0 * c, full()).max() == BOUNDS[1]
-    assert low_frequency_gain(1 + 0 * c, 0 * c, full()).min() == BOUNDS[0]
+
+
+def test_gains_are_bounded_without_a_change_of_hue():
+    c = np.full((*SIZE, 3), 0.1)
+    assert np.allclose(low_frequency_gain(0 * c, 1 + 0 * c, full()), BRIGHTNESS[1])
+    assert np.allclose(low_frequency_gain(1 + 0 * c, 0 * c, full()), BRIGHTNESS[0])
+    # Olive leaves under white snow: brighter by the bound, and white.
+    olive, snow = c * [0.8, 0.7, 0.1], 0 * c + 0.9
+    white = (olive + DARK) * low_frequency_gain(olive, snow, full())
+    assert np.ptp(white, axis=-1).max() < 1e-4
+    # Red walls seen as pure blue: the hue has bounds, too.
+    gain = low_frequency_gain(c * [5, 0, 0], c * [0, 0, 5], full())
+    assert gain.max() <= BRIGHTNESS[1] * HUE[1]
 
 
 def test_texture_of_the_teacher_is_not_learned():

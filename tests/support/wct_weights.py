@@ -20,13 +20,14 @@ def save_wct(folder: Path, seed: int = 0) -> Path:
     generator = torch.Generator(device="cpu").manual_seed(seed)
     for level in (1, 2, 3):
         names = NAMES[: NAMES.index(f"conv{level}1") + 1]
-        encoder = dict(zip(("conv0.weight", "conv0.bias"), random_layer(generator, 3, 3, 1)))
+        weight, bias = random_layer(generator, 3, 3, 1)
+        encoder = {"conv0.weight": weight, "conv0.bias": bias}
         decoder, inputs = {}, 3
         for name in names:
             weight, bias = random_layer(generator, inputs, WIDTHS[name], 3)
             encoder |= {f"{name}.weight": weight, f"{name}.bias": bias}
             inputs = WIDTHS[name]
-        for name, following in zip(reversed(names), [*reversed(names[:-1]), None]):
+        for name, following in zip(reversed(names), [*reversed(names[:-1]), None], strict=True):
             outputs = 3 if following is None else WIDTHS[following]
             weight, bias = random_layer(generator, inputs, outputs, 3)
             decoder |= {f"{name}.weight": weight, f"{name}.bias": bias}

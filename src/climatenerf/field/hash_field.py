@@ -273,7 +273,7 @@ class Field(nn.Module):
                 surface_finest=size.appearance_finest,
             )
             twin.surface_grid = self.appearance_grid
-            twin.surface_resolutions = self.appearance_resolutions
+            twin.surface_resolutions = self.appearance_resolutions.clone()  # files share nothing
         twin.appearance_grid = nn.Parameter(self.appearance_grid.detach().clone())
         return twin
 

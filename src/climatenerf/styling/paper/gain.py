@@ -8,9 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 
+from climatenerf.core.srgb import LUMA
+
 BLURS_ACROSS = 130  # standard deviations of the blur across the picture's width
 DARK = 0.01  # linear radiance added to both: the ratio of two dark pixels is noise
-BOUNDS = (0.2, 5.0)
+BRIGHTNESS = (0.2, 5.0)  # bounds of the gain of luminance
+HUE = (0.125, 8.0)  # bounds of a channel's gain over that of luminance; leaves have little blue
 
 
 def low_frequency_gain(
@@ -18,7 +21,10 @@ def low_frequency_gain(
     taught: Float[np.ndarray, "h w 3"],
     opacity: Float[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """Return G = (B y + e) / (B c + e) within `BOUNDS`, with a Gaussian blur B over matter alone.
+    """Return G = (B y + e) / (B c + e), with a Gaussian blur B over matter alone.
+
+    Luminance and hue have bounds of their own: with one bound on all channels, leaves under snow
+    would turn yellow where blue has reached it.
 
     Args:
         clean: linear radiance c of the field.
@@ -32,4 +38,6 @@ def low_frequency_gain(
 
     # 1e-6: no matter near a pixel, 0/0.
     dark = DARK * blurred(np.ones_like(clean)) + 1e-6
-    return ((blurred(taught) + dark) / (blurred(clean) + dark)).clip(*BOUNDS)
+    new, old = blurred(taught) + dark, blurred(clean) + dark
+    brightness = (new @ np.array(LUMA))[..., None] / (old @ np.array(LUMA))[..., None]
+    return brightness.clip(*BRIGHTNESS) * (new / old / brightness).clip(*HUE)
