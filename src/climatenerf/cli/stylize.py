@@ -1,5 +1,6 @@
 """``climatenerf stylize RUN -o RUN2``: a run in the colours of a season, photos or a text."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,7 +177,7 @@ def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
     if last.step < options.steps:
         progress.say(f"ended after {last.step} steps: other views improved no more")
     progress.say(f"views that teach: {first.taught:.1f} dB before, {last.taught:.1f} dB after")
-    if last.others == last.others:  # NaN: too few views to set one apart
+    if not math.isnan(last.others):  # too few views to set one apart
         progress.say(f"other views: {first.others:.1f} dB before, {last.others:.1f} dB after")
     progress.result(f"run: {out}")
     return 0
