@@ -14,10 +14,17 @@ from support.wct_weights import save_wct
 from climatenerf import load_run
 from climatenerf.core.storage import read_safetensors
 from climatenerf.field.presets import PRESETS
+from climatenerf.field.protocol import observed
+from climatenerf.output.job import hash_of_run
+from climatenerf.render.irradiance import scene_irradiance
+from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.session import RenderSession
 from climatenerf.render.volume import render_view
 from climatenerf.styling.paper import fine_tune
 from climatenerf.styling.paper.shots import choose_shots, march, matter
+from climatenerf.weather.light.captured import COLUMNS, ROWS, CapturedLight
+from climatenerf.weather.light.file import load_light, save_light
+from climatenerf.weather.light.find_light import find_light
 from climatenerf.weather.style import style_in
 from climatenerf.weather.weather import Weather
 
@@ -107,6 +114,37 @@ def test_a_recoloured_twin_of_the_paper_sizes_keeps_its_surface_head():
     assert torch.equal(field.surface_raw(u), before), "the field itself stays as it is"
 
 
+def test_light_that_weather_takes_from_the_ground_stays(run, red, tmp_path):
+    """Red lawns are no redder light: irradiance and the light of the photos are those of before."""
+    out = tmp_path / "out"
+    assert paper(run, out, "--pictures", red) == 0
+    old, new = load_run(run), load_run(out)
+    before = scene_irradiance(old.field, old.scene)
+    assert float((scene_irradiance(new.field, new.scene) - before).abs().max()) > 0.02
+    assert torch.equal(session_of(new)._irradiance(), before)
+    photo = new.field.photo_appearance(0)
+    shown = session_of(new, photo)._irradiance()
+    torch.testing.assert_close(shown, before, rtol=1e-3, atol=1e-3)  # embeddings of 0: one exposure
+    light, made_from = load_light(out / "light.json")
+    assert made_from == hash_of_run(out)
+    assert light == find_light(old.field, trace_photos(observed(old.field), old.scene), None)
+
+
+def test_the_light_that_a_run_keeps_is_taken_along(red, tmp_path):
+    run, out = random_run(tmp_path, small("cpu")), tmp_path / "out"
+    shown = np.ones((ROWS, COLUMNS))
+    sky = CapturedLight(np.full(3, 0.25), np.full(3, 0.75), None, 0.0, np.zeros(3), shown, 0.0)
+    save_light(run / "light.json", sky, hash_of_run(run))
+    assert paper(run, out, "--pictures", red) == 0
+    light, made_from = load_light(out / "light.json")
+    assert made_from == hash_of_run(out)
+    assert light.horizon.tolist() == [0.25] * 3 and light.zenith.tolist() == [0.75] * 3
+
+
+def session_of(run, appearance=None):
+    return RenderSession(run.field, run.scene, Weather(), style=run.style, appearance=appearance)
+
+
 # --- What is learned ------------------------------------------------------------------------------
 
 
@@ -165,6 +203,30 @@ def test_cached_rays_show_what_a_render_shows(run):
     some = torch.tensor([900, 3, 3, 1700])
     found, whole = matter(loaded.field, rays.rows(some)), linear[some] - rays.behind[some]
     torch.testing.assert_close(found, whole, rtol=1e-4, atol=1e-6)
+
+
+def test_a_field_that_teaches_itself_has_nothing_to_learn(run):
+    """Also where a part of the sky is behind the matter; rays that show mostly sky are left."""
+    field = load_run(run).field
+    rays = march(field, *shot_rays(load_run(run)))
+    assert ((rays.transmittance > 0.05) & (rays.transmittance < 0.5)).sum() > 20
+    lesson = fine_tune.lesson_of(rays, matter(field, rays))
+    assert 0 < len(lesson.rays) < len(rays)
+    assert float(lesson.rays.transmittance.max()) < 0.5
+    assert fine_tune.psnr(field, lesson) > 90
+    assert np.isnan(fine_tune.psnr(field, lesson.none()))
+
+
+def test_views_are_spread_and_their_pixels_bounded(run, monkeypatch):
+    scene = load_run(run).scene
+    shots = choose_shots(scene, 3, 24, 5)
+    assert [shot.name for shot in shots] == ["00.png", "02.png", "05.png"]
+    assert {(shot.camera.width, shot.camera.height) for shot in shots} == {(24, 18)}
+    monkeypatch.setattr("climatenerf.styling.paper.shots.MAX_RAYS", 300)
+    few = choose_shots(scene, 3, 24, 5)
+    assert all(len(np.unique(shot.pixels)) == 100 for shot in few)
+    assert np.array_equal(few[1].pixels, choose_shots(scene, 3, 24, 5)[1].pixels)
+    assert not np.array_equal(few[1].pixels, choose_shots(scene, 3, 24, 6)[1].pixels)
 
 
 def test_wct_teaches(run, tmp_path):

@@ -50,8 +50,9 @@ def save_editor(folder: Path) -> Path:
             eos_token_id=len(names) - 1,
         )
     )
+    scheduler = diffusers.DDIMScheduler(clip_sample=False, steps_offset=1)
     pipeline = diffusers.StableDiffusionImg2ImgPipeline(
-        vae, encoder, tokenizer, unet, diffusers.DDIMScheduler(clip_sample=False, steps_offset=1), None, None,
+        vae, encoder, tokenizer, unet, scheduler, None, None,
         requires_safety_checker=False,
     )  # fmt: skip
     pipeline.save_pretrained(folder / "editor", safe_serialization=True)

@@ -220,8 +220,24 @@ class RenderSession:
     def _irradiance(self) -> Float[Tensor, "3"]:
         if self._light is None:
             self._progress("light", 0.0)
-            self._light = scene_irradiance(self.field, self.scene, self._appearance)
+            self._light = self._open_irradiance()
         return self._light
+
+    def _open_irradiance(self) -> Float[Tensor, "3"]:
+        """Irradiance of the photos on open level ground.
+
+        Ground that a style has recoloured would tell another; the style then has that of before, in
+        the mean of all photos.
+        """
+        shown = scene_irradiance(self.field, self.scene, self._appearance)
+        style = self._style
+        if style is None or style.fine_tuned is None:
+            return shown
+        before = shown.new_tensor(style.fine_tuned.irradiance)
+        if self._appearance is None:
+            return before
+        mean = scene_irradiance(self.field, self.scene, None)
+        return before * shown / mean.clamp_min(1e-6)  # a black scene: 0/0
 
 
 def _key(effect: Effect, moments: Sequence[Weather]) -> Key:

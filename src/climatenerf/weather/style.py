@@ -80,6 +80,7 @@ class FineTuned:
         steps: of the fit that were taken.
         views: that taught.
         width: of their pictures, pixels.
+        irradiance: on open level ground before, linear; recoloured ground tells another.
         psnr: of other views against their pictures, dB: before, after. None: there were none.
     """
 
@@ -87,6 +88,7 @@ class FineTuned:
     steps: int
     views: int
     width: int
+    irradiance: Colour
     psnr: tuple[float, float] | None = None
 
 
@@ -203,11 +205,15 @@ def _read_fine_tuned(data: dict[str, Any], where: str) -> FineTuned | None:
     if table.get("psnr") is not None:
         before, after = parsing.matrix([table["psnr"]], [(1, 2)], f"the PSNR of {where}", 1e3)[0]
         psnr = float(before), float(after)
+    what = f"the irradiance of {where}"
+    rgb = parsing.matrix([table.get("irradiance")], [(1, 3)], what, MAX_ENTRY)[0].clip(0)
+    red, green, blue = rgb.tolist()
     return FineTuned(
         parsing.text(table, "teacher", where),
         parsing.integer(table, "steps", where, 0, 10**9),
         parsing.integer(table, "views", where, 1, 10**6),
         parsing.integer(table, "width", where, 1, 10**6),
+        (red, green, blue),
         psnr,
     )
 

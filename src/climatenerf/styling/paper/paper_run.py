@@ -7,10 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from climatenerf.core.device import to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
 from climatenerf.core.storage import (
@@ -22,8 +24,12 @@ from climatenerf.core.storage import (
     write_json,
     write_safetensors,
 )
+from climatenerf.field.capabilities import NORMALS
 from climatenerf.field.hash_field import Field
-from climatenerf.field.protocol import device_of
+from climatenerf.field.protocol import device_of, observed
+from climatenerf.output.job import hash_of_run
+from climatenerf.render.irradiance import scene_irradiance
+from climatenerf.render.photo_rays import trace_photos
 from climatenerf.scene.scene import FILE_NAME as SCENE
 from climatenerf.scene.scene import Scene
 from climatenerf.styling.paper.fine_tune import (
@@ -37,6 +43,10 @@ from climatenerf.styling.paper.shots import Shot, joined, march, matter
 from climatenerf.styling.paper.teachers import Teacher
 from climatenerf.styling.styled_run import UNFINISHED, check_out, write_styled_run
 from climatenerf.training.snapshot import FIELD
+from climatenerf.weather.light.file import FILE_NAME as LIGHT
+from climatenerf.weather.light.file import load_light, save_light
+from climatenerf.weather.light.find_light import find_light
+from climatenerf.weather.light.solar_position import almanac_sun
 from climatenerf.weather.style import FineTuned, Style, as_table
 
 PLAN, STATE = "plan.json", "state.safetensors"
@@ -108,17 +118,34 @@ def write_fine_tuned_run(
         tuned.run(lesson, others, after)
         if tuned.step < settings.steps:  # it ended early
             progress("colours", 1.0)
-        learned = replace(style, classes=(), fine_tuned=_record(tuned, teacher, shots))
+        record = _record(tuned, teacher, shots, to_numpy(scene_irradiance(field, scene)))
+        learned = replace(style, classes=(), fine_tuned=record)
         write_styled_run(folder, scene, learned, out, tuned.field)
+        _keep_light(run, out)
         shutil.rmtree(unfinished, ignore_errors=True)
     return tuned.scores
 
 
-def _record(tuned: FineTuning, teacher: Teacher, shots: Sequence[Shot]) -> FineTuned:
+def _record(
+    tuned: FineTuning, teacher: Teacher, shots: Sequence[Shot], light: Float[np.ndarray, "3"]
+) -> FineTuned:
     first, last = tuned.scores[0], tuned.scores[-1]
     width = max(shot.camera.width for shot in shots)
     psnr = None if math.isnan(first.others) else (first.others, last.others)
-    return FineTuned(teacher.kind, tuned.step, len(shots), width, psnr)
+    red, green, blue = map(float, light)
+    return FineTuned(teacher.kind, tuned.step, len(shots), width, (red, green, blue), psnr)
+
+
+def _keep_light(run: tuple[Path, Field, Scene], out: Path) -> None:
+    """Write the light of the photos into the copy; in new colours another would be found."""
+    folder, field, scene = run
+    if NORMALS not in field.capabilities:
+        return
+    path = folder / LIGHT
+    light, made_from = load_light(path) if path.is_file() else (None, "")
+    if light is None or made_from != hash_of_run(folder):
+        light = find_light(field, trace_photos(observed(field), scene), almanac_sun(scene))
+    save_light(out / LIGHT, light, hash_of_run(out))
 
 
 def _plan(folder: Path, style: Style, teacher: Teacher, settings: PaperSettings) -> str:
