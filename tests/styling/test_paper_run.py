@@ -22,6 +22,7 @@ from climatenerf.render.session import RenderSession
 from climatenerf.render.volume import render_view
 from climatenerf.styling.paper import fine_tune
 from climatenerf.styling.paper.shots import choose_shots, march, matter
+from climatenerf.styling.paper.teachers import picture_teacher
 from climatenerf.weather.light.captured import COLUMNS, ROWS, CapturedLight
 from climatenerf.weather.light.file import load_light, save_light
 from climatenerf.weather.light.find_light import find_light
@@ -240,6 +241,23 @@ def test_wct_teaches(run, tmp_path):
     assert not np.array_equal(
         tensors(run)["appearance_grid"], tensors(tmp_path / "out")["appearance_grid"]
     )
+
+
+def test_strength_scales_the_gain_that_pictures_teach(run):
+    field = load_run(run).field
+    shot = choose_shots(load_run(run).scene, 3, 24, 0)[0]
+    clean = matter(field, march(field, *shot.rays(torch.device("cpu"))))
+
+    def darker(shot, picture):
+        return 0.5 * picture
+
+    full, half, none = (
+        picture_teacher(field, "pictures", "", darker, strength).teach(shot, clean)
+        for strength in (1.0, 0.5, 0.0)
+    )
+    assert torch.equal(none, clean)
+    torch.testing.assert_close(half, (full + clean) / 2, rtol=1e-5, atol=1e-6)
+    assert float(full.mean()) < 0.6 * float(clean.mean())
 
 
 def test_a_fit_ends_when_other_views_stop_improving():

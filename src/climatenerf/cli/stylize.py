@@ -205,7 +205,7 @@ def picture_style(
         return Style(name[:100], (), None, options.patch, options.seed, sources)
 
     def teacher(kind: str, made_from: str, edit: teachers.Edit) -> teachers.Teacher:
-        return teachers.picture_teacher(run.field, kind, made_from, edit)
+        return teachers.picture_teacher(run.field, kind, made_from, edit, options.strength)
 
     if options.pictures is not None:
         edit, paths = teachers.folder_editor(options.pictures, shots)

@@ -83,7 +83,9 @@ def operator_teacher(field: Field, style: Style) -> Teacher:
     return Teacher("operator", style.name, teach)
 
 
-def picture_teacher(field: Field, kind: str, made_from: str, edit: Edit) -> Teacher:
+def picture_teacher(
+    field: Field, kind: str, made_from: str, edit: Edit, strength: float = 1.0
+) -> Teacher:
     """Return an editor of pictures as a teacher; it sees the field at the mean appearance.
 
     Args:
@@ -91,6 +93,7 @@ def picture_teacher(field: Field, kind: str, made_from: str, edit: Edit) -> Teac
         kind: of the teacher.
         made_from: tells it from others.
         edit: the editor.
+        strength: fraction of the change that is taught, 0 to 1.
     """
 
     def teach(shot: Shot, clean: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -108,10 +111,10 @@ def picture_teacher(field: Field, kind: str, made_from: str, edit: Edit) -> Teac
         gain = low_frequency_gain(
             to_linear(picture), to_linear(edited), to_numpy(torch.cat(opacity)).reshape(size)
         )
-        chosen = gain.reshape(-1, 3)[shot.pixels].astype(np.float32)
+        chosen = (1 + strength * (gain - 1)).reshape(-1, 3)[shot.pixels].astype(np.float32)
         return clean * to_device(chosen, clean.device)
 
-    return Teacher(kind, made_from, teach)
+    return Teacher(kind, f"{made_from}, strength {strength}", teach)
 
 
 def wct_editor(field: Field, folder: Path, photos: Sequence[LabelledPhoto], width: int) -> Edit:
