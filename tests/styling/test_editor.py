@@ -24,6 +24,7 @@ def shot(name="a.jpg"):
     return Shot(name, Camera(40, 24, 30.0, 30.0, 20.0, 12.0), np.eye(4), np.arange(40 * 24))
 
 
+@pytest.mark.slow  # importing diffusers and 125 passes through the network
 def test_pictures_come_back_at_the_size_of_the_view_and_repeat(folder):
     picture = np.random.default_rng(0).random((24, 40, 3)).astype(np.float32)
     edit = diffusion_editor(folder, "late snow", 3)
