@@ -33,7 +33,7 @@ from climatenerf.styling.paper.gain import low_frequency_gain
 from climatenerf.styling.paper.shots import Shot
 from climatenerf.styling.style_photos import LabelledPhoto
 from climatenerf.weather.season.entity import no_classes, styled_field
-from climatenerf.weather.season.recolouring import mottle
+from climatenerf.ops.recolouring import mottle
 from climatenerf.weather.style import Style
 
 MAX_ASPECT_ERROR = 0.02  # of a picture's sides against the photo's
