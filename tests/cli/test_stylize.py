@@ -146,6 +146,10 @@ def test_an_unfinished_copy_is_made_anew_and_foreign_files_stay(run_folder, tmp_
         (("--season", "winter", "--labels", "x"), "belong to --style"),
         (("--style", "nothing.jpg"), "no style photo"),
         (("--text", "cherry"), "no rule for"),
+        (("--season", "winter", "--seed", "99999999999999999999"), "--seed must"),
+        (("--season", "winter", "--seed", "-1"), "--seed must"),
+        (("--season", "winter", "--steps", "9"), "belongs to --method paper"),
+        (("--method", "paper"), "--pictures; got none"),
     ],
 )
 def test_wrong_input_is_one_sentence_and_writes_nothing(run_folder, tmp_path, capsys, flags, named):
@@ -165,3 +169,28 @@ def test_the_run_itself_and_missing_paths_are_refused(run_folder, tmp_path, caps
     assert run_cli("stylize", tmp_path / "none", "-o", tmp_path / "a", "--season", "winter") == 2
     assert not (tmp_path / "a").exists()
     assert "name with -o" in capsys.readouterr().err
+
+
+def test_a_style_that_shares_no_class_with_the_scene_is_refused(run_folder, tmp_path, capsys):
+    folder, out = photos(tmp_path / "photos"), tmp_path / "run"
+    flags = ("--style", folder, "--style-region", "person=0,0,1,1")
+    assert run_cli("stylize", run_folder, "-o", out, *flags) == 2
+    assert "nothing would change" in capsys.readouterr().err and not out.exists()
+
+
+def test_sweeps_and_comparisons_show_the_style(run_folder, winter, tmp_path, capsys):
+    seen = []
+    for run in (run_folder, winter):
+        out = tmp_path / f"sweep-{run.name}"
+        flags = ("--sweep", "smog.visibility=1 km,2 km", "--size", "32x18")
+        assert run_cli("evaluate", run, "-o", out, *flags) == 0
+        strip = sorted(out.glob("smog.visibility-*.png"))[0]
+        seen.append(np.asarray(Image.open(strip)).astype(int))
+        out = tmp_path / f"compare-{run.name}"
+        flags = ("--effects", "smog", "--frames", 10, "--size", "32x18", "--no-truth")
+        assert run_cli("compare", run, "-o", out, *flags) == 0
+        frame = sorted((out / "clean" / "frames").glob("*.png"))[0]
+        seen.append(np.asarray(Image.open(frame)).astype(int))
+    assert abs(seen[2] - seen[0]).max() > 20 and abs(seen[3] - seen[1]).max() > 20
+    assert run_cli("evaluate", winter, "--reference", "-o", tmp_path / "report") == 2
+    assert "other colours than the truth" in capsys.readouterr().err

@@ -69,6 +69,15 @@ def test_the_sky_takes_the_photos_colour():
     np.testing.assert_allclose(style.sky.colour, sky[0] / (sky[0] @ LUMA))
 
 
+@pytest.mark.parametrize("kind", [SKY, VEGETATION])
+def test_black_classes_count_as_not_shown(kind):
+    photos = StylePhotos({TERRAIN: LEAVES, kind: np.zeros((600, 3))}, ())
+    style, notes = photo_style("x", {TERRAIN: LEAVES, VEGETATION: LEAVES}, photos, 1.0, 4.0, 0)
+    assert [each.kind for each in style.classes] == [TERRAIN] and style.sky is None
+    assert ("sky stays" if kind == SKY else "vegetation stays") in " ".join(notes)
+    assert set(season_of_photos(photos)) == {"note", "terrain"}
+
+
 # --- reading --------------------------------------------------------------------------------------
 
 

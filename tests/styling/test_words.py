@@ -42,3 +42,27 @@ def test_what_has_no_rule_is_told():
         read_text("cherry blossom")
     with pytest.raises(UserError, match="no rule for"):
         read_text("trees")
+
+
+def test_colours_joined_by_and_are_one_palette():
+    palettes = read_text("yellow and red leaves and grey sky").palettes
+    assert len(palettes.vegetation.palette) == 2 and palettes.sky.colour == pytest.approx((1, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "unknown"),
+    [
+        ("winter, autumn sky", {"autumn", "sky"}),  # autumn has no sky of its own
+        ("winter autumn", {"autumn"}),
+        ("winter, not red leaves", {"not", "red", "leaves"}),
+        ("brown lawn and dark", {"dark"}),
+    ],
+)
+def test_every_word_without_effect_is_named(text, unknown):
+    assert set(read_text(text).unknown) == unknown
+
+
+def test_light_green_leaves_change_wholly():
+    plain, light = (read_text(f"{word}green leaves").palettes for word in ("", "light "))
+    assert light.vegetation.strength == plain.vegetation.strength
+    assert light.vegetation.brightness > plain.vegetation.brightness

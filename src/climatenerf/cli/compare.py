@@ -10,7 +10,7 @@ from climatenerf.cli import progress
 from climatenerf.cli.flags import optional
 from climatenerf.cli.render import check_out, parse_size
 from climatenerf.core.errors import UserError
-from climatenerf.core.input_limits import check_seed
+from climatenerf.core.input_limits import check_fps, check_seed
 from climatenerf.studies.compare.settings import (
     EFFECTS,
     ClimateGanSettings,
@@ -64,7 +64,6 @@ def run(options: Compare) -> int:
     size = parse_size(options.size)
 
     from climatenerf.api import load_run
-    from climatenerf.output.job import check_fps
     from climatenerf.studies.compare import cases, study
     from climatenerf.studies.compare.climategan import climategan_methods
     from climatenerf.studies.compare.diffusion import diffusion_methods
@@ -91,7 +90,7 @@ def run(options: Compare) -> int:
     for sentence in path.notes:
         progress.say(sentence)
     truth = None
-    if options.truth:
+    if options.truth and fitted.style is None:  # the truth has the photos' colours
         try:
             truth = cases.true_views(scene, fitted.field, effects)
         except UserError as error:
@@ -118,6 +117,7 @@ def run(options: Compare) -> int:
                 fitted.digest,
                 fitted.field.knows_classes,
                 fitted.completed,
+                fitted.style,
             ),
             options.out,
             plan,

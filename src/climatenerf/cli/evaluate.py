@@ -125,6 +125,10 @@ def run_reference(options: Evaluate) -> int:
     from climatenerf.weather.world import Kept
 
     fitted = load_run(options.run)
+    if fitted.style is not None:
+        raise UserError(
+            f"{options.run} has other colours than the truth; evaluate the run that it was made of"
+        )
     field, scene = fitted.field, fitted.scene
     config = check_config(options.run)
     reference = read_reference(scene.root, options.views, options.weathers)

@@ -55,7 +55,8 @@ def load_place(run: Path, out: Path) -> "Place":
     check_out(out, run, fitted.scene)
     with progress.StageBars() as bars:
         field = fitted.completed(bars)
-    return Place(field, fitted.scene, Kept(run, fitted.digest or hash_of_run(run)))
+    kept = Kept(run, fitted.digest or hash_of_run(run))
+    return Place(field, fitted.scene, kept, fitted.style)
 
 
 def geometry(

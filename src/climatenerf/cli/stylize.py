@@ -11,6 +11,7 @@ import tyro
 from climatenerf.cli import progress
 from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError
+from climatenerf.core.input_limits import check_seed
 from climatenerf.weather.units import LENGTH, quantity
 
 if TYPE_CHECKING:
@@ -78,6 +79,9 @@ def run(options: Stylize) -> int:
     }
     given = [name for name, value in asked.items() if value]
     paper = check_method(options)
+    check_seed(options.seed)
+    if paper and not given and options.pictures is None:
+        raise UserError("give one of --season, --style, --text and --pictures; got none")
     if len(given) != 1 and not (options.pictures is not None and not given):
         got = " and ".join(given) or "none"
         raise UserError(f"give one of --season, --style, --text and --measure; got {got}")
@@ -125,6 +129,8 @@ def check_method(options: Stylize) -> bool:
     if options.pictures is not None and (options.season or options.style or options.text):
         raise UserError("--pictures are the style; leave --season, --style and --text out")
     for name in ("steps", "views", "width"):
+        if not paper and getattr(options, name) != getattr(Stylize, name):
+            raise UserError(f"--{name} belongs to --method paper; leave it out, or give that")
         least = 16 if name == "width" else 1
         if getattr(options, name) < least:
             raise UserError(f"--{name} must be at least {least}; got {getattr(options, name)}")
@@ -142,6 +148,7 @@ def stylize(options: Stylize, folder: Path, out: Path) -> int:
     from climatenerf.styling.styled_run import write_styled_run
 
     run = load_run(folder)
+    check_colours(run)
     write_styled_run(folder, run.scene, make_style(run), out)
     progress.result(f"run: {out}")
     return 0
@@ -151,7 +158,7 @@ def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
     """Make a run whose colours have learned a style; print how near they came, and where it is."""
     from climatenerf.styling.styled_run import check_out
 
-    check_out(folder, out)
+    check_out(folder, out, resumes=True)
     by_operator = options.wct is options.pictures is options.editor is None
     make_style = style_maker(options) if by_operator else None
 
@@ -161,6 +168,7 @@ def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
     from climatenerf.styling.paper.teachers import operator_teacher
 
     run = load_run(folder)
+    check_colours(run)
     shots = choose_shots(run.scene, options.views, options.width, options.seed)
     if make_style is not None:
         style = make_style(run)
@@ -183,6 +191,19 @@ def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
     return 0
 
 
+def check_colours(run: "Run") -> None:
+    """Refuse a run whose field has learned a style: its own colours are lost.
+
+    Raises:
+        UserError: it has.
+    """
+    if run.style is not None and run.style.fine_tuned is not None:
+        raise UserError(
+            f"the field of {run.folder} has learned a style already; stylize the run that it was"
+            " made of"
+        )
+
+
 def picture_style(
     options: Stylize, run: "Run", shots: "tuple[Shot, ...]"
 ) -> "tuple[Style, Teacher]":
@@ -194,6 +215,7 @@ def picture_style(
     from climatenerf.core.storage import hash_of_files
     from climatenerf.styling.paper import editor, teachers
     from climatenerf.styling.style_photos import (
+        label_file,
         parse_region,
         photo_files,
         read_labelled_photo,
@@ -215,7 +237,9 @@ def picture_style(
     if options.editor is not None:
         text = options.text or ""
         edit = editor.diffusion_editor(options.editor, text, options.seed)
-        made_from = f"{options.editor.resolve()}: {text}"
+        files = sorted(p for p in options.editor.rglob("*") if p.is_file())
+        sizes = [f"{p.relative_to(options.editor)} {p.stat().st_size}" for p in files]
+        made_from = f"{options.editor.resolve()}: {text} {sizes}"
         return style(text), teacher("editor", made_from, edit)
     assert options.wct is not None
     regions = [parse_region(text) for text in options.style_region]
@@ -225,7 +249,9 @@ def picture_style(
         progress.say(unlabelled_note(unlabelled, len(photos)))
     edit = teachers.wct_editor(run.field, options.wct, photos, options.width)
     weights = hash_of_files(sorted(options.wct.glob("*.pth")))
-    made_from = f"{weights} {options.style_region} {options.labels}"
+    labels = [label_file(path) for path in photo_files(options.style)]
+    labelled = hash_of_files([path for path in labels if path is not None])
+    made_from = f"{weights} {labelled} {options.style_region} {options.labels}"
     name = ", ".join(path.name or str(path) for path in options.style)
     sources = (photo.source for photo in photos)
     return style(name, *sources), teacher("wct", made_from, edit)
@@ -260,6 +286,11 @@ def style_maker(options: Stylize) -> "Callable[[Run], Style]":
         )
         for note in notes:
             progress.say(note)
+        if not style.classes and style.sky is None:
+            raise UserError(
+                "nothing would change: the scene and the style photos share no class; name classes"
+                " with --style-region or --labels"
+            )
         say_licences(style.sources)
         return style
 

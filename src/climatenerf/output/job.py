@@ -22,6 +22,7 @@ from jaxtyping import Float, UInt8
 
 import climatenerf
 from climatenerf.core.errors import UserError
+from climatenerf.core.input_limits import check_fps
 from climatenerf.core.layer_table import Layer
 from climatenerf.core.storage import hash_of_files, plain, read_json, write_json
 from climatenerf.field.capabilities import APPEARANCE
@@ -209,17 +210,6 @@ def plan(
         complete_ground,
         style,
     )
-
-
-def check_fps(fps: float) -> float:
-    """Return the frame rate, in frames per second, if a movie can have it.
-
-    Raises:
-        UserError: it is outside 0.1 to 240.
-    """
-    if not 0.1 <= fps <= 240:
-        raise UserError(f"the frame rate must lie between 0.1 and 240 per second; got {fps:g}")
-    return fps
 
 
 def check_size(size: tuple[int, int], supersample: int) -> None:

@@ -240,7 +240,8 @@ def tilted(shot: Shot, progress: Callable[[str], None]) -> Seen:
     place, scene = shot.place, shot.place.scene
     turn = turn_of(scene, shot.weather.flood.level)
     moved = replace(scene, world_from_input=turn.matrix() @ scene.world_from_input)
-    turned = Place(TurnedField(place.field, turn), moved)  # its light is not that of the run
+    field = TurnedField(place.field, turn)
+    turned = Place(field, moved, style=place.style)  # its light is not that of the run
     c2w = turn.matrix() @ shot.c2w
     other = replace(shot, place=turned, c2w=c2w)
     return see(other.session().world(shot.time), other)

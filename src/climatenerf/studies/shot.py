@@ -20,6 +20,7 @@ from climatenerf.field.protocol import RadianceField
 from climatenerf.paths.camera_path import still
 from climatenerf.render.session import RenderSession
 from climatenerf.scene import Scene
+from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Kept
 
@@ -32,11 +33,13 @@ class Place:
         field: the field, with completed ground where there is any.
         scene: its capture.
         kept: where the light that is found in it is kept; None: nowhere.
+        style: new colours of the run; None: those of the photos.
     """
 
     field: RadianceField
     scene: Scene
     kept: Kept | None = None
+    style: Style | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class Shot:
         chosen = self.weather if weather is None else weather
         eye, moment = self.c2w[None, :3, 3], np.array([self.time])
         given = self.place.field, self.place.scene, chosen, eye, moment
-        return RenderSession(*given, kept=self.place.kept)
+        return RenderSession(*given, kept=self.place.kept, style=self.place.style)
 
     def directions(self) -> Float[np.ndarray, "h w 3"]:
         """Unit directions of the pixels, world axes."""

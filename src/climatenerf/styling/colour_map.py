@@ -10,12 +10,11 @@ from jaxtyping import Float
 
 from climatenerf.core.classes import CLASS_NAMES, SKY, SOLID
 from climatenerf.core.srgb import LUMA
-from climatenerf.styling.style_photos import StylePhotos
+from climatenerf.styling.style_photos import StylePhotos, is_shown
 from climatenerf.weather.style import ClassStyle, SkyPalette, Style
 
 FLOOR = 1e-5  # added to the moments' diagonal: a class without blue has a singular matrix
 GAINS = (0.2, 5.0)  # bounds of the map's eigenvalues
-MIN_PIXELS = 500  # of a class in the style photos
 MAX_RATIO = 100.0  # of the fractions of a class here and there
 SKY_SHARE = 0.75  # of the photographed sky that the style's replaces
 
@@ -73,21 +72,21 @@ def photo_style(
         own, new = ours.get(kind, np.zeros((0, 3))), photos.colours.get(kind, np.zeros((0, 3)))
         if not len(own):
             continue
-        if len(new) < MIN_PIXELS:
+        if not is_shown(new):
             notes.append(f"{CLASS_NAMES[kind]} stays: the style photos do not show it")
             continue
         ratio = (len(own) / here) / (len(new) / there)
         if not 1 / MAX_RATIO < ratio < MAX_RATIO:
             notes.append(
-                f"{CLASS_NAMES[kind]} stays: the style photos show {100 * len(new) / there:.2g} %"
-                f" of it, the scene {100 * len(own) / here:.2g} %"
+                f"{CLASS_NAMES[kind]} stays: the style photos show {100 * len(new) / there:.1f} %"
+                f" of it, the scene {100 * len(own) / here:.1f} %"
             )
             continue
         matrix = colour_map(own, new)
         classes.append(ClassStyle(kind, np.zeros((1, 3)), matrix, strength, 1.0))
     sky = None
     colours = photos.colours.get(SKY, np.zeros((0, 3)))
-    if len(colours) >= MIN_PIXELS:
+    if is_shown(colours):
         mean = colours.mean(0)
         red, green, blue = (mean / (mean @ np.array(LUMA))).tolist()
         sky = SkyPalette((red, green, blue), 0.0, SKY_SHARE * strength)

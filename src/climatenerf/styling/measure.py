@@ -12,11 +12,10 @@ from scipy.cluster.vq import kmeans2
 from climatenerf.core.classes import SKY, TERRAIN, VEGETATION
 from climatenerf.core.errors import UserError
 from climatenerf.core.srgb import LUMA
-from climatenerf.styling.style_photos import StylePhotos
+from climatenerf.styling.style_photos import MIN_PIXELS, StylePhotos, is_shown
 
 COLOURS = 4  # of a palette
 DARKEST, BRIGHTEST = 0.1, 0.98  # quantiles of luminance: noise and clipped pixels are left out
-MIN_PIXELS = 500
 STRENGTH = 0.85
 GATE = 0.5  # of what is not green
 SKY_SHARE = 0.75
@@ -34,7 +33,7 @@ def season_of_photos(photos: StylePhotos) -> dict[str, Any]:
     tables: dict[str, Any] = {}
     for name, kind in (("vegetation", VEGETATION), ("terrain", TERRAIN)):
         colours = photos.colours.get(kind)
-        if colours is not None and len(colours) >= MIN_PIXELS:
+        if colours is not None and is_shown(colours):
             tables[name] = {
                 "palette": palette_of(colours).round(3).tolist(),
                 "strength": STRENGTH,
@@ -47,7 +46,7 @@ def season_of_photos(photos: StylePhotos) -> dict[str, Any]:
             " --style-region or --labels"
         )
     sky = photos.colours.get(SKY)
-    if sky is not None and len(sky) >= MIN_PIXELS:
+    if sky is not None and is_shown(sky):
         mean = sky.mean(0)
         colour = mean / (mean @ np.array(LUMA))
         tables["sky"] = {

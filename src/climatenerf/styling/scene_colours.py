@@ -28,4 +28,7 @@ def colours_of_run(
     if CLASSES not in field.capabilities:
         raise no_classes("a style")
     report = None if progress is None else lambda fraction: progress("photos", fraction)
-    return photographed_colours(field, trace_photos(observed(field), scene, report), None)
+    photos = trace_photos(observed(field), scene, report)
+    if report is not None:
+        report(1.0)
+    return photographed_colours(field, photos, None)

@@ -31,6 +31,8 @@ MAX_LICENCE = 400  # characters
 MIN_SPREAD = 1e-3  # of linear values; below it a photo has one colour
 DARK = 1e-3  # mean linear value of a black photo
 
+MIN_PIXELS = 500  # of a class, so that it counts as shown
+
 Labeller = Callable[[UInt8[np.ndarray, "h w 3"]], UInt8[np.ndarray, "h w"]]
 """Maps a picture to Cityscapes train ids."""
 
@@ -61,6 +63,11 @@ class StylePhotos:
     colours: dict[int, Float[np.ndarray, "n 3"]]
     sources: tuple[Source, ...]
     notes: tuple[str, ...] = field(default=())
+
+
+def is_shown(colours: Float[np.ndarray, "n 3"] | None) -> bool:
+    """Return whether photos show enough of a class, and show it neither black nor absent."""
+    return colours is not None and len(colours) >= MIN_PIXELS and bool(colours.mean() >= DARK)
 
 
 def parse_region(text: str) -> Region:
@@ -209,19 +216,25 @@ def licence_beside(path: Path) -> str:
     return ""
 
 
-def _labels(
-    path: Path, picture: UInt8[np.ndarray, "h w 3"], labeller: Labeller | None
-) -> UInt8[np.ndarray, "h w"] | None:
-    """Return the classes of a photo; None if nothing tells them."""
+def label_file(path: Path) -> Path | None:
+    """Return the label file beside a style photo; None if there is none."""
     for folder in (path.parent / "labels", path.parent.parent / "labels"):
         file = folder / f"{path.stem}.png"
         if file.is_file():
-            labels = read_labels(file)
-            if labels.shape != picture.shape[:2]:
-                raise UserError(
-                    f"the labels {file} have another size than their photo; make them anew"
-                )
-            return MERGED[labels]
+            return file
+    return None
+
+
+def _labels(
+    path: Path, picture: UInt8[np.ndarray, "h w 3"], labeller: Labeller | None
+) -> UInt8[np.ndarray, "h w"] | None:
+    """Return the classes of a photo; None if they are not known."""
+    file = label_file(path)
+    if file is not None:
+        labels = read_labels(file)
+        if labels.shape != picture.shape[:2]:
+            raise UserError(f"the labels {file} have another size than their photo; make them anew")
+        return MERGED[labels]
     return None if labeller is None else MERGED[labeller(picture)]
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
 from climatenerf.core.storage import explain, make_folder, read_json, write_json
+from climatenerf.scene.scene import FILE_NAME as SCENE
 from climatenerf.scene.scene import OBSERVATIONS_NAME, POINTS_NAME, Scene
 from climatenerf.training.snapshot import CONFIG, FIELD, identity_of, new_checkpoint, stage_scene
 from climatenerf.weather.style import FILE_NAME, Style, write_style
@@ -19,25 +20,34 @@ if TYPE_CHECKING:
 KEPT = (POINTS_NAME, OBSERVATIONS_NAME)
 BESIDE = ("terrain.npz",)
 """Files that were found in the field, and hold for the copy as well."""
+ALL = (FIELD, CONFIG, SCENE, "light.json")
+"""Files of a finished copy."""
 UNFINISHED = ".fine-tuning"
 """Folder in the styled run from which an interrupted fine-tuning resumes."""
 
 
-def check_out(run: Path, out: Path) -> None:
+def check_out(run: Path, out: Path, resumes: bool = False) -> None:
     """Refuse a folder that cannot become the styled run; write nothing.
 
     Args:
         run: the run.
         out: the folder.
+        resumes: whether an unfinished fine-tuning in it may go on.
 
     Raises:
         UserError: it is the run itself or lies in it, or it holds anything but an unfinished copy.
     """
     if out.resolve() == run.resolve() or out.resolve().is_relative_to(run.resolve()):
         raise UserError(f"-o {out} is the run itself or lies in it; choose another folder")
-    if (out / FIELD).exists():
+    begun = (out / UNFINISHED).exists()
+    if begun and not resumes:
+        raise UserError(
+            f"{out} holds an unfinished fine-tuning; repeat its command, remove the folder, or"
+            " choose another -o"
+        )
+    if (out / FIELD).exists() and not begun:
         raise UserError(f"{out} already holds a run; choose another -o, or remove it")
-    ours = {FILE_NAME, ".lock", ".next", UNFINISHED, *BESIDE, *KEPT}
+    ours = {FILE_NAME, ".lock", ".next", UNFINISHED, *(ALL if begun else ()), *BESIDE, *KEPT}
     foreign = sorted({path.name for path in out.iterdir()} - ours) if out.is_dir() else []
     if foreign:
         raise UserError(f"{out} holds other files, such as {foreign[0]}; choose another -o")
@@ -58,7 +68,7 @@ def write_styled_run(
     Raises:
         UserError: the folder cannot be used or written.
     """
-    check_out(run, out)
+    check_out(run, out, resumes=field is not None)
     make_folder(out)
     with only_writer(out):
         write_style(out, style)

@@ -38,10 +38,11 @@ NOUNS = {
     "sky": "sky", "skies": "sky", "clouds": "sky",
 }  # fmt: skip
 SKIES = {"overcast": "grey", "cloudy": "grey", "dull": "grey"}
-WEAKER = {"slightly", "little", "light", "early", "somewhat"}
+WEAKER = {"slightly", "little", "early", "somewhat"}
 STRONGER = {"very", "deep", "strong", "strongly", "completely"}
 DARKER = {"late": 0.85, "dark": 0.7}
-BRIGHTER = {"bright": 1.2, "pale": 1.15}
+BRIGHTER = {"bright": 1.2, "pale": 1.15, "light": 1.15}
+NEGATIONS = {"not", "no", "without", "never"}
 FILLERS = {"a", "an", "the", "of", "in", "with", "under", "all", "day", "season", "colours",
            "colors", "coloured", "colored", "scene", "place"}  # fmt: skip
 HALF = 0.5  # of the strength, by a weaker word
@@ -70,15 +71,16 @@ def read_text(text: str) -> Reading:
     """
     palettes = Palettes(note=f'From the text "{text[:200]}".')
     understood, unknown = [], []
-    for phrase in re.split(r"[,;.]|\band\b|\bwith\b|\bunder\b", text.lower()):
-        words = re.findall(r"[\w'-]+", phrase)
+    for words in _phrases(text.lower()):
         known = [word for word in words if _has_rule(word)]
-        unknown += [word for word in words if word not in known and word not in FILLERS]
-        meaning = _meaning(known)
-        if meaning is None:
-            unknown += [word for word in known if word in NOUNS]
-            continue
+        meaning = Palettes() if NEGATIONS & set(words) else _meaning(known)
         parts = {name: part for name, part in vars(meaning).items() if name != "note" and part}
+        if not parts:
+            unknown += [word for word in words if word not in FILLERS]
+            continue
+        seasons = [word for word in known if word in SEASONS]
+        unknown += [word for word in words if word not in known and word not in FILLERS]
+        unknown += [word for word in seasons[1:] if SEASONS[word] != SEASONS[seasons[0]]]
         palettes = replace(palettes, **parts)
         understood.append(f'"{" ".join(known)}" changes {", ".join(parts)}')
     if not understood:
@@ -89,13 +91,27 @@ def read_text(text: str) -> Reading:
     return Reading(palettes, tuple(understood), tuple(dict.fromkeys(unknown)))
 
 
+def _phrases(text: str) -> list[list[str]]:
+    """Return the words of each phrase; colours before "and" go to the noun behind it."""
+    phrases: list[list[str]] = []
+    pending: list[str] = []
+    parts = re.split(r"([,;.]|\band\b|\bwith\b|\bunder\b)", text)
+    for phrase, separator in zip(parts[::2], [*parts[1::2], ","], strict=True):
+        words = pending + re.findall(r"[\w'-]+", phrase)
+        colours_alone = bool(words) and all(word in {*COLOURS, *FILLERS} for word in words)
+        pending = words if separator == "and" and colours_alone else []
+        if words and not pending:
+            phrases.append(words)
+    return phrases
+
+
 def _has_rule(word: str) -> bool:
     tables = SEASONS, COLOURS, NOUNS, SKIES, WEAKER, STRONGER, DARKER, BRIGHTER
     return any(word in table for table in tables)
 
 
-def _meaning(words: list[str]) -> Palettes | None:
-    """Return what the known words of a phrase change; None if they name no season and colour."""
+def _meaning(words: list[str]) -> Palettes:
+    """Return what the known words of a phrase change; nothing without a season or a colour."""
     targets = {NOUNS[word] for word in words if word in NOUNS}
     targets |= {"sky" for word in words if word in SKIES}
     seasons = [SEASONS[word] for word in words if word in SEASONS]
@@ -111,8 +127,6 @@ def _meaning(words: list[str]) -> Palettes | None:
         palette = tuple(unit_luminance(colour) for colour in colours)
         for name in targets or {"vegetation"}:
             found = replace(found, **{name: _coloured(name, palette)})
-    if not seasons and not colours:
-        return None
     return _modified(found, words)
 
 

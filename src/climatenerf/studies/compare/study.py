@@ -21,6 +21,7 @@ from climatenerf.studies.compare.stand_ins import STAND_INS
 from climatenerf.studies.compare.store import FrameStore, make_frames, store_of
 from climatenerf.studies.compare.uvq import Uvq
 from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Kept
 
@@ -40,6 +41,7 @@ class Fitted:
         digest: hash of the run's files; None takes that of the files as they are.
         knows_classes: whether its field has classes.
         completed: gives the field with completed ground; called once, if a frame is missing.
+        style: new colours of the run; None: those of the photos.
     """
 
     folder: Path
@@ -47,6 +49,7 @@ class Fitted:
     digest: str | None
     knows_classes: bool
     completed: Callable[[Progress], RadianceField]
+    style: Style | None = None
 
 
 @dataclass(frozen=True)
@@ -174,9 +177,9 @@ class _Comparison:
         if weather is not None:
             effect, film = weather
             layers = ("depth", MASKS[effect])
-        job = jobs.plan(
-            self.fitted.folder, path, self.plan.fps, film, layers=layers, digest=self.fitted.digest
-        )
+        fitted = self.fitted
+        given = fitted.folder, path, self.plan.fps, film
+        job = jobs.plan(*given, layers=layers, digest=fitted.digest, style=fitted.style)
         folder = self.out / reel / name
         times = FrameStore(folder, job.key, len(job))
 

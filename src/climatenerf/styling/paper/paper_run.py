@@ -43,6 +43,7 @@ from climatenerf.styling.paper.shots import Shot, joined, march, matter
 from climatenerf.styling.paper.teachers import Teacher
 from climatenerf.styling.styled_run import UNFINISHED, check_out, write_styled_run
 from climatenerf.training.snapshot import FIELD
+from climatenerf.weather.light.captured import CapturedLight, UnknownLight
 from climatenerf.weather.light.file import FILE_NAME as LIGHT
 from climatenerf.weather.light.file import load_light, save_light
 from climatenerf.weather.light.find_light import find_light
@@ -99,7 +100,7 @@ def write_fine_tuned_run(
             options.
     """
     folder, field, scene = run
-    check_out(folder, out)
+    check_out(folder, out, resumes=True)
     unfinished = out / UNFINISHED
     with only_writer(out, (UNFINISHED,)):
         _check_plan(unfinished, _plan(folder, style, teacher, settings))
@@ -120,8 +121,10 @@ def write_fine_tuned_run(
             progress("colours", 1.0)
         record = _record(tuned, teacher, shots, to_numpy(scene_irradiance(field, scene)))
         learned = replace(style, classes=(), fine_tuned=record)
+        light = _light_of_photos(run)
         write_styled_run(folder, scene, learned, out, tuned.field)
-        _keep_light(run, out)
+        if light is not None:
+            save_light(out / LIGHT, light, hash_of_run(out))
         shutil.rmtree(unfinished, ignore_errors=True)
     return tuned.scores
 
@@ -136,16 +139,16 @@ def _record(
     return FineTuned(teacher.kind, tuned.step, len(shots), width, (red, green, blue), psnr)
 
 
-def _keep_light(run: tuple[Path, Field, Scene], out: Path) -> None:
-    """Write the light of the photos into the copy; in new colours another would be found."""
+def _light_of_photos(run: tuple[Path, Field, Scene]) -> CapturedLight | UnknownLight | None:
+    """Return the light of the photos for the copy; in new colours another would be found."""
     folder, field, scene = run
     if NORMALS not in field.capabilities:
-        return
+        return None
     path = folder / LIGHT
     light, made_from = load_light(path) if path.is_file() else (None, "")
     if light is None or made_from != hash_of_run(folder):
         light = find_light(field, trace_photos(observed(field), scene), almanac_sun(scene))
-    save_light(out / LIGHT, light, hash_of_run(out))
+    return light
 
 
 def _plan(folder: Path, style: Style, teacher: Teacher, settings: PaperSettings) -> str:

@@ -23,6 +23,7 @@ from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.hash_field import Field
 from climatenerf.field.protocol import device_of
+from climatenerf.ops.recolouring import mottle
 from climatenerf.render.heads import see_surface
 from climatenerf.render.volume import camera_rays
 from climatenerf.scene.file_names import FileNames
@@ -33,7 +34,6 @@ from climatenerf.styling.paper.gain import low_frequency_gain
 from climatenerf.styling.paper.shots import Shot
 from climatenerf.styling.style_photos import LabelledPhoto
 from climatenerf.weather.season.entity import no_classes, styled_field
-from climatenerf.ops.recolouring import mottle
 from climatenerf.weather.style import Style
 
 MAX_ASPECT_ERROR = 0.02  # of a picture's sides against the photo's
