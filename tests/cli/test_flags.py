@@ -39,7 +39,7 @@ def test_help_has_no_words_of_the_parser(verb, capsys):
         main([verb, "--help"])
     found = capsys.readouterr().out
     assert end.value.code in (0, None) and f"climatenerf {verb}" in found
-    switches = found.replace("--no-complete-ground", "")  # the one that is on by default
+    switches = found.replace("--no-complete-ground", "").replace("--no-truth", "")  # on by default
     assert "None" not in found and "--no-" not in switches
 
 

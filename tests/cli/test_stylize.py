@@ -26,7 +26,7 @@ def run_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("street") / "run"
     settings = dataclasses.replace(
         settings_of("cpu"),
-        steps=80,
+        steps=250,
         samples_per_step=2**14,
         size=FEW_ROWS,
         multiview_stereo=False,

@@ -79,17 +79,19 @@ def test_a_styled_run_shows_what_its_season_shows_and_a_season_replaces_it():
     field, scene = sunlit_yard(), yard_scene()
     camera, pose = scene.cameras[0].resized(24, 15), scene.c2w_world(scene.views[0])
 
-    def seen(style=None, **table):
-        weather = weather_from_table(table)
-        return RenderSession(field, scene, weather, style=style).frame(camera, pose).linear
+    plain = RenderSession(field, scene, weather_from_table({}))
 
-    entity = RenderSession(field, scene, weather_from_table({"season": {"kind": "winter"}}))
-    entity.frame(camera, pose)
-    means = entity._entities["season"]._means
+    def seen(session, **table):
+        session.change(weather_from_table(table))
+        return session.frame(camera, pose).linear
+
+    winter = seen(plain, season={"kind": "winter"})
+    means = plain._entities["season"]._means
     style = seasonal_style("winter", palettes_of("winter"), means, 4.0, 0)
-    winter = seen(season={"kind": "winter"})
-    np.testing.assert_array_equal(seen(style), winter)
-    assert float((winter - seen()).abs().max()) > 0.01
-    np.testing.assert_array_equal(seen(style, season={"strength": 0}), seen())
-    autumn = seen(season={"kind": "autumn"})
-    np.testing.assert_array_equal(seen(style, season={"kind": "autumn"}), autumn)
+    styled = RenderSession(field, scene, weather_from_table({}), style=style)
+    np.testing.assert_array_equal(seen(styled), winter)
+    clean = seen(plain)
+    assert float((winter - clean).abs().max()) > 0.01
+    np.testing.assert_array_equal(seen(styled, season={"strength": 0}), clean)
+    autumn = seen(plain, season={"kind": "autumn"})
+    np.testing.assert_array_equal(seen(styled, season={"kind": "autumn"}), autumn)

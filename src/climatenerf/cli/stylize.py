@@ -29,7 +29,9 @@ class Stylize:
 
     run: Annotated[tyro.conf.Positional[Path | None], optional("PATH")] = None
     """Run folder made by `climatenerf fit`; none with --measure."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
+    out: Annotated[
+        Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH", help_behavior_hint="")
+    ] = None
     """Folder of the new run; with --measure the season file (TOML)."""
     season: Annotated[str | None, optional("STR")] = None
     """autumn, winter, drought, wildfire, or a season file (TOML)."""

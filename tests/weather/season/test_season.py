@@ -253,21 +253,28 @@ def test_a_season_of_no_strength_is_the_clean_picture(yard):
 
 def test_a_grey_sky_takes_the_hard_sun_and_keeps_the_light_in_the_open(yard):
     field, _ = yard
-    old = session(field, flood={"level": "-9 m"}).world(0.0).light
-    new = session(field, season={"kind": "winter"}).world(0.0).light
+    one = session(field, flood={"level": "-9 m"})
+
+    def world(**table):
+        one.change(weather_from_table(table))
+        return one.world(0.0)
+
+    old = one.world(0.0).light
+    winter = world(season={"kind": "winter"})
+    new = winter.light
     share = palettes_of("winter").sky.share
     before, after = old.open_irradiance(), new.open_irradiance()
     assert float(luma(after) / luma(before)) == pytest.approx(1, abs=0.02)
     torch.testing.assert_close(new.sun_irradiance, (1 - share) * old.sun_irradiance)
     d = torch.nn.functional.normalize(torch.tensor([[0.3, 0.1, 0.4], [-0.5, 0.3, 0.9]]), dim=-1)
-    grey = session(field, season={"kind": "winter"}).world(0.0).field.sky(d)
+    grey = winter.field.sky(d)
     torch.testing.assert_close(grey, new.radiance(d))
     # The photos' sky has its share still; another kind of sky wins over the season's.
     level = float(luma(before)) / (math.pi * (1 + 0.2 * 2 / 3))
     colour = torch.tensor(palettes_of("winter").sky.colour) * level * (1 + 0.2 * d[:, 2:])
     torch.testing.assert_close(grey, (1 - share) * old.radiance(d) + share * colour)
-    overcast = session(field, season={"kind": "winter"}, sky={"kind": "overcast"}).world(0.0)
-    plain = session(field, sky={"kind": "overcast"}).world(0.0)
+    overcast = world(season={"kind": "winter"}, sky={"kind": "overcast"})
+    plain = world(sky={"kind": "overcast"})
     torch.testing.assert_close(overcast.light.radiance(d), plain.light.radiance(d))
 
 
