@@ -1,4 +1,4 @@
-"""The ablations of weather: which there are, and what each renders unless it is told."""
+"""The list of weather ablations, and the default weather of each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -29,13 +29,23 @@ def colour_map(
         theirs: linear colours of it in the style photos.
     """
     floor = FLOOR * np.eye(3)
-    s = ours.T @ ours / len(ours) + floor
-    r = theirs.T @ theirs / len(theirs) + floor
-    root = _power(s, 0.5)
-    inverse = _power(s, -0.5)
-    full = inverse @ _power(root @ r @ root, 0.5) @ inverse
-    values, vectors = np.linalg.eigh((full + full.T) / 2)
+    s, r = (colours.T @ colours / len(colours) + floor for colours in (ours, theirs))
+    values, vectors = np.linalg.eigh(transport_map(s, r))
     return vectors @ np.diag(values.clip(*GAINS)) @ vectors.T
+
+
+def transport_map(
+    s: Float[np.ndarray, "3 3"], r: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Return the symmetric map A with A S A = R, the one that moves colours least.
+
+    Args:
+        s: moments or covariance of the colours that are moved, positive definite.
+        r: those to be reached.
+    """
+    root, inverse = _power(s, 0.5), _power(s, -0.5)
+    found = inverse @ _power(root @ r @ root, 0.5) @ inverse
+    return (found + found.T) / 2
 
 
 def _power(matrix: Float[np.ndarray, "3 3"], exponent: float) -> Float[np.ndarray, "3 3"]:

@@ -158,7 +158,7 @@ class LabelledPhoto:
     Attributes:
         linear: its linear colours, in [0, 1].
         masks: the classes that it shows.
-        labelled: whether something told the classes; if not, all pixels stand for plants.
+        labelled: whether the classes are known; if not, all pixels stand for plants and for ground.
         source: the file.
     """
 

@@ -80,7 +80,7 @@ class FineTuned:
         steps: of the fit that were taken.
         views: that taught.
         width: of their pictures, pixels.
-        irradiance: on open level ground before, linear; recoloured ground tells another.
+        irradiance: on open level ground before, linear; recoloured ground would give another.
         psnr: of other views against their pictures, dB: before, after. None: there were none.
     """
 
@@ -101,7 +101,7 @@ class Style:
         classes: the classes that change.
         sky: the sky; None: that of the photos.
         patch: size of places that turn alike, m.
-        seed: of the noise that tells these places apart.
+        seed: of the noise that places them.
         sources: files that it was made from.
         note: what a user should know.
         fine_tuned: how the field got its colours, if not by `classes`, which are empty then.

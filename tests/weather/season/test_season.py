@@ -16,13 +16,19 @@ from climatenerf.core.colour import luma
 from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import Box, HalfSpace
 from climatenerf.ops import recolouring as r
+from climatenerf.render.integrator import trace
 from climatenerf.render.session import RenderSession
+from climatenerf.verification.closed_forms import fresnel
 from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.flood.surface import Water
+from climatenerf.weather.flood.waves import at_time, make_waves
 from climatenerf.weather.season.entity import SeasonEntity, class_colours
 from climatenerf.weather.season.palettes import SEASONS, palettes_of, read_palettes, seasonal_style
 from climatenerf.weather.season.parameters import Season
 from climatenerf.weather.season.styled_field import StyledField
 from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import World
 
 
 def session(field, **table):
@@ -278,9 +284,58 @@ def test_a_grey_sky_takes_the_hard_sun_and_keeps_the_light_in_the_open(yard):
     torch.testing.assert_close(overcast.light.radiance(d), plain.light.radiance(d))
 
 
-def test_floods_mirror_the_season(yard):
-    """Water is placed on the styled field."""
+def test_still_water_mirrors_the_styled_hedge():
+    """Black muddy water shows what the mirrored camera sees, times Fresnel's reflectance."""
+    flood = Flood(level=0.3, wind_speed=0.0, clarity=0.01, colour=(0.0, 0.0, 0.0))
+    waves = at_time(make_waves(flood, 0), 0.0)
+    water = Water(flood, 0.3, waves, torch.full((3,), math.pi))
+    down = torch.nn.functional.normalize(torch.tensor([[0.0, 1.5, -1.0]]), dim=-1)
+    foot = torch.tensor([[-1.5, -0.5, 0.3]])  # behind it the hedge's face at z = 1.3
+    up = down * torch.tensor([1.0, 1.0, -1.0])
+    shown = {}
+    for name, field in (("clean", garden()), ("autumn", styled(garden()))):
+        seen = trace(World(field, surfaces=(water,)), foot - 2 * down, down, torch.full((1,), 1e-3))
+        hedge = trace(World(field), foot, up, torch.full((1,), 1e-3)).rgb
+        reflectance = float(fresnel(np.arccos(-float(down[0, 2])), flood.ior))
+        torch.testing.assert_close(seen.rgb, reflectance * hedge, atol=1e-5, rtol=0.02)
+        shown[name] = seen.rgb[0]
+    assert shown["autumn"][0] / shown["autumn"][1] > 1.5 * shown["clean"][0] / shown["clean"][1]
+
+
+def test_water_and_snow_take_the_light_of_the_sky_and_not_of_the_lawn(yard):
+    """Deep muddy water and deep snow scale with the irradiance on open ground."""
     field, _ = yard
-    world = session(field, season={"kind": "autumn"}, flood={"level": "0.2 m"}).world(0.0)
-    assert isinstance(world.field.field, StyledField)
-    assert len(world.field.field.classes.index) == 2
+    one = session(field, flood={"level": "-9 m"})
+    before = one.world(0.0).light.open_irradiance()
+
+    def irradiance(**table):
+        one.change(weather_from_table({"flood": {"level": "0.2 m"}} | table))
+        world = one.world(0.0)
+        (water,) = world.surfaces
+        place = torch.tensor([[30.0, -30.0, 0.2]])
+        return world.light.open_irradiance() / before, water.irradiance_at(world, place)[0]
+
+    _, plain = irradiance()
+    for kind in ("autumn", "winter"):
+        ratio, lit = irradiance(season={"kind": kind})
+        torch.testing.assert_close(lit / plain, ratio, rtol=0.02, atol=0)
+        assert bool(((ratio - 1).abs() < 1e-3).all()) == (kind == "autumn")
+
+
+def test_neighbouring_patches_of_autumn_differ_in_hue_and_views_do_not():
+    """Cells of 4 m: hues spread by 8 degrees and more; a place has one colour from everywhere."""
+    hedge = Box((-60.0, 1.0, 0.0), (60.0, 2.0, 2.0), LEAF)
+    field = styled(LabelledField([HalfSpace(colour=LEAF), hedge], classes=[TERRAIN, VEGETATION]))
+    places = [(x + 0.5, 1.0, 1.0) for x in range(-56, 57, 4)]
+    hue = hue_of(look(field, places))
+    assert float(hue.std()) > 8
+    x = torch.tensor(places)
+    d = torch.nn.functional.normalize(torch.tensor([[0.6, 1.0, -0.2]]), dim=-1)
+    other = field.colour(x, d.expand(len(x), 3).contiguous(), torch.arange(len(x)))
+    torch.testing.assert_close(hue_of(other), hue, atol=1.0, rtol=0)
+
+
+def hue_of(colour):
+    """Hue in Oklab, degrees."""
+    lab = (colour @ torch.tensor(r.CONES).T) ** (1 / 3) @ torch.tensor(r.OKLAB).T
+    return torch.rad2deg(torch.atan2(lab[:, 2], lab[:, 1]))

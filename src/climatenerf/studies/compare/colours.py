@@ -10,6 +10,7 @@ from jaxtyping import Float, UInt8
 from climatenerf.core.classes import ROAD, SKY, TERRAIN, VEGETATION
 from climatenerf.core.srgb import LUMA
 from climatenerf.ops.recolouring import recoloured
+from climatenerf.styling.colour_map import transport_map
 from climatenerf.weather.season.palettes import kept_differences
 
 EPSILON = 1e-5  # added to variances: a picture of one colour has none, and no inverse root
@@ -37,8 +38,8 @@ def transferred(
 ) -> Float[np.ndarray, "h w 3"]:
     """Return a picture after the Monge-Kantorovich map between two Gaussians of colours.
 
-    x' = mean_t + A (x - mean_s) with A = S^-1/2 (S^1/2 T S^1/2)^1/2 S^-1/2: of all linear maps
-    that turn the covariance S into T, the one that moves colours least (Pitié and Kokaram 2007).
+    x' = mean_t + A (x - mean_s) with A from `styling.colour_map.transport_map` of the covariances
+    (Pitié and Kokaram 2007).
 
     Args:
         picture: colours in any space.
@@ -46,10 +47,7 @@ def transferred(
         target: of the colours to be reached.
     """
     s, t = (each.covariance + EPSILON * np.eye(3) for each in (source, target))
-    root = _power(s, 0.5)
-    inverse = _power(s, -0.5)
-    matrix = inverse @ _power(root @ t @ root, 0.5) @ inverse
-    return target.mean + (picture - source.mean) @ matrix
+    return target.mean + (picture - source.mean) @ transport_map(s, t)
 
 
 def class_means(
@@ -92,10 +90,3 @@ def whitened(
         for each in (picture.reshape(-1, 3), share, white, brightness[:, None, None] * kept)
     )
     return recoloured(*tensors).numpy().reshape(picture.shape)
-
-
-def _power(matrix: Float[np.ndarray, "3 3"], exponent: float) -> Float[np.ndarray, "3 3"]:
-    """Return a power of a symmetric positive matrix."""
-    values, vectors = np.linalg.eigh(matrix)
-    # EPSILON^2: rounding may leave an eigenvalue below 0, whose root is NaN.
-    return (vectors * np.maximum(values, EPSILON**2) ** exponent) @ vectors.T

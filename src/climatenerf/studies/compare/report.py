@@ -17,13 +17,13 @@ from climatenerf.scene.images import read_rgb
 from climatenerf.studies.compare.material import Kind, Material, Rendered
 from climatenerf.studies.compare.pictures import Picture
 from climatenerf.studies.compare.strips import column_strip, lines_with_most, row_strip, widened
+from climatenerf.studies.user_study.compare_folder import FILE_NAME, SCHEMA_VERSION
 from climatenerf.weather.description import weather_to_table
 
 if TYPE_CHECKING:
     from climatenerf.studies.compare.study import Plan
 
-SCHEMA_VERSION = 1
-FILE_NAME, TEXT_NAME = "compare.json", "compare.md"
+TEXT_NAME = "compare.md"
 SHEET, COLUMNS_STRIP, ROWS_STRIP = "sheet.jpg", "time-columns.png", "time-rows.png"
 OUR_LICENCE = "Apache-2.0"
 PICTURES = 3  # single pictures of each method, evenly spaced

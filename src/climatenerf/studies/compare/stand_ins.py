@@ -52,7 +52,7 @@ class StandIn:
     licence: str = "Apache-2.0, part of climatenerf"
 
     def shows(self, material: Material) -> bool:
-        """Return whether it knows the effect, and the classes if it needs them."""
+        """Return whether it has the effect, and the run the classes that it needs."""
         known = self.name != "class-recolour" or material.has_labels
         return known and material.effect in SHOWN[self.name]
 
@@ -102,7 +102,7 @@ def _baseline(name: str) -> Callable[[Material], EditFrame]:
 
 
 def _depth_fog(material: Material) -> EditFrame:
-    """Fit colour and extinction of a fog that knows the depth alone.
+    """Fit colour and extinction of a fog that depends on the depth alone.
 
     `tune` takes the colour of thick smog from the weather, which does not state it where smog
     scatters the light of the place.

@@ -34,7 +34,7 @@ class FrameStore:
 
     Attributes:
         folder: such as `OUT/flood/flat-plane`.
-        key: hash of all that the frames depend on.
+        key: hash of run, weather, cameras, method and version.
         count: number of frames.
     """
 

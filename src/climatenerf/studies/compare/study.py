@@ -20,6 +20,7 @@ from climatenerf.studies.compare.scores import movie_scores, truth_scores
 from climatenerf.studies.compare.stand_ins import STAND_INS
 from climatenerf.studies.compare.store import FrameStore, make_frames, store_of
 from climatenerf.studies.compare.uvq import Uvq
+from climatenerf.studies.user_study.compare_folder import SCHEMA_VERSION
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather
@@ -123,7 +124,7 @@ def compare(
     check_folder(out)
     with only_writer(out):
         check_folder(out)
-        write_json(out / MARKER, {"schema_version": report.SCHEMA_VERSION})
+        write_json(out / MARKER, {"schema_version": SCHEMA_VERSION})
         return _Comparison(fitted, out, plan, progress, note).run()
 
 

@@ -1,6 +1,6 @@
 """A user study as one HTML page that needs no network, and the key to its votes. No torch.
 
-The page knows pictures by opaque ids. `key.json`, which stays with the maker, names their methods.
+The page has pictures under opaque ids. `key.json`, which stays with the maker, names their methods.
 """
 
 import base64
@@ -142,7 +142,7 @@ def page(data: Mapping[str, Any]) -> bytes:
 
 
 def _page_data(study: Study, name: str, contents: Contents) -> dict[str, Any]:
-    """Return what the page knows: nothing from which a method could be told."""
+    """Return the data of the page, without anything that names a method."""
 
     def medium(each: str) -> dict[str, str | None]:
         kind, held = contents.media[each]["type"], contents.held.get(each)

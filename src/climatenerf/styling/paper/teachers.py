@@ -50,7 +50,7 @@ class Teacher:
 
     Attributes:
         kind: "operator", "wct", "pictures" or "editor".
-        made_from: tells teachers of one kind apart.
+        made_from: hash or text that differs between teachers of one kind.
         teach: returns the radiance to learn.
     """
 
@@ -91,7 +91,7 @@ def picture_teacher(
     Args:
         field: the field that is taught.
         kind: of the teacher.
-        made_from: tells it from others.
+        made_from: hash or text that differs between teachers of one kind.
         edit: the editor.
         strength: fraction of the change that is taught, 0 to 1.
     """

@@ -95,7 +95,7 @@ def seasonal_style(
         palettes: its colours.
         means: mean linear colour of classes in the photos; absent or black: none shows it.
         patch: size of places that turn alike, m.
-        seed: of the noise that tells these places apart.
+        seed: of the noise that places them.
     """
     parts = ((VEGETATION, palettes.vegetation), (TERRAIN, palettes.terrain))
     classes = tuple(

@@ -21,7 +21,7 @@ class StyledField(RecolouredField):
     Attributes:
         classes: the classes that change.
         patch: size of places that turn alike, m.
-        noise: tells these places apart, see `recolouring.mottle`.
+        noise: places them, see `recolouring.mottle`.
         white: light that the field is shown in over that of its photos; hues are judged without it.
     """
 
