@@ -39,7 +39,7 @@ def test_an_ablation_waits_for_no_other_writer(tmp_path, capsys):
 @pytest.fixture
 def quick_scores(monkeypatch):
     """Replace the run and its scores."""
-    run = types.SimpleNamespace(field=None, scene=load_scene(REFERENCE))
+    run = types.SimpleNamespace(field=None, style=None, scene=load_scene(REFERENCE))
     found = types.SimpleNamespace(table=[], pictures={})
     monkeypatch.setattr(climatenerf.api, "load_run", lambda path: run)
     monkeypatch.setattr(run_folder, "check_config", lambda path: {})
