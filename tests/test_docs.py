@@ -32,6 +32,7 @@ VERBS = (
     "compare",
     "verify",
     "study",
+    "batch",
     "export",
     "demo",
 )

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-SLOW = {"torch", "numba", "mitsuba", "scipy"}
+SLOW = {"torch", "numba", "mitsuba", "scipy", "distributed", "dask"}
 
 
 @pytest.mark.parametrize(
@@ -15,7 +15,8 @@ SLOW = {"torch", "numba", "mitsuba", "scipy"}
         "climatenerf.scene",
         "climatenerf.weather.registry climatenerf.weather.units climatenerf.weather.description",
         "climatenerf.cli.fit climatenerf.cli.render climatenerf.cli.verify climatenerf.cli.demo"
-        " climatenerf.cli.study climatenerf.cli.compare climatenerf.cli.stylize",
+        " climatenerf.cli.study climatenerf.cli.compare climatenerf.cli.stylize"
+        " climatenerf.cli.batch",
         "climatenerf.core.storage climatenerf.field.presets climatenerf.evaluation.metrics",
     ],
 )

@@ -27,9 +27,11 @@ MAY_IMPORT = {
     "training": BELOW_TRAINING,
     "styling": BELOW_STUDIES,
     "studies": BELOW_STUDIES | {"styling"},
+    "cluster": BELOW_STUDIES,
     "extend": BELOW_RENDER,
-    "api": BELOW_STUDIES | {"studies", "styling", "sfm", "perception"},
-    "cli": BELOW_STUDIES | {"studies", "styling", "sfm", "perception", "verification", "api"},
+    "api": BELOW_STUDIES | {"studies", "styling", "sfm", "perception", "cluster"},
+    "cli": BELOW_STUDIES
+    | {"studies", "styling", "sfm", "perception", "cluster", "verification", "api"},
     "__main__": {"cli"},
 }
 

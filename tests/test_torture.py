@@ -23,6 +23,7 @@ def passed(found):
     return found["counts"]
 
 
+@pytest.mark.slow
 def test_some_mutations_of_quick_kinds(tmp_path):
     """The other kinds begin with fits, so only the slow test covers them."""
     options = {"seconds": 600.0, "trials": len(QUICK), "first_seed": FIRST_SEED}

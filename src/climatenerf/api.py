@@ -34,6 +34,7 @@ from climatenerf.weather.weather import Weather
 
 if TYPE_CHECKING:
     from climatenerf.field.hash_field import Field
+    from climatenerf.output.frame_source import FrameSource
     from climatenerf.render.completed_ground import CompletedField
 
 PathText = str | PathLike[str]
@@ -257,6 +258,7 @@ def render_movie(
     join_only: bool = False,
     preview: bool = False,
     complete_ground: bool = True,
+    workers: int | str | None = None,
     progress: Progress | None = None,
     note: Callable[[str], None] | None = None,
     effects: Sequence[Effect] | None = None,
@@ -283,6 +285,9 @@ def render_movie(
         join_only: render nothing; join the finished frames.
         preview: show the frame at work in `preview.png`.
         complete_ground: let a terrain stand in where no photo shows the ground.
+        workers: how many processes of this machine render the frames, or the address of a Dask
+            scheduler, such as "tcp://10.0.0.1:8786"; None renders them here. A script that calls
+            this needs `if __name__ == "__main__":`, since its processes import it.
         progress: called with what is prepared ("ground", an effect), then with "frames" and
             "movie".
         note: called with sentences about what was assumed or left out.
@@ -338,16 +343,23 @@ def render_movie(
         style=run.style,
     )
 
-    def prepare() -> "jobs.FrameSource":
+    def prepare() -> "FrameSource":
+        from climatenerf.output.frame_source import frame_source
         from climatenerf.weather.world import Kept
 
         field = run.completed(progress) if complete_ground else run.field
-        return jobs.frame_source(job, field, run.scene, progress, Kept(run.folder, job.run))
+        return frame_source(job, field, run.scene, progress, Kept(run.folder, job.run))
 
+    if workers is not None and (part is not None or join_only):
+        raise UserError("workers render all frames and join them; leave part and join out")
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)
     if part is None:
         options: dict[str, Any] = {"preview": preview, "note": note, "progress": progress}
+        if workers is not None:
+            from climatenerf.cluster.frames import renderer
+
+            options["render"] = renderer(workers)
         return jobs.render_movie(job, run.scene, out, prepare, **options)
     indices = jobs.frames_of_part(job, part)
     jobs.render_frames(job, out, prepare, indices, preview=preview, progress=progress)

@@ -3,6 +3,7 @@
 import json
 
 import numpy as np
+import pytest
 from PIL import Image
 from support.command_line import error_message, run_cli
 from support.fake_checkouts import make_climategan, make_uvq
@@ -11,6 +12,7 @@ from support.processes import holder
 SMALL = ["--size", "48x27", "--frames", "2", "--effects", "flood", "--portion", "0.02"]
 
 
+@pytest.mark.slow
 def test_all_kinds_of_methods_are_compared_and_licences_are_said_once(run_folder, tmp_path, capsys):
     checkout, weights = make_climategan(tmp_path)
     frames = tmp_path / "arf" / "flood"

@@ -178,6 +178,7 @@ def test_a_style_that_shares_no_class_with_the_scene_is_refused(run_folder, tmp_
     assert "nothing would change" in capsys.readouterr().err and not out.exists()
 
 
+@pytest.mark.slow
 def test_sweeps_and_comparisons_show_the_style(run_folder, winter, tmp_path, capsys):
     seen = []
     for run in (run_folder, winter):

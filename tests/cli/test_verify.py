@@ -88,6 +88,7 @@ def test_wrong_input_is_one_sentence(finding, capsys, tmp_path, run_folder):
     assert run_cli("verify", "--device", "abacus") == 2
 
 
+@pytest.mark.slow
 def test_a_run_is_checked_as_well(finding, capsys, run_folder, monkeypatch):
     finding(GOOD)
     # A small square of snow: that of the whole street takes half a minute.

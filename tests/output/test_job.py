@@ -19,6 +19,7 @@ import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.output import job as jobs
 from climatenerf.output import render_folder
+from climatenerf.output.frame_source import measured
 from climatenerf.output.job import frames_of_part, join, render_frames, render_movie
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.snow.parameters import Snow
@@ -118,7 +119,7 @@ def test_a_render_writes_frames_layers_movie_and_sidecar(tmp_path):
         assert np.array_equal(np.asarray(picture), expected.picture)
     depth = np.load(tmp_path / "depth" / "0001.npz")["depth"]
     assert np.array_equal(depth, expected.layers["depth"])
-    assert sidecar["frames"][1]["measured"] == jobs.measured(expected.layers)
+    assert sidecar["frames"][1]["measured"] == measured(expected.layers)
     fractions = [fraction for what, fraction in reports if what == "frames"]
     assert fractions == [0, 1 / 3, 2 / 3, 1] and reports[-1] == ("movie", 1.0)
 

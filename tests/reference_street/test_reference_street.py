@@ -53,6 +53,7 @@ def mean_depth(cover, x0, x1, y0, y1):
     return cover.depth[(y > y0) & (y < y1)][:, (x > x0) & (x < x1)].mean()
 
 
+@pytest.mark.slow
 def test_snow_depth_follows_the_slope_and_its_mass_is_conserved(yard):
     cover, _ = snowfall.snow_cover(yard, 0.15, 0)
     assert mean_depth(cover, 1.8, 2.8, -2.5, -1.0) == pytest.approx(0.15, rel=0.04)

@@ -65,6 +65,7 @@ def test_all_weathers_and_layers_are_rendered_together(kind, tmp_path):
     assert 0 < frame.layers["mask_smog"].min() < frame.layers["mask_smog"].max() <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FIELDS)
 def test_snow_on_the_ground_has_the_requested_depth(kind, tmp_path):
     frame = session(FIELDS[kind](), tmp_path, snow=Snow(depth=0.2)).frame(CAMERA, C2W)

@@ -285,6 +285,7 @@ def test_what_no_photo_shows_is_left_out_but_completion_is_kept():
 # --- weather ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_flood_lies_on_completed_ground(tmp_path):
     o, d, _ = camera_rays()
     level = 0.3
@@ -315,6 +316,7 @@ def test_snow_lies_on_completed_ground():
     assert (seen.layers["seen"] < 0.01).all(), "the snow lies on ground that no photo shows"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "weather",
     [

@@ -297,6 +297,7 @@ def test_smog_of_zero_extinction_is_bit_identical():
         assert np.array_equal(layers[key], same_layers[key])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["smog", "flood", "snow"])
 def test_vanishing_weather_changes_no_pixel_by_more_than_one_level(what):
     flat = AnalyticField(
@@ -356,6 +357,7 @@ def test_snow_on_planes_has_the_requested_thickness(tilt):
     assert (height - 0.15).abs().max() < 0.15 * 0.15
 
 
+@pytest.mark.slow
 def test_snow_is_not_marched_behind_opaque_surfaces(monkeypatch):
     """Fewer samples give the same picture up to rounding, with all snow in front of a wall."""
     world = World(street(), matters=(snowed(0.2),))
@@ -443,6 +445,7 @@ def test_white_furnace_from_under_water():
         assert (seen.rgb - 1).abs().max() < 1e-3
 
 
+@pytest.mark.slow
 def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch):
     """A hash field with snow and water uses Numba kernels, unlike the analytic field."""
     import numba

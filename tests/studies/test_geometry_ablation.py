@@ -132,6 +132,7 @@ def test_finished_rows_are_kept_and_other_settings_refused(tmp_path):
             ablation.fit_row(scene, run, other, downscale, lambda state: None)
 
 
+@pytest.mark.slow
 def test_an_interrupted_row_is_resumed(tmp_path):
     scene = make_scene(tmp_path / "toy")
     settings = FitSettings(size=TINY, minutes=None, steps=6, samples_per_step=2**12)

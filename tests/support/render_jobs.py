@@ -1,5 +1,6 @@
 """Render jobs with a trivial frame source, and processes that render or join their parts."""
 
+import functools
 import multiprocessing
 from pathlib import Path
 
@@ -7,8 +8,8 @@ import numpy as np
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.storage import is_temporary
+from climatenerf.output.frame_source import RenderedFrame
 from climatenerf.output.job import (
-    RenderedFrame,
     RenderJob,
     frames_of_part,
     join,
@@ -38,18 +39,18 @@ def make_job(frames: int = 8, visibility: float = 50.0, **changes) -> RenderJob:
 
 def noise_of(job: RenderJob):
     """A frame source whose pictures depend on the job and the index only."""
+    return functools.partial(noise_frame, job)
 
-    def render(index, preview):
-        rng = np.random.default_rng([int(job.key[:8], 16), index])
-        picture = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-        names = ("depth", "water_depth", "transmittance", "snow_thickness", "seen")
-        layers = {name: rng.random((HEIGHT, WIDTH), np.float32) for name in names}
-        layers |= {f"mask_{name}": rng.random((HEIGHT, WIDTH)) for name in ("water", "snow")}
-        if preview is not None:
-            preview(picture)
-        return RenderedFrame(picture, layers, {"fact": 1.5})
 
-    return render
+def noise_frame(job: RenderJob, index: int, preview) -> RenderedFrame:
+    rng = np.random.default_rng([int(job.key[:8], 16), index])
+    picture = rng.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    names = ("depth", "water_depth", "transmittance", "snow_thickness", "seen")
+    layers = {name: rng.random((HEIGHT, WIDTH), np.float32) for name in names}
+    layers |= {f"mask_{name}": rng.random((HEIGHT, WIDTH)) for name in ("water", "snow")}
+    if preview is not None:
+        preview(picture)
+    return RenderedFrame(picture, layers, {"fact": 1.5})
 
 
 def render_part(out: Path, part: tuple[int, int], frames: int) -> None:

@@ -64,6 +64,7 @@ def stop_halfway(trainer, run):
     checkpoint(trainer, run)
 
 
+@pytest.mark.slow
 def test_a_restored_fit_is_bit_identical(scene, tmp_path):
     trainer = begin(scene, steps=40)
     trainer.field.pruning_threshold = 0.004
@@ -91,6 +92,7 @@ def labelled(trainer):
     return make_trainer(pixels, trainer.extent, trainer.settings)
 
 
+@pytest.mark.slow
 def test_a_restored_fit_with_labels_is_bit_identical(scene, tmp_path):
     """The checkpoint contains masks, sums of relative depth, and cells forced empty by the sky."""
     trainer = labelled(begin(scene, steps=40))
@@ -153,6 +155,7 @@ def test_a_run_with_the_earlier_names_of_settings_is_read_and_resumed(scene, tmp
     assert fitted(scene, tmp_path / "run", steps=6, resume=True)["steps"] == 6
 
 
+@pytest.mark.slow
 def test_resuming_continues_the_counters(scene, tmp_path):
     first = fitted(scene, tmp_path / "run", steps=8)
     second = fitted(scene, tmp_path / "run", steps=16, resume=True)
@@ -210,6 +213,7 @@ def test_a_run_resumed_after_refinement_protects_the_cells_of_points(scene, tmp_
     assert torch.equal(again.field.occupancy.forced_empty, trainer.field.occupancy.forced_empty)
 
 
+@pytest.mark.slow
 def test_ground_height_of_a_resumed_run_is_in_its_units(scene, tmp_path, monkeypatch):
     """The extent is estimated again, but the field keeps that of the run."""
     xy = np.random.default_rng(0).uniform(-2, 2, (200, 2))
@@ -349,6 +353,7 @@ def test_an_optimiser_state_that_would_make_nan_is_refused(scene, tmp_path, name
     assert (tmp_path / "run" / "field.safetensors").read_bytes() == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["field.safetensors", "optimiser.safetensors", "metrics.json", "scene.json"]
 )

@@ -135,6 +135,7 @@ def test_field_and_optimiser_of_different_checkpoints_are_not_resumed(scene, tmp
         fitted(scene, tmp_path, 6, resume=True)
 
 
+@pytest.mark.slow
 def test_a_run_is_hashed_as_it_was_read(scene, tmp_path):
     """Frames of a field that a fit has replaced meanwhile do not count as those of the new one."""
     fitted(scene, tmp_path / "run", 2)
@@ -147,6 +148,7 @@ def test_a_run_is_hashed_as_it_was_read(scene, tmp_path):
     assert hashes[0] != hashes[1]
 
 
+@pytest.mark.slow
 def test_a_folder_whose_first_checkpoint_was_cut_off_can_be_resumed(scene, tmp_path):
     fitted(scene, tmp_path, 2)
     (tmp_path / STAGING).mkdir()

@@ -85,6 +85,7 @@ def batch_of():
     return lambda trainer: trainer.pixels.draw(600, torch.Generator().manual_seed(2), 100, 0.1)
 
 
+@pytest.mark.slow
 def test_fixed_capacities_give_the_gradients_of_exact_buffers(scene, batch_of):
     results = []
     for fixed in (False, True):
@@ -114,6 +115,7 @@ def test_fixed_capacities_give_the_gradients_of_exact_buffers(scene, batch_of):
     assert count > 20, "all parts of the field, masks and poses have gradients"
 
 
+@pytest.mark.slow
 def test_a_step_with_fixed_capacities_does_not_synchronise(scene, batch_of, monkeypatch):
     trainer = frozen_fit(scene, True)
     for _ in range(4):

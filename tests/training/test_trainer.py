@@ -117,6 +117,7 @@ def parameters_after(scene, seed, steps=40):
     return trainer.field.state_dict()
 
 
+@pytest.mark.slow
 def test_the_seed_determines_the_field(scene):
     a, b, c = (parameters_after(scene, seed) for seed in (1, 1, 2))
     for name in a:
@@ -187,6 +188,7 @@ def test_space_outside_all_frusta_stays_empty(scene):
             trainer.evidence.free_space.force_empty(everywhere=False)
 
 
+@pytest.mark.slow
 def test_normals_are_marked_as_learned_late_in_a_fit(scene):
     trainer = begin(scene, steps=100)
 
@@ -222,6 +224,7 @@ def test_colours_are_view_independent_until_surfaces_are_found(scene):
     assert seen[-1][1] > 0
 
 
+@pytest.mark.slow
 def test_colours_recover_from_black(scene):
     """Haze in front of a bright sky darkens at first; it must keep a gradient to recover."""
     trainer = begin(scene, steps=150)

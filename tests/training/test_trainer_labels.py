@@ -188,6 +188,7 @@ def test_ground_height_moves_matter_to_the_ground(scene, monkeypatch, obstacles,
     assert above[100.0] < 0.5 * above[0.0], above
 
 
+@pytest.mark.slow
 def test_multiview_matches_on_the_ground_are_dropped(scene):
     known, labels = labelled(scene)
     pixels = labelled_pixels(known, labels)
@@ -228,6 +229,7 @@ def test_classes_and_normals_do_not_change_the_density(scene, monkeypatch):
         assert any(name.startswith("geometry") for name in moved) == changed, moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("labelled_ids", "learned"), [((9,), False), ((2,), False), ((2, 9), True)]
 )
@@ -297,6 +299,7 @@ def test_the_sky_prior_extrapolates_the_sky_to_unseen_directions(scene, label):
     assert errors[Losses.sky_prior] < 0.5 * errors[0.0], errors
 
 
+@pytest.mark.slow
 def test_settings_of_the_ablation_disable_parts(scene, monkeypatch):
     full = with_labels(scene, np.asarray)
     assert full.field.occupancy.forced_empty.any() and full.evidence.knows_sky

@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from climatenerf.training import losses
@@ -30,6 +31,7 @@ def person(image, xy):
     return (image == 1) & (xy[:, 0] > 0.2) & (xy[:, 0] < 0.4) & (xy[:, 1] > 0.3)
 
 
+@pytest.mark.slow
 def test_an_object_in_one_photo_is_masked_there_only():
     masks = train(lambda image, xy: 0.003 + 0.1 * person(image, xy))
     image, xy = torch.randint(4, (8000,)), torch.rand(8000, 2)
@@ -53,6 +55,7 @@ def test_a_static_capture_is_not_masked():
     assert (m > 0.5).float().mean() < 0.02
 
 
+@pytest.mark.slow
 def test_masks_can_turn_on_late():
     """The logarithm keeps a gradient at M near 0; here a person appears late."""
     step = iter(range(10**9))

@@ -55,6 +55,7 @@ def scene_at(folder):
     return Scene(folder, "test", (CAMERA,), views)
 
 
+@pytest.mark.slow
 def test_ash_of_an_external_package_is_rendered(ash, tmp_path):
     effects = (*EFFECTS, ash.ASH)
     box = ((-6.0, -6.0, -2.0), (6.0, 6.0, 4.0))
@@ -103,6 +104,7 @@ def climatenerf(site, *args):
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
 
 
+@pytest.mark.slow
 def test_an_installed_effect_has_flags_keyframes_and_layers(installed, tmp_path):
     (tmp_path / "film.toml").write_text('[ash]\ndepth = { "0 s" = "0 m", "1 s" = "4 cm" }\n')
     out = tmp_path / "out"

@@ -75,6 +75,7 @@ def test_a_weakened_style_changes_less():
     assert half.sky.share == 0.5 * style.sky.share
 
 
+@pytest.mark.slow
 def test_a_styled_run_shows_what_its_season_shows_and_a_season_replaces_it():
     field, scene = sunlit_yard(), yard_scene()
     camera, pose = scene.cameras[0].resized(24, 15), scene.c2w_world(scene.views[0])

@@ -60,6 +60,7 @@ VERBS = {
     "compare": Verb("climatenerf.cli.compare", "Compare", "compare weather with other methods"),
     "verify": Verb("climatenerf.cli.verify", "Verify", "check the physics of this installation"),
     "study": Verb("climatenerf.cli.study", "Study", "compare methods by a user study"),
+    "batch": Verb("climatenerf.cli.batch", "Batch", "do all this for many captures"),
     "export": Verb("climatenerf.cli.export", "Export", "write poses for other programs"),
     "demo": Verb("climatenerf.cli.demo", "Demo", "fit and render the embedded street"),
 }

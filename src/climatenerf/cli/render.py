@@ -11,6 +11,7 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.cli.flags import optional
+from climatenerf.cluster.workers import parse_workers
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.core.storage import read_json
@@ -57,6 +58,9 @@ class Render:
     part: Annotated[str | None, optional("STR")] = None
     """Render a part of the frames, such as 3/16: frames 0002, 0018, 0034, ... Several processes can
     each render a part of one folder; --join then assembles them."""
+    workers: Annotated[str | None, optional("N|ADDRESS")] = None
+    """Render on several workers: N processes of this machine, or those of a Dask scheduler such as
+    tcp://10.0.0.1:8786, which must share the folders."""
     join: bool = False
     """Render nothing; assemble movie.mp4 and movie.json from finished frames."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -98,6 +102,11 @@ def run(
         raise UserError(
             "--part renders frames and --join assembles them; render all parts, then use --join"
         )
+    workers = parse_workers(options.workers)
+    if workers is not None and (part is not None or options.join or options.preview):
+        raise UserError(
+            "--workers renders all frames and joins them; leave --part, --join and --preview out"
+        )
     used = installed_effects() if effects is None else tuple(effects)
     film = None if options.weather is None else read_weather(options.weather, used)
     sections = {each.name: getattr(options, each.name) for each in used}
@@ -131,6 +140,7 @@ def run(
             join_only=options.join,
             preview=options.preview,
             complete_ground=options.complete_ground,
+            workers=workers,
             progress=bars,
             note=progress.say,
             effects=used,

@@ -29,12 +29,14 @@ def first_crossing(
     rays_o: Float[Tensor, "n 3"],
     rays_d: Float[Tensor, "n 3"],
     span: Float[Tensor, "n 2"],
+    slope: float | None = None,
 ) -> Float[Tensor, "n"]:
     """Return where rays first pass from above a height field to below it.
 
-    See `heightfield_reference.first_crossing`.
+    See `heightfield_reference.first_crossing`. A caller that asks often can keep the height field's
+    `steepest_slope` and give it.
     """
-    slope = steepest_slope(height)
+    slope = steepest_slope(height) if slope is None else slope
     if dispatch.backend(height, rays_o, rays_d, span) == "cpu":
         from climatenerf.ops.cpu import heightfield as kernels
 

@@ -12,21 +12,20 @@ import contextlib
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
-from jaxtyping import Float, UInt8
 
 import climatenerf
 from climatenerf.core.errors import UserError
 from climatenerf.core.input_limits import check_fps
 from climatenerf.core.layer_table import Layer
 from climatenerf.core.storage import hash_of_files, plain, read_json, write_json
-from climatenerf.field.capabilities import APPEARANCE
 from climatenerf.output import render_folder
+from climatenerf.output.frame_source import FrameSource, Preview, RenderedFrame, measured
 from climatenerf.output.layers import LayerFormat, require_exr, save_layers
 from climatenerf.output.render_folder import MOVIE, PREVIEW, SIDECAR
 from climatenerf.output.sidecar import FrameRecord, sidecar
@@ -42,13 +41,9 @@ from climatenerf.scene import Scene
 from climatenerf.scene.images import read_rgb
 from climatenerf.weather.description import KeyframedWeather, weather_to_table
 from climatenerf.weather.effect import Effect
-from climatenerf.weather.registry import COMPLETED_GROUND, EFFECTS, MEAN_TRANSMITTANCE, layer_table
+from climatenerf.weather.registry import EFFECTS, layer_table
 from climatenerf.weather.style import FILE_NAME as STYLE
 from climatenerf.weather.style import Style
-
-if TYPE_CHECKING:
-    from climatenerf.field.protocol import RadianceField
-    from climatenerf.weather.world import Kept
 
 MAX_SIDE = 8192
 MAX_RAYS = 2**26
@@ -56,26 +51,6 @@ MAX_RAYS = 2**26
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and the fraction of it that is done."""
-Preview = Callable[[UInt8[np.ndarray, "h w 3"]], None]
-
-
-@dataclass(frozen=True)
-class RenderedFrame:
-    """One rendered frame.
-
-    Attributes:
-        picture: 8-bit sRGB.
-        layers: all measured layers, (h, w) or (h, w, 3) each; the layer table gives their units.
-        facts: numbers about the whole render, for the sidecar.
-    """
-
-    picture: UInt8[np.ndarray, "h w 3"]
-    layers: dict[str, Float[np.ndarray, "h w *c"]]
-    facts: dict[str, float] = field(default_factory=dict)
-
-
-FrameSource = Callable[[int, Preview | None], RenderedFrame]
-"""Renders the frame of an index; a preview is called with coarser pictures first."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +127,23 @@ class RenderJob:
     def files(self, index: int) -> list[str]:
         """Return the files of a frame, relative to the movie's folder, the picture first."""
         return render_folder.frame_files(index, self.layers, self.formats)
+
+
+class RenderFrames(Protocol):
+    """Renders the frames that are not finished yet, as `render_frames`."""
+
+    def __call__(
+        self,
+        job: RenderJob,
+        out: Path,
+        prepare: Callable[[], FrameSource],
+        indices: Iterable[int],
+        *,
+        preview: bool = False,
+        progress: Progress | None = None,
+    ) -> None:
+        """See `render_frames`."""
+        ...
 
 
 def plan(
@@ -321,28 +313,70 @@ def render_frames(
         UserError: see `check_folder`; or a disk error.
     """
     indices = list(indices)
-    render_folder.continue_promotion(out)
-    check_folder(job, out, preview)
-    missing = missing_frames(job, out, indices)
+    missing = frames_to_render(job, out, indices, preview)
     if not missing:
         return
     render = prepare()
-    with render_folder.locked(out):
-        render_folder.clear_abandoned(out, list(job.table))
-        described = render_folder.describe(job.key, len(job), job.layers, job.formats, ())
-        render_folder.claim(out, described)
+    claim(job, out)
     show = (lambda seen: write_png(out / PREVIEW, seen, SIMULATED)) if preview else None
     done = len(indices) - len(missing)
     try:
         for index in missing:
             _report(progress, done / len(indices))
-            if missing_frames(job, out, [index]):  # another process may have rendered it
-                _save(job, out, index, render(index, show))
+            render_frame(job, out, index, render, show)
             done += 1
         _report(progress, 1.0)
     finally:
         if preview:
             (out / PREVIEW).unlink(missing_ok=True)
+
+
+def frames_to_render(
+    job: RenderJob, out: Path, indices: Iterable[int], preview: bool = False
+) -> list[int]:
+    """Return which of the frames are not finished, in a folder that can receive them.
+
+    Raises:
+        UserError: see `check_folder`; or a disk error.
+    """
+    render_folder.continue_promotion(out)
+    check_folder(job, out, preview)
+    return missing_frames(job, out, indices)
+
+
+def claim(job: RenderJob, out: Path) -> None:
+    """Record in the folder that it receives this job.
+
+    Raises:
+        UserError: it holds another unfinished render; or a disk error.
+    """
+    with render_folder.locked(out):
+        render_folder.clear_abandoned(out, list(job.table))
+        described = render_folder.describe(job.key, len(job), job.layers, job.formats, ())
+        render_folder.claim(out, described)
+
+
+def render_frame(
+    job: RenderJob,
+    out: Path,
+    index: int,
+    render: FrameSource,
+    show: Preview | None = None,
+) -> None:
+    """Render and write one frame of a claimed folder, unless another process has finished it.
+
+    Args:
+        job: the job.
+        out: folder of the movie.
+        index: number of the frame, from 0.
+        render: renders it.
+        show: called with coarser pictures first.
+
+    Raises:
+        UserError: a disk error, or another render has taken the folder.
+    """
+    if missing_frames(job, out, [index]):
+        _save(job, out, index, render(index, show))
 
 
 def join(
@@ -410,96 +444,27 @@ def render_movie(
     preview: bool = False,
     note: Callable[[str], None] | None = None,
     progress: Progress | None = None,
+    render: RenderFrames | None = None,
 ) -> Path:
     """Render the frames that are missing, join them, and return the path of the movie.
 
     A stopped render leaves a sidecar of the frames that are finished, and resumes with the same
     call. Arguments and errors are those of `render_frames` and `join`.
+
+    Args:
+        render: renders the frames in place of `render_frames`, such as on other machines.
     """
     render_folder.continue_promotion(out)
     check_folder(job, out, preview)
     if note is not None:  # before hours of rendering
         _note_about_movie(job, note)
+    render = render or render_frames
     try:
-        render_frames(job, out, prepare, range(len(job)), preview=preview, progress=progress)
+        render(job, out, prepare, range(len(job)), preview=preview, progress=progress)
     except BaseException:
         _write_partial_sidecar(job, scene, out)
         raise
     return join(job, scene, out, progress=progress)
-
-
-def frame_source(
-    job: RenderJob,
-    field: "RadianceField",
-    scene: Scene,
-    progress: Progress | None = None,
-    kept: "Kept | None" = None,
-) -> FrameSource:
-    """Prepare light, waves and snow for a job, and return what renders its frames.
-
-    Args:
-        job: the job.
-        field: the fitted field of its run.
-        scene: the capture of its run.
-        progress: called with what is being prepared and the fraction that is done.
-        kept: the run folder, where what is found in the field is kept; None: nowhere.
-
-    Raises:
-        UserError: the weather does not fit the scene.
-    """
-    from climatenerf.field.protocol import require
-    from climatenerf.render.session import RenderSession
-
-    appearance = None
-    if job.appearance is not None:
-        require(field, frozenset({APPEARANCE}), "the appearance of a photo")
-        appearance = field.photo_appearance(job.appearance)
-    times = np.array([job.time(index) for index in range(len(job))])
-    positions = job.path.c2w[:, :3, 3]
-    session = RenderSession(
-        field,
-        scene,
-        job.weather,
-        positions,
-        times,
-        appearance,
-        progress,
-        job.effects,
-        kept,
-        job.style,
-    )
-
-    def render(index: int, preview: Preview | None) -> RenderedFrame:
-        frame = session.frame(
-            job.path.cameras[index],
-            job.path.c2w[index],
-            job.time(index),
-            supersample=job.supersample,
-            layers=job.layers,
-            preview=preview,
-        )
-        return RenderedFrame(frame.picture, frame.layers, session.facts)
-
-    return render
-
-
-def measured(
-    layers: dict[str, Float[np.ndarray, "h w *c"]], effects: Sequence[Effect] = EFFECTS
-) -> dict[str, float]:
-    """Return the means over a frame that its effects name; see `Effect.measures`."""
-    found = {
-        MEAN_TRANSMITTANCE: float(layers["transmittance"].mean()),
-        COMPLETED_GROUND: 1.0 - float(layers["seen"].mean()),
-    }
-    for measure in (measure for effect in effects for measure in effect.measures):
-        values = layers[measure.layer]
-        where = np.ones(values.shape, bool) if measure.mask is None else layers[measure.mask] > 0.5
-        found[measure.name] = _mean(values, where)
-    return found
-
-
-def _mean(values: np.ndarray, where: np.ndarray) -> float:
-    return float(values[where].mean()) if where.any() else 0.0
 
 
 def _save(job: RenderJob, out: Path, index: int, frame: RenderedFrame) -> None:

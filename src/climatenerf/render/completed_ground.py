@@ -50,6 +50,10 @@ class CompletedField(WrappedField):
         return self._tensor((lowered / self.terrain.cell).astype(np.float32))
 
     @cached_property
+    def _slope(self) -> float:
+        return heightfield.steepest_slope(self._height)
+
+    @cached_property
     def _surface(self) -> Float[Tensor, "rows columns"]:
         """Heights in cells above the world's origin."""
         return self._tensor((self.terrain.height / self.terrain.cell).astype(np.float32))
@@ -111,7 +115,7 @@ class CompletedField(WrappedField):
         cell = self.terrain.cell
         span = torch.stack([t_min, t_max], dim=-1) / cell
         o = self._cells(rays_o)
-        t = heightfield.first_crossing(self._height, o, rays_d.contiguous(), span)
+        t = heightfield.first_crossing(self._height, o, rays_d.contiguous(), span, self._slope)
         met = t.isfinite().nonzero()[:, 0]
         at = o[met, :2] + t[met, None] * rays_d[met, :2]
         whole = bilinear(self._completed, at) <= 0.5

@@ -25,7 +25,7 @@ from climatenerf.weather.effect import Effect, Entity
 from climatenerf.weather.registry import check_effects, in_order, installed_effects, layer_table
 from climatenerf.weather.style import Style
 from climatenerf.weather.weather import Weather, check
-from climatenerf.weather.world import Kept, Preparation, World
+from climatenerf.weather.world import Kept, Preparation, World, unreported
 
 Key = tuple[tuple[object, ...], ...]
 
@@ -95,7 +95,7 @@ class RenderSession:
         self._camera_positions = camera_positions
         self._times = np.zeros(1) if times is None else times
         self._appearance = appearance
-        self._progress = progress or (lambda what, fraction: None)
+        self._progress = progress or unreported
         self._kept = kept
         self._style = style
         self._photos: list[PhotoRays] | None = None
@@ -135,6 +135,10 @@ class RenderSession:
             self._keys[name], self._entities[name] = key, entity
         self.weather = weather
         return tuple(prepared)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the receiver of progress out of a pickle: it belongs to one process."""
+        return {**self.__dict__, "_progress": unreported}
 
     @property
     def facts(self) -> dict[str, float]:

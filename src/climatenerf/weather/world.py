@@ -360,3 +360,11 @@ class Preparation:
     photo_rays: Callable[[], list[PhotoRays]] | None = None
     kept: Kept | None = None
     style: Style | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the receiver of progress out of a pickle: it belongs to one process."""
+        return {**self.__dict__, "progress": unreported}
+
+
+def unreported(what: str, fraction: float) -> None:
+    """Take a report of progress and show it to nobody."""

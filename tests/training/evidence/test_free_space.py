@@ -5,6 +5,7 @@ import functools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from support.tower import CAMERA, TOWER, in_matter, labels, poses
 from support.toy_scene import TINY
@@ -262,6 +263,7 @@ def test_air_beside_the_tower_is_penalised_and_the_tower_is_not():
     assert bare.ground is None and not penalised_samples(bare, x, d, t).any()
 
 
+@pytest.mark.slow
 def test_a_minority_of_wrong_views_does_not_penalise_the_tower():
     def err(count):
         wrong = range(0, 12, 12 // count)
@@ -279,6 +281,7 @@ def test_a_minority_of_wrong_views_does_not_penalise_the_tower():
         assert not penalised_samples(free_space(err(count)), x, d, t).any()
 
 
+@pytest.mark.slow
 def test_obstacles_with_points_of_their_own_are_exempt():
     """Most views label the tower ground, but not those that observe the points on it."""
 

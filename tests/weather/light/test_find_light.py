@@ -84,6 +84,7 @@ def test_no_sun_is_found_under_an_even_sky():
     assert found.gain < finding.MIN_GAIN
 
 
+@pytest.mark.slow
 def test_two_halves_of_the_photos_under_two_suns_contradict_each_other():
     field, morning, sky = sunlit_yard(direction(35, 110))
     _, evening, _ = sunlit_yard(direction(35, 250))

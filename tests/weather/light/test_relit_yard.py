@@ -57,6 +57,7 @@ def ground(field):
     return x, field.colour(x, DOWN.expand_as(x))[:, 0]
 
 
+@pytest.mark.slow
 def test_the_map_of_the_sun_equals_the_shadows_in_closed_form():
     found = sun_map(sunlit_yard(), TO_SUN, np.array([0.0, 0.0, 1.0]))
     rng = np.random.default_rng(0)
@@ -70,6 +71,7 @@ def test_the_map_of_the_sun_equals_the_shadows_in_closed_form():
     assert float(found.visibility(far)) == 1.0
 
 
+@pytest.mark.slow
 def test_the_sun_of_the_yard_is_found(overcast):
     overcast.world(0.0)
     light = overcast._entities["sky"].captured
@@ -102,6 +104,7 @@ def test_lit_ground_with_a_wrong_normal_does_not_turn_black(overcast):
     torch.testing.assert_close(wrong, right, rtol=0.35, atol=0.0)
 
 
+@pytest.mark.slow
 def test_a_new_sun_casts_the_shadow_elsewhere():
     opposite = {"elevation": "45 deg", "azimuth": "315 deg"}
     world = session(sunlit_yard(), sky={"kind": "clear"}, sun=opposite).world(0.0)
@@ -113,6 +116,7 @@ def test_a_new_sun_casts_the_shadow_elsewhere():
     assert float(colour[lit].median()) > 1.8 * float(colour[~lit].median())
 
 
+@pytest.mark.slow
 def test_exposure_is_kept_on_average_and_ev_doubles_it(overcast):
     x = torch.cat([ACROSS, torch.tensor([[x, 5.99, 2.0] for x in np.linspace(-6, 6, 40)]).float()])
     d = torch.where(x[:, 1:2] > 5, torch.tensor([[0.0, 1.0, 0.0]]), DOWN)
@@ -127,6 +131,7 @@ def test_exposure_is_kept_on_average_and_ev_doubles_it(overcast):
     )
 
 
+@pytest.mark.slow
 def test_light_that_stays_is_bit_identical():
     """Nothing is found or gathered for a clean frame, and the field is the given one."""
     field, scene = sunlit_yard(), yard_scene()
@@ -155,6 +160,7 @@ def test_the_photos_own_sun_keeps_its_shadows_under_snow(snowy):
     assert 1.05 < float(brighter[0, 0]) < 2.0
 
 
+@pytest.mark.slow
 def test_what_keeps_no_snow_sends_no_more_light():
     """By the paper's rule with half of the snow at 0 degrees, level ground carries half."""
     field = sunlit_yard()
@@ -166,6 +172,7 @@ def test_what_keeps_no_snow_sends_no_more_light():
     assert 0.3 < float((some - dry) / (most - dry)) < 0.7
 
 
+@pytest.mark.slow
 def test_snow_and_mud_receive_the_light_of_their_place(snowy):
     field = sunlit_yard()
     (snow,) = snowy.matters
@@ -181,6 +188,7 @@ def test_snow_and_mud_receive_the_light_of_their_place(snowy):
     assert float(received[1, 0] / received[0, 0]) < 0.75
 
 
+@pytest.mark.slow
 def test_faint_smog_in_the_sun_changes_nothing():
     field, scene = sunlit_yard(), yard_scene()
     camera, pose = scene.cameras[0].resized(40, 25), scene.c2w_world(scene.views[0])
@@ -211,6 +219,7 @@ def test_photos_that_show_too_little_are_refused_in_one_sentence():
         session(plain, sky={"kind": "overcast"}).world(0.0)
 
 
+@pytest.mark.slow
 def test_parameters_move_the_sun_of_the_photos():
     """What they leave out stays as found."""
     table = {"flood": {"level": "0.1 m"}, "sun": {"azimuth": "200 deg"}}

@@ -257,6 +257,7 @@ def test_a_season_of_no_strength_is_the_clean_picture(yard):
         np.testing.assert_array_equal(seen.linear, clean.linear)
 
 
+@pytest.mark.slow
 def test_a_grey_sky_takes_the_hard_sun_and_keeps_the_light_in_the_open(yard):
     field, _ = yard
     one = session(field, flood={"level": "-9 m"})
@@ -302,6 +303,7 @@ def test_still_water_mirrors_the_styled_hedge():
     assert shown["autumn"][0] / shown["autumn"][1] > 1.5 * shown["clean"][0] / shown["clean"][1]
 
 
+@pytest.mark.slow
 def test_water_and_snow_take_the_light_of_the_sky_and_not_of_the_lawn(yard):
     """Deep muddy water and deep snow scale with the irradiance on open ground."""
     field, _ = yard

@@ -18,7 +18,7 @@ import climatenerf
 from climatenerf.core import parsing
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import make_folder, plain, read_json, write_json
-from climatenerf.output.job import FrameSource, Preview, RenderedFrame
+from climatenerf.output.frame_source import FrameSource, Preview, RenderedFrame
 from climatenerf.output.render_folder import png_text
 from climatenerf.output.video import MovieWriter, write_png
 from climatenerf.scene.images import read_rgb

@@ -10,6 +10,7 @@ from climatenerf.core.locks import LOCK, only_writer
 from climatenerf.core.storage import is_temporary, write_json
 from climatenerf.field.protocol import RadianceField
 from climatenerf.output import job as jobs
+from climatenerf.output.frame_source import FrameSource, frame_source
 from climatenerf.paths.camera_path import CameraPath
 from climatenerf.scene import Scene
 from climatenerf.studies.compare import report
@@ -187,10 +188,10 @@ class _Comparison:
         def report_progress(what: str, fraction: float) -> None:
             self.progress(f"{Path(reel, name)}, {what}", fraction)
 
-        def prepare() -> jobs.FrameSource:
+        def prepare() -> FrameSource:
             if self.field is None:
                 self.field = self.fitted.completed(report_progress)
-            source = jobs.frame_source(
+            source = frame_source(
                 job,
                 self.field,
                 self.fitted.scene,
