@@ -1,12 +1,16 @@
 """`climatenerf render`: frames, layers, parts, sidecars, and what it refuses."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from PIL import Image
@@ -354,3 +358,64 @@ def test_a_damaged_run_is_refused(run_folder, tmp_path, capsys):
     path = tmp_path / "run" / "field.safetensors"
     path.write_bytes(path.read_bytes()[:5000])
     assert "damaged" in error_message(capsys, "render", tmp_path / "run", "-o", tmp_path / "out")
+
+
+def files_in(folder):
+    found = [path for path in folder.rglob("*.*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
+
+
+@pytest.mark.slow
+def test_workers_render_the_bytes_of_one_process(run_folder, tmp_path, capsys):
+    weather = ["--flood.level", "-0.2 m", "--snow.depth", "5 cm", "--smog.visibility", "80 m"]
+    weather += ["--sky.kind", "overcast", "--layers", "all", "--frames", "4", "--size", "48x27"]
+    for name, flags in (("one", []), ("two", ["--workers", "2"])):
+        assert run_cli("render", run_folder, "-o", tmp_path / name, *weather, *flags) == 0
+    one, two = (
+        {
+            p.relative_to(tmp_path / name): p.read_bytes()
+            for p in (tmp_path / name).rglob("*.*")
+            if p.is_file()
+        }
+        for name in ("one", "two")
+    )
+    log = two.pop(Path("workers.log")).decode()
+    assert one == two and len(one) > 40
+    assert all(f"frame 000{i} took" in log for i in range(4))
+    err = capsys.readouterr().err
+    assert "distributed" not in err and "frames: 100 %" in err
+
+
+@pytest.mark.parametrize("flag", [("--part", "1/2"), ("--join",), ("--preview",)])
+def test_workers_render_all_frames_themselves(run_folder, tmp_path, capsys, flag):
+    given = "render", run_folder, "-o", tmp_path / "out", "--workers", "2"
+    assert "leave --part, --join and --preview out" in error_message(capsys, *given, *flag)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_the_command(run_folder, tmp_path, number):
+    out = tmp_path / "out"
+    flags = ["--workers", "2", "--frames", "400", "--size", "96x54", "-o", str(out)]
+    command = [sys.executable, "-m", "climatenerf", "render", str(run_folder), *flags]
+    with (tmp_path / "err").open("wb") as err:
+        child = subprocess.Popen(command, stderr=err, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while not list(out.glob("frames/*.png")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    below = psutil.Process(child.pid).children(recursive=True)
+    assert len(below) >= 2
+    if number == signal.SIGINT:  # a terminal sends it to all
+        os.killpg(child.pid, number)
+    else:
+        child.kill()
+    assert child.wait(60) == (130 if number == signal.SIGINT else -number)
+    assert not psutil.wait_procs(below, timeout=30)[1]
+    finished = len(list(out.glob("frames/*.png")))
+    assert 0 < finished < 400
+    if number == signal.SIGINT:
+        said = (tmp_path / "err").read_text()
+        assert said.endswith("climatenerf: interrupted\n") and "Traceback" not in said
+        assert len(json.loads((out / "movie.json").read_text())["frames"]) == finished
+        assert not list(out.glob(".frames/unfinished-*"))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import pickle
 from pathlib import Path
 from typing import Annotated
 
@@ -151,6 +152,17 @@ CHANGES = [
     ("snow.fall_tilt", 0.3, {"find_deposits": 1, "grow": 1}),
     ("seed", 5, {"find_deposits": 1, "grow": 1, "make_waves": 1}),
 ]
+
+
+def test_a_pickled_session_renders_the_same_and_prepares_nothing(session_of, counted):
+    weather = {"flood": {"level": "-5 cm", "wind_speed": "3 m/s"}, "snow": {"depth": "5 cm"}}
+    session = session_of({**weather, "smog": {"visibility": "60 m"}}, [0.0, 1.0])
+    expected = seen(session, 1.0)[0]
+    session._progress = lambda what, fraction: None  # cannot be pickled
+    before = dict(counted)
+    copy = pickle.loads(pickle.dumps(session))
+    assert np.array_equal(seen(copy, 1.0)[0], expected)
+    assert copy.facts == session.facts and counted == before and before
 
 
 @pytest.mark.parametrize(("name", "value", "again"), CHANGES)
