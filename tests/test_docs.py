@@ -14,6 +14,7 @@ from textwrap import dedent
 import pytest
 
 import climatenerf
+from climatenerf.cli.batch import read_batch
 from climatenerf.training.settings import Losses
 from climatenerf.weather.description import read_weather
 
@@ -39,6 +40,7 @@ VERBS = (
 PARTS = {"study": ("make", "score")}
 """The verbs inside a verb."""
 OTHER_PROGRAMS = {"--index-url", "--extra-index-url"}
+OTHER_PROGRAMS |= {"--host", "--hostfile", "--port", "--nthreads", "--nworkers"}  # dask
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^[ \t]*```(\w*)\n(.*?)^[ \t]*```$", re.MULTILINE | re.DOTALL)
 
@@ -114,11 +116,15 @@ def test_commands_have_a_verb_and_its_options(page):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_weather_files_in_pages_are_valid(page, tmp_path):
+def test_weather_and_batch_files_in_pages_are_valid(page, tmp_path):
     for language, block in FENCE.findall(page.read_text()):
         if language != "toml" or "[project" in block:
             continue
         file = tmp_path / "weather.toml"
+        if "[[scene]]" in block:
+            file.write_text(block)
+            assert read_batch(file, tmp_path)
+            continue
         # A line on its own shows one key of a section that the text names.
         file.write_text(block if "[" in block.splitlines()[0] else f"[flood]\n{block}")
         read_weather(file)  # raises where a key or a value is wrong

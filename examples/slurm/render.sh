@@ -18,6 +18,7 @@ array=$(sbatch --parsable --job-name=frames --array="1-$parts" --cpus-per-task=1
     --time=12:00:00 --output="$out/logs/%a.log" --export=ALL,NUMBA_NUM_THREADS=1,OMP_NUM_THREADS=1 \
     --wrap="$(printf '%q ' climatenerf render "$run" -o "$out" "$@") --part \$SLURM_ARRAY_TASK_ID/$parts")
 
-sbatch --job-name=join --dependency="afterok:${array%%;*}" --cpus-per-task=1 --mem=4G --time=1:00:00 \
+sbatch --job-name=join --dependency="afterok:${array%%;*}" --kill-on-invalid-dep=yes \
+    --cpus-per-task=1 --mem=4G --time=1:00:00 \
     --output="$out/logs/join.log" \
     --wrap="$(printf '%q ' climatenerf render "$run" -o "$out" "$@" --join)"

@@ -301,6 +301,7 @@ def render_movie(
         UserError: a value is out of range, frames to join are missing, or the folder holds
             something else.
     """
+    from climatenerf.field.protocol import device_of
     from climatenerf.output import job as jobs
     from climatenerf.paths.camera_path import camera_path
 
@@ -352,6 +353,8 @@ def render_movie(
 
     if workers is not None and (part is not None or join_only):
         raise UserError("workers render all frames and join them; leave part and join out")
+    if workers is not None and device_of(run.field).type != "cpu":
+        raise UserError("workers compute on the CPU; load the run with device cpu")
     if join_only:
         return jobs.join(job, run.scene, out, note=note, progress=progress)
     if part is None:

@@ -1,7 +1,9 @@
 """Batches: the file, the order of the tasks, what is done before, and the table."""
 
 import csv
+import threading
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -9,6 +11,7 @@ from support.command_line import STREET, error_message, run_cli
 
 from climatenerf.cli.batch import flag_words, read_batch
 from climatenerf.cluster.batch import Task, run_batch
+from climatenerf.cluster.on_worker import run_verb
 
 WHOLE = """
 [defaults.fit]
@@ -83,6 +86,10 @@ def test_tasks_are_commands_in_the_order_of_their_needs(tmp_path):
         ('[[scene]]\ncapture = "a"\n[[scene.render]]\nname = "run"', "'run', or the name is"),
         ('[[scene]]\ncapture = "a"\n[[scene.render]]\nof = "spring"', "no styled run 'spring'"),
         ('[[scene]]\ncapture = "a"\n[[scene.render]]\nflood.level = "3"', "has no unit"),
+        ("[[scene]]\ncapture = 5", "either capture = "),
+        ('[[scene]]\ncapture = "a"\nfit.out = "b"', "leave out out, which the batch decides"),
+        ('[[scene]]\ncapture = "a"\nfit.help = true', "leave help out"),
+        ('[[scene]]\nname = "table.csv"\ncapture = "a"', "or the name is reserved"),
         ('[defaults.flood]\n[[scene]]\ncapture = "a"', "unknown key 'flood'"),
     ],
 )
@@ -142,9 +149,10 @@ def test_a_failure_skips_what_needs_it_and_nothing_else(tmp_path, workers):
     assert [third[task].before for task in tasks[:3]] == [False, False, True]
 
 
-def test_the_table_shows_what_failed_and_escapes_it(tmp_path, capsys):
-    text = '[[scene]]\nname = "a & <b"\ncapture = "absent"\n[[scene.render]]\n'.replace("<", "")
-    out = tmp_path / "out"
+def test_the_table_shows_what_failed_and_escapes_it(tmp_path, capsys, monkeypatch):
+    text = '[[scene]]\nname = "a & b"\ncapture = "absent"\n[[scene.render]]\n'
+    monkeypatch.chdir(tmp_path)  # a relative folder, as people type it
+    out = Path("out")
     message = error_message(capsys, "batch", batch_file(tmp_path, text), "-o", out)
     assert message.endswith("runs them again") and "1 of 2 tasks have failed" in message
     with (out / "table.csv").open(newline="") as file:
@@ -153,6 +161,28 @@ def test_the_table_shows_what_failed_and_escapes_it(tmp_path, capsys):
     assert "absent does not exist" in rows[0]["message"]
     page = (out / "table.html").read_text()
     assert "a &amp; b" in page and "a & b" not in page and "1 failed, 1 skipped" in page
+    assert 'href="a%20%26%20b/logs/fit.log"' in page
+    address = "tcp://127.0.0.1:9"  # a refused command leaves the table
+    said = error_message(capsys, "batch", "batch.toml", "-o", out, "--workers", address)
+    assert "no Dask scheduler answers" in said and (out / "table.html").read_text() == page
+    said = error_message(capsys, "batch", "batch.toml", "-o", "new", "--workers", address)
+    assert "no Dask scheduler answers" in said and not Path("new").exists()
+
+
+def test_a_verb_that_a_signal_ends_is_said(tmp_path):
+    log = tmp_path / "log"
+
+    def kill_it():
+        while True:
+            for process in psutil.Process().children():
+                if process.cmdline()[-2:-1] == ["check"]:
+                    process.kill()
+                    return
+            time.sleep(0.02)
+
+    threading.Thread(target=kill_it, daemon=True).start()
+    status, _, message = run_verb(["check", str(STREET)], log, tmp_path, None)
+    assert status == -9 and message.startswith("ended by signal 9")
 
 
 @pytest.mark.slow
@@ -195,8 +225,6 @@ def test_a_killed_worker_takes_its_verb_along_and_another_repeats_it(tmp_path):
                 killed.append(process)
                 process.parent().kill()
                 return
-
-    import threading
 
     def watch():
         while not killed:

@@ -50,7 +50,7 @@ def test_parts_are_rendered_and_joined(run_folder, tmp_path):
     assert (out / "movie.mp4").is_file() and (out / "movie.json").is_file()
     lines = jobs.read_text().splitlines()
     assert len(lines) == 5 and "--dependency=afterok:4711" in lines
-    assert "part" not in lines[-1] and lines[-1].endswith("--join")
+    assert "--part" not in lines[-1] and lines[-1].rstrip().endswith("--join")
     assert {path.name for path in (out / "logs").iterdir()} == {
         *("1.log", "2.log", "3.log", "join.log")
     }

@@ -1,6 +1,7 @@
 """Frames on local workers: the bytes of one process, also when a worker is killed."""
 
 import errno
+import hashlib
 import os
 import random
 import signal
@@ -150,7 +151,7 @@ def test_a_preview_is_refused(tmp_path):
 
 
 def test_a_changed_pickle_is_not_unpickled(tmp_path):
-    from climatenerf.cluster.on_worker import Saved, unpickled
+    from climatenerf.cluster.on_worker import Saved, unpickled, versions
 
     class Bomb:
         def __reduce__(self):
@@ -161,5 +162,9 @@ def test_a_changed_pickle_is_not_unpickled(tmp_path):
     path = tmp_path / "prepared"
     path.write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(UserError, match="holds something else"):
-        unpickled(Saved(path, "0" * 64))
+        unpickled(Saved(path, "0" * 64, versions()))
+    right = hashlib.sha256(path.read_bytes()).hexdigest()
+    old = versions() | {"torch": "1.0"}
+    with pytest.raises(UserError, match="and the program has 1.0; install the same versions"):
+        unpickled(Saved(path, right, old))
     assert not (tmp_path / "exploded").exists()

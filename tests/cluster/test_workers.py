@@ -31,7 +31,6 @@ from climatenerf.output.job import missing_frames, render_movie
 )
 def test_numbers_and_addresses(text, meant):
     assert parse_workers(text) == meant
-    assert parse_workers(None) is None
 
 
 @pytest.mark.parametrize(
@@ -59,6 +58,36 @@ def test_nobody_listens(tmp_path):
         pass
     assert time.monotonic() - began < 60
     assert not out.exists()
+
+
+def test_a_program_that_is_no_scheduler(tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "CONNECT", 2.0)
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        silent.listen()
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        began = time.monotonic()
+        said = refusal(tmp_path, address)
+    assert "no Dask scheduler answers at" in said
+    assert time.monotonic() - began < 60  # it would wait for ever
+
+
+def test_tls_without_certificates(tmp_path):
+    said = refusal(tmp_path, f"tls://127.0.0.1:{free_port()}")
+    assert "needs certificates" in said
+
+
+def test_the_environment_stays(tmp_path):
+    before = dict(os.environ)
+    with connected(1, tmp_path) as client:
+        assert client.submit(os.environ.get, "NUMBA_NUM_THREADS").result() is not None
+    assert dict(os.environ) == before
+
+
+@pytest.mark.parametrize("count", [0, -1, 257, "2x"])
+def test_counts_out_of_range_are_refused(count):
+    with pytest.raises(UserError, match="--workers must be a number"):
+        renderer(count)
 
 
 @contextlib.contextmanager
@@ -111,7 +140,7 @@ def test_a_worker_with_another_version(tmp_path):
     old = "import climatenerf; climatenerf.__version__ = '0.0.9'"
     with scheduler(tmp_path, startup=old) as (address, _):
         said = refusal(tmp_path, address)
-    assert "has climatenerf 0.0.9 and this program has" in said and "same versions" in said
+    assert "has climatenerf 0.0.9 and the program has" in said and "same versions" in said
 
 
 def test_a_worker_without_the_program(tmp_path):

@@ -21,6 +21,7 @@ flood.level = "0.3 m"
 
 import dataclasses
 import importlib
+import shlex
 import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -31,17 +32,21 @@ import tyro
 
 from climatenerf.cli import progress
 from climatenerf.cli.flags import optional, parse_flags
-from climatenerf.cluster.batch import Outcome, Task, run_batch
+from climatenerf.cluster.batch import Outcome, Task, earlier_outcomes, run_batch
 from climatenerf.cluster.table import write_table
-from climatenerf.cluster.workers import check_installed, parse_workers
+from climatenerf.cluster.workers import LOG, check_installed, parse_workers
 from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.locks import only_writer
 from climatenerf.core.parsing import read_toml
 
 OF_A_RUN = ("stylize", "render", "evaluate", "compare")
 """Verbs that read a run; a scene has a list of tables for each."""
-RESERVED = {"capture": "capture", "fit": "run", "logs": "logs"}
-"""Names in a scene's folder that tasks from lists cannot have."""
+TAKEN: tuple[str, ...] = ("capture", "fit", "run", "logs")
+"""Names in a scene's folder that tasks of lists cannot have."""
+TAKEN_BY_BATCH = ("table.csv", "table.html", LOG, ".lock")
+"""Names in the folder of the batch that scenes cannot have."""
+SET_BY_BATCH = ("out", "resume", "join", "part", "workers", "help")
+"""Flags that a batch gives itself, or that end a verb before its work is done."""
 MAX_TASKS = 10_000
 
 
@@ -63,27 +68,28 @@ class Batch:
 
 def run(options: Batch) -> int:
     """Run the tasks of a batch file, and print where the table of results is."""
-    workers = parse_workers(options.workers)
+    workers = None if options.workers is None else parse_workers(options.workers)
     if workers is not None:
         check_installed()
-    tasks = read_batch(options.file, options.out)
+    out = options.out.resolve()
+    tasks = read_batch(options.file, out)
     if options.dry_run:
         for task in tasks:
-            progress.result(f"climatenerf {' '.join(_quoted(word) for word in task.words)}")
+            progress.result(shlex.join(["climatenerf", *task.words]))
         return 0
-    title, outcomes = options.file.stem, {}
-    with only_writer(options.out), progress.Bar("batch", len(tasks)) as bar:
+    ended: dict[Task, Outcome] = {}
+    with only_writer(out), progress.Bar("batch", len(tasks)) as bar:
+        shown = earlier_outcomes(tasks)
 
         def report(task: Task, outcome: Outcome) -> None:
-            outcomes[task] = outcome
-            write_table(options.out, title, tasks, outcomes)
+            ended[task] = shown[task] = outcome
+            write_table(out, options.file.stem, tasks, shown)
             progress.say(line(task, outcome))
-            bar.update(len(outcomes))
+            bar.update(len(ended))
 
-        write_table(options.out, title, tasks, outcomes)
-        run_batch(tasks, options.out, workers, report)
+        run_batch(tasks, out, workers, report)
     progress.result(f"table: {options.out / 'table.html'}")
-    failed = sum(outcome.status == "failed" for outcome in outcomes.values())
+    failed = sum(outcome.status == "failed" for outcome in ended.values())
     if failed:
         raise UserError(
             f"{failed} of {len(tasks)} tasks have failed; {options.out / 'table.html'} shows why,"
@@ -125,14 +131,16 @@ def read_batch(path: Path, out: Path) -> list[Task]:
     tasks: list[Task] = []
     names: set[str] = set()
     for number, scene in enumerate(scenes, 1):
-        if ("photos" in scene) == ("capture" in scene):
+        if ("photos" in scene) == ("capture" in scene) or not _source(scene):
             raise UserError(
                 f'{where}, scene {number} needs either capture = "FOLDER" (photos with poses) or'
                 ' photos = "FOLDER" (without)'
             )
         name = _name(scene.get("name", Path(_source(scene)).name), f"{where}, scene {number}")
-        if name in names:
-            raise UserError(f"{where} has two scenes {name!r}; give each another name")
+        if name in names or name in TAKEN_BY_BATCH:
+            raise UserError(
+                f"{where} has two scenes {name!r}, or the name is reserved; give each another"
+            )
         names.add(name)
         tasks += _tasks(scene, name, defaults, path.resolve().parent, out.resolve(), where)
     if len(tasks) > MAX_TASKS:
@@ -165,7 +173,7 @@ def _tasks(
         source, needed = str(home / "capture"), ("capture",)
     yield task("fit", "run", ["fit", source], _table(scene, "fit", where), *needed)
     runs = {"fit": home / "run"}
-    taken = set(RESERVED) | set(RESERVED.values())
+    taken = set(TAKEN)
     for verb in OF_A_RUN:
         for entry in _list(scene, verb, where):
             title = _name(entry.get("name", verb), f"{where}, {verb}")
@@ -201,6 +209,8 @@ def flag_words(verb: str, flags: Mapping[str, Any], where: str) -> list[str]:
     repeated = _repeated(verb)
     words: list[str] = []
     for name, value in _flat(flags):
+        if name.replace("_", "-") in SET_BY_BATCH:
+            raise UserError(f"{where}: leave {name} out, which the batch decides")
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, bool):
             words.append(flag if value else f"--no-{flag[2:]}")
@@ -289,7 +299,8 @@ def _list(table: Mapping[str, Any], name: str, where: str) -> list[Mapping[str, 
 
 
 def _source(scene: Mapping[str, Any]) -> str:
-    return str(scene.get("capture", scene.get("photos", "")))
+    found = scene.get("capture", scene.get("photos"))
+    return found if isinstance(found, str) else ""
 
 
 def _name(value: object, where: str) -> str:
@@ -305,9 +316,3 @@ def _name(value: object, where: str) -> str:
             " spaces and hyphens"
         )
     return str(value)
-
-
-def _quoted(word: str) -> str:
-    import shlex
-
-    return shlex.quote(word)

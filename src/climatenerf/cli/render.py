@@ -102,11 +102,13 @@ def run(
         raise UserError(
             "--part renders frames and --join assembles them; render all parts, then use --join"
         )
-    workers = parse_workers(options.workers)
+    workers = None if options.workers is None else parse_workers(options.workers)
     if workers is not None and (part is not None or options.join or options.preview):
         raise UserError(
             "--workers renders all frames and joins them; leave --part, --join and --preview out"
         )
+    if workers is not None and options.device != "cpu":
+        raise UserError("--workers computes on the CPU; leave --device out")
     used = installed_effects() if effects is None else tuple(effects)
     film = None if options.weather is None else read_weather(options.weather, used)
     sections = {each.name: getattr(options, each.name) for each in used}

@@ -104,7 +104,7 @@ def run_batch(
 def _one_by_one(tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
     done: dict[tuple[str, str], Outcome] = {}
     for task in tasks:
-        outcome = run_task(task, *(done[task.scene, name] for name in task.needs))
+        outcome = run_task(task, [done[task.scene, name] for name in task.needs])
         done[task.scene, task.name] = outcome
         yield task, outcome
 
@@ -116,7 +116,7 @@ def _by(workers: Workers, tasks: Sequence[Task], out: Path) -> Iterator[tuple[Ta
         for number, task in enumerate(tasks):
             needed = [futures[task.scene, name] for name in task.needs]
             # Earlier scenes first, so that the table fills scene by scene.
-            future = client.submit(run_task, task, *needed, pure=False, priority=-number)
+            future = client.submit(run_on_worker, task, *needed, pure=False, priority=-number)
             futures[task.scene, task.name] = future
             of[future] = task
         titles = {future: task.title for future, task in of.items()}
@@ -124,12 +124,18 @@ def _by(workers: Workers, tasks: Sequence[Task], out: Path) -> Iterator[tuple[Ta
             yield of[future], outcome
 
 
-def run_task(task: Task, *needed: Outcome) -> Outcome:
+def run_on_worker(task: Task, *needed: Outcome) -> Outcome:
+    """Run a task with the threads that a worker has; see `run_task`."""
+    return run_task(task, needed, on_worker.own_threads())
+
+
+def run_task(task: Task, needed: Sequence[Outcome], threads: int | None = None) -> Outcome:
     """Run a task unless it is done, and record how it ended.
 
     Args:
         task: the task.
         needed: outcomes of the tasks that it needs, in their order.
+        threads: of its kernels; None: as many as there are cores.
 
     Raises:
         UserError: a log or a record cannot be written.
@@ -137,13 +143,13 @@ def run_task(task: Task, *needed: Outcome) -> Outcome:
     key = _key(task, needed)
     if any(outcome.status != "done" for outcome in needed):
         return Outcome("skipped", 0.0, "what it needs has failed", key)
-    earlier = recorded(task)
-    if earlier is not None and (earlier.status, earlier.key) == ("done", key) and task.out.exists():
+    earlier = recorded(task, key)
+    if earlier is not None and earlier.status == "done" and task.out.exists():
         return earlier
     words = [*task.words]
     if words[0] == "fit" and (task.out / "config.json").is_file():
         words.append("--resume")
-    status, seconds, message = on_worker.run_verb(words, task.log, task.folder)
+    status, seconds, message = on_worker.run_verb(words, task.log, task.folder, threads)
     outcome = Outcome("done" if status == 0 else "failed", seconds, message, key)
     now = datetime.now(UTC).isoformat(timespec="seconds")
     about = {"command": words, "exit_status": status, "ended": now, "schema_version": 1}
@@ -151,13 +157,30 @@ def run_task(task: Task, *needed: Outcome) -> Outcome:
     return outcome
 
 
-def recorded(task: Task) -> Outcome | None:
-    """Return how an earlier run of a task ended; None if there is no sound record."""
+def earlier_outcomes(tasks: Sequence[Task]) -> dict[Task, Outcome]:
+    """Return how tasks ended in an earlier batch, as far as neither they nor what they need differ.
+
+    Args:
+        tasks: in an order in which each comes after those that it needs.
+    """
+    found: dict[Task, Outcome] = {}
+    by_name: dict[tuple[str, str], Outcome] = {}
+    for task in tasks:
+        needed = [by_name.get((task.scene, name)) for name in task.needs]
+        known = [outcome for outcome in needed if outcome is not None]
+        outcome = recorded(task, _key(task, known)) if len(known) == len(needed) else None
+        if outcome is not None:
+            found[task] = by_name[task.scene, task.name] = outcome
+    return found
+
+
+def recorded(task: Task, key: str) -> Outcome | None:
+    """Return how an earlier run of a task ended; None if it had another key, or has no record."""
     with contextlib.suppress(UserError, OSError, KeyError, TypeError, ValueError):
         found = read_json(task.log.with_suffix(".json"))
         status, message = found["status"], str(found["message"])
-        if status in ("done", "failed"):
-            return Outcome(status, float(found["seconds"]), message, str(found["key"]), True)
+        if status in ("done", "failed") and found["key"] == key:
+            return Outcome(status, float(found["seconds"]), message, key, True)
     return None
 
 

@@ -1,7 +1,7 @@
 """The frames of one movie on several workers.
 
 This process prepares light, waves, ground and snow once and saves them beside the frames; the
-workers read that. Which frames are finished is read from the disk, never from what a worker says.
+workers read that. Which frames are finished is read from the disk, never from the result of a task.
 """
 
 import functools
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from climatenerf.cluster import on_worker
 from climatenerf.cluster.on_worker import Saved
-from climatenerf.cluster.workers import Workers, connected, logger, results
+from climatenerf.cluster.workers import Workers, connected, logger, parse_workers, results
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import write_bytes
 from climatenerf.output import job as jobs
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from climatenerf.output.job import RenderFrames, RenderJob
 
 ROUNDS = 3
-"""How often frames are asked for that a worker has called finished and that are not on the disk."""
+"""How often frames are rendered that are not on the disk although a worker has finished them."""
 
 
 def renderer(workers: Workers) -> "RenderFrames":
@@ -35,7 +35,7 @@ def renderer(workers: Workers) -> "RenderFrames":
     Args:
         workers: how many processes of this machine, or the address of a scheduler.
     """
-    return functools.partial(_render_frames, workers)
+    return functools.partial(_render_frames, parse_workers(str(workers)))
 
 
 def _render_frames(
@@ -67,7 +67,8 @@ def _render_frames(
         jobs.claim(job, out)
         with render_folder.unfinished_files(out) as scratch:
             data = pickle.dumps((job, source), pickle.HIGHEST_PROTOCOL)
-            prepared = Saved(scratch.resolve() / "prepared", hashlib.sha256(data).hexdigest())
+            digest = hashlib.sha256(data).hexdigest()
+            prepared = Saved(scratch.resolve() / "prepared", digest, on_worker.versions())
             write_bytes(prepared.path, data)
             del data
             report("frames", (len(indices) - len(missing)) / len(indices))
@@ -78,7 +79,7 @@ def _render_frames(
                 if not missing:
                     return
     raise UserError(
-        f"workers call {len(missing)} frames finished that are not in {out}; check that all"
+        f"{len(missing)} frames that workers have finished are not in {out}; check that all"
         " machines share the folder, and run it again"
     )
 

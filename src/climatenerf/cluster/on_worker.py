@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,14 +24,25 @@ if TYPE_CHECKING:
 THREADS = "NUMBA_NUM_THREADS"
 """Environment variable with the number of threads of a worker's kernels; 1 if it is not set."""
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # a forked child may not load it
 
 
 @dataclass(frozen=True)
 class Saved:
-    """A file, and what it must hold."""
+    """A pickled job with its frame source.
+
+    Attributes:
+        path: The file.
+        sha256: What it must hold.
+        versions: What `versions` gave where it was written.
+    """
 
     path: Path
     sha256: str
+    versions: dict[str, str]
+
+    def __hash__(self) -> int:
+        return hash(self.sha256)
 
 
 def versions() -> dict[str, str]:
@@ -49,6 +60,22 @@ def versions() -> dict[str, str]:
         "NumPy": numpy.__version__,
         "Numba": numba.__version__,
     }
+
+
+def different_version(theirs: Mapping[str, str], wanted: Mapping[str, str]) -> str | None:
+    """Return the sentence for a worker with other versions; None if all are the same."""
+    for name, version in wanted.items():
+        if theirs[name] != version:
+            return (
+                f"a worker has {name} {theirs[name]} and the program has {version}; install the"
+                " same versions on all machines"
+            )
+    return None
+
+
+def own_threads() -> int:
+    """Return the number of threads of a worker's kernels."""
+    return int(os.environ.get(THREADS, 1))
 
 
 def holds(path: Path, content: str) -> bool:
@@ -82,15 +109,19 @@ def render_frame(out: Path, prepared: Saved, index: int) -> tuple[float, str]:
 def unpickled(prepared: Saved) -> "tuple[RenderJob, FrameSource]":
     """Return what another process has prepared; a worker reads it once.
 
-    A pickle can run any code, so only one with the hash that came with the task is unpickled.
+    A pickle can run any code, so only one with the hash that came with the task is unpickled. A
+    worker may have come after the others were checked, so its versions are checked here.
 
     Raises:
-        UserError: the file cannot be read, or holds something else.
+        UserError: the file cannot be read, or holds something else, or versions differ.
     """
     import numba
     import torch
 
-    threads = min(int(os.environ.get(THREADS, 1)), numba.get_num_threads())
+    difference = different_version(versions(), prepared.versions)
+    if difference is not None:
+        raise UserError(difference)
+    threads = min(own_threads(), numba.get_num_threads())
     numba.set_num_threads(threads)
     torch.set_num_threads(threads)
     try:
@@ -105,19 +136,22 @@ def unpickled(prepared: Saved) -> "tuple[RenderJob, FrameSource]":
     return pickle.loads(data)
 
 
-def run_verb(words: Sequence[str], log: Path, folder: Path) -> tuple[int, float, str]:
+def run_verb(
+    words: Sequence[str], log: Path, folder: Path, threads: int | None
+) -> tuple[int, float, str]:
     """Run a verb of the command line in a process of its own.
 
     Args:
         words: verb and flags.
         log: file that receives all that the verb prints.
         folder: working folder of the verb.
+        threads: of its kernels; None: as many as there are cores.
 
     Returns:
-        Exit status, seconds, and the last line that it printed.
+        Exit status, seconds, and the last line that it printed, or the signal that ended it.
     """
     begin = time.perf_counter()
-    environment = {**os.environ, THREADS: os.environ.get(THREADS, "1")}
+    environment = {**os.environ} | ({} if threads is None else {THREADS: str(threads)})
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as file:
@@ -134,12 +168,16 @@ def run_verb(words: Sequence[str], log: Path, folder: Path) -> tuple[int, float,
             ).returncode
     except OSError as error:
         raise explain(error, log) from error
-    return status, time.perf_counter() - begin, last_line(log)
+    message = last_line(log)
+    if status < 0:
+        message = f"ended by signal {-status}; if nobody sent it, the memory was not enough"
+    return status, time.perf_counter() - begin, message
 
 
 def _end_with_parent() -> None:
     """Ask the system to stop this process, as `kill` does, when the worker ends in any way."""
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    if _LIBC is not None:
+        _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def last_line(path: Path) -> str:

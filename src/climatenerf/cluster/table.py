@@ -4,6 +4,7 @@ import contextlib
 import csv
 import html
 import io
+import urllib.parse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,9 @@ def _row(out: Path, task: Task, outcome: Outcome | None) -> dict[str, Any]:
     if outcome.status == "done":
         found = next((task.out / n for n in SHOWN if (task.out / n).is_file()), task.out)
         row["result"] = found.relative_to(out).as_posix()
-    if task.words[0] == "fit":
+    if outcome.status == "failed":
+        row["result"] = task.log.relative_to(out).as_posix()
+    if task.words[0] == "fit" and outcome.status == "done":
         with contextlib.suppress(UserError, OSError):
             metrics = read_json(task.out / "metrics.json")
             row |= {name: _rounded(metrics.get(name)) for name in SCORES}
@@ -102,16 +105,18 @@ _STATUSES = ("done", "failed", "skipped", "waiting")
 def _html_row(row: Mapping[str, Any]) -> str:
     status = row["status"]
     seconds = row["seconds"]
-    time = "" if seconds == "" else f"{seconds // 60:.0f}:{seconds % 60:02.0f}"
+    time = "" if seconds == "" else "{}:{:02}".format(*divmod(round(seconds), 60))
     numbers = [time, _digits(row["psnr"], 2), _digits(row["psnr_cc"], 2), _digits(row["ssim"], 3)]
     cells = [f"<td>{html.escape(row[name])}</td>" for name in ("scene", "task")]
     cells.append(f'<td class="{status}">{status}</td>')
     cells += [f'<td class="number">{text}</td>' for text in (*numbers, row["steps"])]
+    shown = ""
     if row["result"]:
-        link = html.escape(row["result"])
-        cells.append(f'<td><a href="{link}">{link}</a></td>')
-    else:
-        cells.append(f"<td>{html.escape(row['message']) if status == 'failed' else ''}</td>")
+        link = urllib.parse.quote(row["result"], errors="replace")
+        shown = f'<a href="{link}">{html.escape(row["result"])}</a>'
+    if status == "failed":
+        shown = f"{html.escape(row['message'])} ({shown})"
+    cells.append(f"<td>{shown}</td>")
     return f"<tr>{''.join(cells)}</tr>"
 
 

@@ -4,18 +4,21 @@ Processes of this machine speak TLS with keys of their own on the loopback inter
 other user of the machine can give them work. What protects a real cluster is its own matter.
 """
 
+import asyncio
 import contextlib
+import itertools
 import logging
 import os
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from climatenerf.cluster import on_worker
 from climatenerf.core.errors import UserError, explain, one_line
+from climatenerf.core.locks import LOCK
 from climatenerf.core.storage import make_folder, owned_name, write_bytes
 
 if TYPE_CHECKING:
@@ -35,6 +38,8 @@ SETTINGS = {
 ALONE = 60.0
 """Seconds without any worker after which the program gives up."""
 POLL = 1.0
+WINDOW = 1024
+SET_BY_ENGINE = ("PYTHONHASHSEED", "__DASK_PARENT_PID")
 LOG = "workers.log"
 LINE = "%(asctime)s %(process)d %(name)s %(levelname)s: %(message)s"
 
@@ -44,14 +49,12 @@ Workers = int | str
 """How many processes of this machine, or the address of a scheduler."""
 
 
-def parse_workers(text: str | None) -> Workers | None:
-    """Return what a text such as "2" or "tcp://10.0.0.1:8786" means; None stays None.
+def parse_workers(text: str) -> Workers:
+    """Return what a text such as "2" or "tcp://10.0.0.1:8786" means.
 
     Raises:
         UserError: it is neither a number from 1 to 256 nor an address.
     """
-    if text is None:
-        return None
     text = text.strip()
     if text.isdecimal() and len(text) < 5 and 1 <= int(text) <= MAX_LOCAL:
         return int(text)
@@ -98,19 +101,26 @@ def connected(workers: Workers, folder: Path) -> Iterator["Client"]:
     check_installed()
     import dask.config
 
-    created, passed = not folder.exists(), False
     log = folder.resolve() / LOG
+    missing = [path for path in (log, *log.parents) if not path.exists()]
     opened = _processes(workers, log) if isinstance(workers, int) else _scheduler(workers)
     try:
         with _logged(log), dask.config.set(SETTINGS), opened as client:
             check_workers(client, folder)
-            passed = True
             yield client
-    finally:
-        if created and not passed:
-            with contextlib.suppress(OSError):
-                log.unlink()
-                folder.rmdir()
+    except UserError:
+        _remove_new(missing)
+        raise
+
+
+def _remove_new(paths: list[Path]) -> None:
+    """Remove a log and folders that were made for work that has not begun, the innermost first."""
+    with contextlib.suppress(OSError):
+        for path in paths:
+            if path.is_dir():
+                path.rmdir()  # refuses one that holds frames or results
+            elif {other.name for other in path.parent.iterdir()} <= {LOG, LOCK}:
+                path.unlink()
 
 
 @contextlib.contextmanager
@@ -122,6 +132,7 @@ def _processes(count: int, log: Path) -> Iterator["Client"]:
     names = on_worker.THREADS, "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
     environment = dict.fromkeys(names, threads) | {"DASK_LOGGING": repr(_logging(log))}
     with (
+        _restored({*environment, *SET_BY_ENGINE}),  # it sets all in this process as well
         dask.config.set({"distributed.nanny.pre-spawn-environ": environment}),
         LocalCluster(
             n_workers=count,
@@ -133,10 +144,25 @@ def _processes(count: int, log: Path) -> Iterator["Client"]:
             dashboard_address="127.0.0.1:0",
             memory_limit=0,  # the system has one
             silence_logs=False,
+            preload=["climatenerf.cluster.ignore_ctrl_c"],
         ) as cluster,
         Client(cluster) as client,
     ):
         yield client
+
+
+@contextlib.contextmanager
+def _restored(names: Iterable[str]) -> Iterator[None]:
+    """Give environment variables the values that they had before, at the end."""
+    before = {name: os.environ.get(name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def _cores() -> int:
@@ -151,7 +177,13 @@ def _scheduler(address: str) -> Iterator["Client"]:
     from distributed import Client
 
     try:
+        asyncio.run(asyncio.wait_for(_identity(address), CONNECT))
         client = Client(address, timeout=CONNECT)
+    except TypeError as error:  # an address of TLS without certificates
+        raise UserError(
+            f"{address} needs certificates; name them in Dask's configuration, under"
+            " distributed.comm.tls"
+        ) from error
     except (OSError, ValueError, RuntimeError) as error:  # TimeoutError is an OSError
         raise UserError(
             f"no Dask scheduler answers at {address}; start one with `dask scheduler`, and give the"
@@ -179,11 +211,13 @@ def results(
     """
     from distributed import wait
 
-    waiting, last_seen = set(titles), time.monotonic()
+    waiting, last_seen = dict(titles), time.monotonic()
     try:
         while waiting:
             try:
-                ended = wait(list(waiting), timeout=POLL, return_when="FIRST_COMPLETED").done
+                # Work begins in the order in which it was given; to wait for all takes longer.
+                first = list(itertools.islice(waiting, WINDOW))
+                ended = wait(first, timeout=POLL, return_when="FIRST_COMPLETED").done
             except TimeoutError:
                 last_seen = _last_seen(client, last_seen)
                 continue
@@ -198,7 +232,8 @@ def results(
                     if future.status in ("lost", "pending"):
                         continue
                     raise _failure(error, titles[future], folder / LOG) from error
-                waiting.discard(future)
+                del waiting[future]
+                last_seen = time.monotonic()
                 yield future, result
     finally:
         with contextlib.suppress(OSError, RuntimeError):  # the scheduler may have ended
@@ -227,7 +262,9 @@ def _last_seen(client: "Client", before: float) -> float:
 
 def _failure(error: Exception, title: str, log: Path) -> UserError:
     """Return the sentence for a piece of work that has failed."""
-    if isinstance(error, CancelledError | OSError):
+    from distributed.comm import CommClosedError
+
+    if isinstance(error, CancelledError | CommClosedError):
         return UserError(
             "the scheduler has ended or has dropped the work; what is finished stays, and the same"
             " command goes on"
@@ -240,6 +277,18 @@ def _failure(error: Exception, title: str, log: Path) -> UserError:
             f" workers, or smaller pictures, and see {log}"
         )
     return UserError(f"{title} has failed on a worker ({one_line(repr(error), 300)}); see {log}")
+
+
+async def _identity(address: str) -> None:
+    """Ask a scheduler for its identity; another program may accept a connection and not answer."""
+    from distributed import Security
+    from distributed.core import rpc
+
+    scheduler = rpc(address, connection_args=Security().get_connection_args("client"))
+    try:
+        await scheduler.identity()
+    finally:
+        await scheduler.close_rpc()
 
 
 def check_workers(client: "Client", folder: Path) -> None:
@@ -263,12 +312,9 @@ def check_workers(client: "Client", folder: Path) -> None:
             )
     own = on_worker.versions()
     for worker, theirs in _asked(client, on_worker.versions).items():
-        for name, version in own.items():
-            if theirs[name] != version:
-                raise UserError(
-                    f"the worker {worker} has {name} {theirs[name]} and this program has {version};"
-                    " install the same versions on all machines"
-                )
+        difference = on_worker.different_version(theirs, own)
+        if difference is not None:
+            raise UserError(f"{worker}: {difference}")
     token, content = make_folder(folder) / f".{owned_name()}", secrets.token_hex(8)
     write_bytes(token, content.encode())
     try:
@@ -348,7 +394,7 @@ def _logging(path: Path) -> dict:
 
 
 def _gather_logs(client: "Client") -> None:
-    """Log what the workers of other machines remember of their logs."""
+    """Log the last lines of the workers on other machines."""
     with contextlib.suppress(Exception):  # a log is no reason to fail
         logs: Any = client.get_worker_logs()
         for worker, lines in logs.items():

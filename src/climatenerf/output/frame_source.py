@@ -83,6 +83,9 @@ def frame_source(
         kept,
         job.style,
     )
+    session.world(
+        float(times[0])
+    )  # prepares what is put off until it is seen, such as light probes
     return functools.partial(_render, job, session)
 
 
