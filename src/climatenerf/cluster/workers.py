@@ -262,7 +262,7 @@ def _last_seen(client: "Client", before: float) -> float:
 
 def _failure(error: Exception, title: str, log: Path) -> UserError:
     """Return the sentence for a piece of work that has failed."""
-    from distributed.comm import CommClosedError
+    from distributed.comm.core import CommClosedError
 
     if isinstance(error, CancelledError | CommClosedError):
         return UserError(
