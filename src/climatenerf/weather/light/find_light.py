@@ -60,7 +60,6 @@ MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
 CLOUDS = 60  # independent patches of the sky that photos show
 SKY_ERROR = 0.08  # of log radiance, by clouds
 GROUND_ALBEDO, ALBEDO_SPREAD = 0.15, 0.5  # asphalt and grass .1, soil .15, concrete .3; of its log
-HUE_SPREAD = 0.2  # of the log of a channel's share of the luma, from the horizon to the zenith
 RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
 TYPICAL_WIDTH, WIDTH_SPREAD = np.radians(20.0), 0.5  # of a sun behind thin cloud; of its log
 WHITE = np.ones(3)
@@ -439,9 +438,9 @@ def fit_sky(
     grid = grid[grid[:, 2] > 0]
     share = np.sqrt(CLOUDS / len(d)) / SKY_ERROR
 
-    def model(p: np.ndarray, at: np.ndarray, with_lobe: bool = lobe) -> np.ndarray:
+    def model(p: np.ndarray, at: np.ndarray) -> np.ndarray:
         base = np.exp(p[0]) * (1 + (np.exp(p[1]) - 1) * np.clip(at[:, 2], 0, 1))
-        if not with_lobe:
+        if not lobe:
             return base
         angle = np.arccos(np.clip(at @ _direction(p[2], p[3]), -1, 1))
         return base + np.exp(p[5]) * np.exp(-((angle / np.exp(p[4])) ** 2))
@@ -471,54 +470,18 @@ def fit_sky(
         best = found if best is None or found.cost < best.cost else best
     assert best is not None
     p = best.x
-    sun = _direction(p[2], p[3]) if lobe else None
-    # Sunlight through thin cloud is white.
-    glow = model(p, d) - model(p, d, with_lobe=False)
-    horizon, zenith = _base_colours(d, rgb, p[0], p[1], glow, share)
-    if sun is None:
+    # The base's colour is that of the sky where it is darker than white.
+    plain = (rgb.max(-1) < CLIPPED) if (rgb.max(-1) < CLIPPED).any() else np.ones(len(rgb), bool)
+    colour = np.median(rgb[plain] / brightness[plain, None], axis=0)
+    zenith_colour = colour / (colour @ LUMA)
+    horizon = np.exp(p[0]) * zenith_colour
+    zenith = np.exp(p[0] + p[1]) * zenith_colour
+    if not lobe:
         return SkyModel(horizon, zenith, None, 0.0, np.zeros(3))
-    return SkyModel(horizon, zenith, sun, float(np.exp(p[4])), np.exp(p[5]) * WHITE)
-
-
-def _base_colours(
-    d: Float[np.ndarray, "n 3"],
-    rgb: Float[np.ndarray, "n 3"],
-    horizon: float,
-    ratio: float,
-    glow: Float[np.ndarray, "n"],
-    share: float,
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the colours of the base at the horizon and at the zenith, of given luma.
-
-    All shown sky counts, clipped at white in each channel as in the photos: what is not clipped is
-    bluer than the rest.
-
-    Args:
-        d: directions of sky in the photos.
-        rgb: what they show there, at most 1.
-        horizon: log luma of the base at the horizon.
-        ratio: log of its luma at the zenith over that.
-        glow: radiance of the lobe there.
-        share: weight of a direction.
-    """
-    up = np.clip(d[:, 2], 0, 1)
-
-    def radiance(log_ends: np.ndarray) -> np.ndarray:
-        low, high = np.exp(horizon + log_ends[0]), np.exp(horizon + ratio + log_ends[1])
-        return low + (high - low) * up + glow
-
-    def residuals(log_ends: np.ndarray, channel: int) -> np.ndarray:
-        shown = np.log(np.minimum(radiance(log_ends), 1.0)) - np.log(rgb[:, channel])
-        change = (log_ends[1] - log_ends[0]) / HUE_SPREAD
-        return np.append(share * shown, [change, log_ends[0]])
-
-    rgb = np.maximum(rgb, DARK)
-    ends = [
-        optimize.least_squares(residuals, np.zeros(2), args=(c,), loss="soft_l1").x
-        for c in range(3)
-    ]
-    low, high = np.exp(np.array(ends)).T
-    return np.exp(horizon) * low / (low @ LUMA), np.exp(horizon + ratio) * high / (high @ LUMA)
+    # Sunlight through thin cloud is white.
+    return SkyModel(
+        horizon, zenith, _direction(p[2], p[3]), float(np.exp(p[4])), np.exp(p[5]) * WHITE
+    )
 
 
 def _direction(elevation: float, azimuth: float) -> Float[np.ndarray, "3"]:
