@@ -10,6 +10,7 @@ import pytest
 from support.command_line import STREET, error_message, run_cli
 
 from climatenerf.cli.batch import flag_words, read_batch
+from climatenerf.cluster import workers
 from climatenerf.cluster.batch import Task, run_batch
 from climatenerf.cluster.on_worker import run_verb
 
@@ -162,6 +163,7 @@ def test_the_table_shows_what_failed_and_escapes_it(tmp_path, capsys, monkeypatc
     page = (out / "table.html").read_text()
     assert "a &amp; b" in page and "a & b" not in page and "1 failed, 1 skipped" in page
     assert 'href="a%20%26%20b/logs/fit.log"' in page
+    monkeypatch.setattr(workers, "CONNECT", 1.0)
     address = "tcp://127.0.0.1:9"  # a refused command leaves the table
     said = error_message(capsys, "batch", "batch.toml", "-o", out, "--workers", address)
     assert "no Dask scheduler answers" in said and (out / "table.html").read_text() == page

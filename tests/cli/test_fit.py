@@ -65,13 +65,17 @@ def contents(folder):
         (["--downscale", "6", "--holdout", "0"], "other photos"),
     ],
 )
-def test_a_resume_with_other_settings_is_refused(run_folder, capsys, monkeypatch, args, expected):
+def test_a_resume_with_other_settings_is_refused(
+    run_folder, tmp_path, capsys, monkeypatch, args, expected
+):
     settings = FitSettings(size=FEW_ROWS)
     monkeypatch.setattr("climatenerf.cli.fit.settings_of", lambda preset, device: settings)
-    before = contents(run_folder)
-    message = error_message(capsys, "fit", STREET, "-o", run_folder, "--resume", *args)
+    own = tmp_path / "run"  # renders of other processes keep what they find in the shared one
+    shutil.copytree(run_folder, own)
+    before = contents(own)
+    message = error_message(capsys, "fit", STREET, "-o", own, "--resume", *args)
     assert expected in message
-    assert contents(run_folder) == before
+    assert contents(own) == before
 
 
 def test_a_run_of_another_preset_is_refused_before_labels_are_made(run_folder, capsys, monkeypatch):
