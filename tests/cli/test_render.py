@@ -400,7 +400,13 @@ def test_workers_end_with_the_command(run_folder, tmp_path, number):
     flags = ["--workers", "2", "--frames", "400", "--size", "96x54", "-o", str(out)]
     command = [sys.executable, "-m", "climatenerf", "render", str(run_folder), *flags]
     with (tmp_path / "err").open("wb") as err:
-        child = subprocess.Popen(command, stderr=err, start_new_session=True)
+        child = subprocess.Popen(
+            command,
+            stderr=err,
+            start_new_session=True,
+            # A shell lets jobs in the background ignore it, and their children inherit that.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
     deadline = time.monotonic() + 120
     while not list(out.glob("frames/*.png")) and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -1,5 +1,6 @@
 """Light in a yard photographed in the sun: found, replaced, and changed by weather."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -129,6 +130,25 @@ def test_exposure_is_kept_on_average_and_ev_doubles_it(overcast):
     assert float(twice.field.sky(up)[0, 0] / overcast.world(0.0).field.sky(up)[0, 0]) == (
         pytest.approx(2.0, rel=0.01)
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "table",
+    [
+        {"smog": {"visibility": "200 m", "light": "scene"}},
+        {"snow": {"depth": "10 cm"}, "season": {"kind": "winter"}},
+        {"sky": {"kind": "clear"}, "smog": {"visibility": "200 m", "light": "scene"}},
+    ],
+)
+def test_light_can_be_sent_to_another_process(table):
+    here = session(sunlit_yard(), **table)
+    there = pickle.loads(pickle.dumps((here.world(0.0).light, here)))
+    light, again = here.world(0.0).light, there[1].world(0.0).light
+    x, up = ACROSS[:5], torch.tensor([[0.0, 0.0, 1.0]]).expand(5, 3)
+    for other in (there[0], again):
+        assert torch.equal(other.irradiance(x, up), light.irradiance(x, up))
+        assert torch.equal(other.radiance(up), light.radiance(up))
 
 
 @pytest.mark.slow

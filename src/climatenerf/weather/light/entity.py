@@ -18,7 +18,7 @@ from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.field.capabilities import NORMALS
 from climatenerf.field.normals import normals_at
-from climatenerf.field.protocol import device_of, observed
+from climatenerf.field.protocol import RadianceField, device_of, observed
 from climatenerf.weather.light import skies
 from climatenerf.weather.light.captured import (
     CapturedLight,
@@ -31,6 +31,7 @@ from climatenerf.weather.light.probes import GatheredLight, gather
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo, estimate
 from climatenerf.weather.light.relit_field import RelitField
 from climatenerf.weather.light.scene_light import (
+    Radiance,
     SceneLight,
     Surfaces,
     light_of_photos,
@@ -114,12 +115,8 @@ class LightEntity:
             captured = replace(captured, sun=sun)
         key = () if captured.sun is None else tuple(captured.sun.tolist())
         if key not in self._lights:
-            field, appearance = self._given.field, self._given.appearance
-
-            def radiance(d: Tensor) -> Tensor:
-                return captured.sky(d, field.sky(d, appearance))
-
-            device = device_of(field)
+            field, device = self._given.field, device_of(self._given.field)
+            radiance = functools.partial(_photographed_sky, captured, field, self._given.appearance)
             shadow, strength = None, torch.zeros(3, device=device)
             if captured.hard and captured.sun is not None:
                 shadow = self._sun_map(captured.sun)
@@ -218,7 +215,7 @@ class LightEntity:
             """The new sky and sun, klx times a gain."""
             return replace(
                 old,
-                radiance=lambda d: gain * sky.radiance(d),
+                radiance=functools.partial(_brighter, gain, sky.radiance),
                 sun_irradiance=gain * direct,
                 sun=shadow,
                 captured=None,
@@ -337,12 +334,30 @@ def below_smog(weather: Weather, light: SceneLight) -> SceneLight:
     passed = sun_transmittance(weather.smog, sigma, math.asin(sine))
     beam = light.sun_irradiance
     kept = beam * beam.new_tensor(passed)
-    spread = (beam - kept) * sine / math.pi
-
-    def radiance(d: Tensor) -> Tensor:
-        return light.radiance(d) + spread
-
+    radiance = functools.partial(_lighter, light.radiance, (beam - kept) * sine / math.pi)
     return replace(light, radiance=radiance, sun_irradiance=kept, captured=None)
+
+
+# Skies are sent to other processes with the light: no closures, which cannot be pickled.
+
+
+def _photographed_sky(
+    captured: CapturedLight,
+    field: RadianceField,
+    appearance: Float[Tensor, "1 e"] | None,
+    d: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n 3"]:
+    return captured.sky(d, field.sky(d, appearance))
+
+
+def _brighter(gain: float, sky: Radiance, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    return gain * sky(d)
+
+
+def _lighter(
+    sky: Radiance, spread: Float[Tensor, "3"], d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    return sky(d) + spread
 
 
 def _whiteness(weather: Weather) -> tuple[float, ...]:

@@ -1,5 +1,6 @@
 """The sky of a season: part of the photographed sky, and of its sun, gives way to it."""
 
+import functools
 import math
 from dataclasses import replace
 
@@ -7,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from climatenerf.core.colour import luma
-from climatenerf.weather.light.scene_light import SceneLight
+from climatenerf.weather.light.scene_light import Radiance, SceneLight
 from climatenerf.weather.season.palettes import palettes_of
 from climatenerf.weather.season.parameters import Season
 from climatenerf.weather.style import SkyPalette, Style
@@ -41,10 +42,17 @@ def under_season(season: Season, style: Style | None, light: SceneLight) -> Scen
     whole = math.pi * (1 + palette.gradient * 2 / 3)
     level = float(luma(light.open_irradiance())) / whole
     colour = light.sun_irradiance.new_tensor(palette.colour) * level
-
-    def radiance(d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        height = d[:, 2:].clamp_min(0)
-        return (1 - share) * light.radiance(d) + share * colour * (1 + palette.gradient * height)
-
+    radiance = functools.partial(_mixed, light.radiance, share, colour, palette.gradient)
     beam = (1 - share) * light.sun_irradiance
     return replace(light, radiance=radiance, sun_irradiance=beam, captured=None)
+
+
+def _mixed(
+    sky: Radiance,
+    share: float,
+    colour: Float[Tensor, "3"],
+    gradient: float,
+    d: Float[Tensor, "n 3"],
+) -> Float[Tensor, "n 3"]:
+    height = d[:, 2:].clamp_min(0)
+    return (1 - share) * sky(d) + share * colour * (1 + gradient * height)
