@@ -13,6 +13,8 @@ MIN_TAU = 1e-3
 
 COMPLETED = -2
 """Id of samples on ground that no photo shows; see `render.completed_ground`."""
+PLACED = -3
+"""Id of samples on objects that were put into the scene; see `render.placed_objects`."""
 
 
 @dataclass

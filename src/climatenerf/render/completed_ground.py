@@ -18,18 +18,17 @@ from climatenerf.core.classes import SOLID, TERRAIN, UNKNOWN
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.samples import COMPLETED, Samples
 from climatenerf.field.capabilities import COMPLETES
+from climatenerf.field.inserted import NO_ID, OPTICAL_DEPTH, with_surface
 from climatenerf.field.protocol import observed
 from climatenerf.field.wrapped import WrappedField
-from climatenerf.ops import compositing, heightfield
+from climatenerf.ops import heightfield
 from climatenerf.ops.heightfield_reference import bilinear
 from climatenerf.scene.terrain import Terrain, nearest_known
 
 THICKNESS = 0.04  # m, of the completed ground
-OPTICAL_DEPTH = 14.0  # across it: 1e-6 of the light passes
 ON_GROUND = 0.05  # m; a position this near to the completed ground has its colour
 DROP = 0.1  # m, by which the raster passes below the edge of the ground that the field holds
 OVERLAP = 3  # nodes
-NO_ID = -1  # of samples of a field that gives none
 BRIDGED = 1.5  # m into a gap of the ground, up to which the terrain is used
 SMOOTHING = 20  # steps of diffusion at each level of a continuation
 
@@ -155,19 +154,7 @@ class CompletedField(WrappedField):
         )
         if not hit.numel():
             return inner
-        counts = torch.zeros(t.shape[0] + 1, dtype=torch.long, device=t.device)
-        counts[hit + 1] = 1
-        own = counts.cumsum(0)
-        order, offsets = compositing.merge_order(inner.t, inner.offsets, t[hit], own)
-        extent = torch.full_like(t[hit], THICKNESS)
-        values = {
-            "t": (inner.t, t[hit]),
-            "dt": (inner.dt, extent),
-            "sigma": (inner.sigma, OPTICAL_DEPTH / extent),
-        }
-        ids = order.new_full(inner.t.shape, NO_ID) if inner.ids is None else inner.ids
-        ids = torch.cat([ids, ids.new_full(hit.shape, COMPLETED)])[order]
-        return Samples(offsets, **{k: torch.cat(v)[order] for k, v in values.items()}, ids=ids)
+        return with_surface(inner, t, hit, THICKNESS, COMPLETED)
 
     def colour(
         self,
