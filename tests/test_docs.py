@@ -34,6 +34,8 @@ VERBS = (
     "verify",
     "study",
     "batch",
+    "page",
+    "report",
     "export",
     "demo",
 )

@@ -28,10 +28,11 @@ MAY_IMPORT = {
     "styling": BELOW_STUDIES,
     "studies": BELOW_STUDIES | {"styling"},
     "cluster": BELOW_STUDIES,
+    "page": BELOW_STUDIES | {"studies"},
     "extend": BELOW_RENDER,
     "api": BELOW_STUDIES | {"studies", "styling", "sfm", "perception", "cluster"},
     "cli": BELOW_STUDIES
-    | {"studies", "styling", "sfm", "perception", "cluster", "verification", "api"},
+    | {"studies", "styling", "sfm", "perception", "cluster", "page", "verification", "api"},
     "__main__": {"cli"},
 }
 
