@@ -34,6 +34,7 @@ VERBS = (
     "verify",
     "study",
     "batch",
+    "view",
     "page",
     "report",
     "export",

@@ -29,10 +29,21 @@ MAY_IMPORT = {
     "studies": BELOW_STUDIES | {"styling"},
     "cluster": BELOW_STUDIES,
     "page": BELOW_STUDIES | {"studies"},
+    "viewer": BELOW_STUDIES | {"studies", "page"},
     "extend": BELOW_RENDER,
     "api": BELOW_STUDIES | {"studies", "styling", "sfm", "perception", "cluster"},
     "cli": BELOW_STUDIES
-    | {"studies", "styling", "sfm", "perception", "cluster", "page", "verification", "api"},
+    | {
+        "studies",
+        "styling",
+        "sfm",
+        "perception",
+        "cluster",
+        "page",
+        "viewer",
+        "verification",
+        "api",
+    },
     "__main__": {"cli"},
 }
 

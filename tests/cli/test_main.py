@@ -88,8 +88,8 @@ def test_missing_and_unknown_verbs_are_refused(capsys):
     assert capsys.readouterr().err == error_message
     assert cli.main(["xyzzy"]) == 2
     assert (
-        "use one of capture, check, fit, stylize, render, page, report, evaluate, compare, verify,"
-        " study, batch, export, demo" in capsys.readouterr().err
+        "use one of capture, check, fit, stylize, render, view, page, report, evaluate, compare,"
+        " verify, study, batch, export, demo" in capsys.readouterr().err
     )
 
 

@@ -11,8 +11,12 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 
 @contextlib.contextmanager
-def chromium() -> Iterator[Any]:
-    """Start the system's Chromium by playwright; skip the test where one of them is missing."""
+def chromium(*flags: str) -> Iterator[Any]:
+    """Start the system's Chromium by playwright; skip the test where one of them is missing.
+
+    Args:
+        flags: of its command line.
+    """
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="needs playwright (make setup installs it)"
     )
@@ -21,6 +25,6 @@ def chromium() -> Iterator[Any]:
         pytest.skip("needs Chromium, such as `apt-get install chromium`")
     with playwright.sync_playwright() as started:
         # Without the sandbox it starts as root and in containers; it opens our own page alone.
-        browser = started.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        browser = started.chromium.launch(executable_path=found, args=["--no-sandbox", *flags])
         yield browser
         browser.close()

@@ -56,6 +56,7 @@ VERBS = {
     "fit": Verb("climatenerf.cli.fit", "Fit", "fit a radiance field to posed photographs"),
     "stylize": Verb("climatenerf.cli.stylize", "Stylize", "give a run the colours of a season"),
     "render": Verb("climatenerf.cli.render", "Render", "render a fitted place in any weather"),
+    "view": Verb("climatenerf.cli.view", "View", "look at a place in weather, live in a browser"),
     "page": Verb("climatenerf.cli.page", "Page", "write a web page with a water level slider"),
     "report": Verb("climatenerf.cli.report", "Report", "write what to know of a fit, as HTML"),
     "evaluate": Verb("climatenerf.cli.evaluate", "Evaluate", "measure a run against ground truth"),

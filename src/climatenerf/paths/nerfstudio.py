@@ -10,6 +10,7 @@ from jaxtyping import Float
 from climatenerf.core import parsing
 from climatenerf.core.errors import UserError, excerpt
 from climatenerf.core.input_limits import MAX_FRAMES
+from climatenerf.core.storage import write_json
 from climatenerf.scene import Scene
 from climatenerf.scene.readers.ply import MAX_POSITION
 from climatenerf.scene.scene import MAX_SCALE, MAX_WORLD
@@ -83,6 +84,41 @@ def read_drawn_path(path: Path, scene: Scene) -> DrawnPath:
         fps=_number(data.get("fps")) or None,
         note=note,
     )
+
+
+def write_drawn_path(path: Path, scene: Scene, drawn: DrawnPath) -> Path:
+    """Write a `camera_path.json` in the capture's own frame, which `read_drawn_path` reads back.
+
+    Args:
+        path: the file; no `dataparser_transforms.json` may lie beside it.
+        scene: the capture; defines the transform from metres to its frame.
+        drawn: the path; its note is left out.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    input_from_world = np.linalg.inv(scene.world_from_input)
+    width, height = drawn.size
+    entries = []
+    for c2w, fov in zip(drawn.c2w, drawn.vertical_fov, strict=True):
+        pose = _transformed(input_from_world, c2w) @ OPENGL_TO_OPENCV
+        entries.append(
+            {
+                "camera_to_world": pose.reshape(-1).tolist(),
+                "fov": float(fov),
+                "aspect": width / max(height, 1),
+            }
+        )
+    data = {
+        "camera_type": "perspective",
+        "render_width": width,
+        "render_height": height,
+        "fps": drawn.fps,
+        "seconds": len(entries) / drawn.fps if drawn.fps else None,
+        "camera_path": entries,
+    }
+    write_json(path, {key: value for key, value in data.items() if value is not None})
+    return path
 
 
 def _number(value: Any) -> float:

@@ -210,6 +210,21 @@ class Parameter(PrimitiveConstructorSpec[Any]):
             )
         return tuple(float(x) for x in raw)
 
+    def parse(self, text: str, where: str) -> Any:
+        """A value typed as one text: "0.5 m", "0.5 0.4 0.3", "none"; `where` begins the message.
+
+        Raises:
+            UserError: another form or dimension.
+        """
+        words = text.replace(",", " ").split() if self.count > 1 else [text.strip()]
+        none = self.optional and [word.lower() for word in words] == ["none"]
+        try:
+            if len(words) != self.count and not none:
+                raise ValueError(f"must be {self.count} numbers; got {excerpt(text)}")
+            return self._from_words(words)
+        except ValueError as error:
+            raise UserError(f"{where} {one_line(str(error), 200)}") from error
+
     def write(self, value: Any) -> Any:
         """The value as a weather file holds it; `read` returns it unchanged."""
         if self.kind is not None:

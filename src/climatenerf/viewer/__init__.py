@@ -1,0 +1,1 @@
+"""A live view of a fitted place in weather, in a browser on the same machine."""

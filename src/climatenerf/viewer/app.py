@@ -1,0 +1,237 @@
+"""The viewer: one session, one set of controls and one live view for each browser tab."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.core.rotations import quaternions, rotation_matrices
+from climatenerf.core.storage import make_folder, write_json
+from climatenerf.paths.camera_path import still
+from climatenerf.paths.nerfstudio import DrawnPath, write_drawn_path
+from climatenerf.render.session import RenderSession
+from climatenerf.studies.shot import Place
+from climatenerf.viewer import guarded_server
+from climatenerf.viewer.controls import WeatherControls, render_command
+from climatenerf.viewer.live import LiveView, Shown, Wanted
+from climatenerf.viewer.measure import measure
+from climatenerf.viewer.overlays import LAYERS, legend
+from climatenerf.weather.description import weather_to_table
+from climatenerf.weather.weather import Weather
+
+if TYPE_CHECKING:
+    import viser
+
+MAX_SIDE = 960  # pixels of a full picture
+JPEG_QUALITY = {"warped": 70, "coarse": 75, "half": 80, "full": 90}
+VIEWS = "views"
+"""Folder in the run that pictures and paths are written into."""
+
+
+class ViewerApp:
+    """Serves a fitted place to browser tabs of this machine."""
+
+    def __init__(self, run: Path, place: Place, port: int, allowed_hosts: tuple[str, ...] = ()):
+        """Start the server.
+
+        Args:
+            run: the run folder; files are written into its folder `views` alone.
+            place: field and scene.
+            port: to listen on; 0 takes a free one.
+            allowed_hosts: see `guarded_server.start`.
+
+        Raises:
+            UserError: the package is missing, or the port is taken.
+        """
+        self.run, self.place = run, place
+        self.tabs: dict[int, Tab] = {}
+        self._lock = threading.Lock()
+        self.server = guarded_server.start(port, allowed_hosts)
+        self.port = self.server.get_port()
+        self.server.scene.set_up_direction("+z")
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._left)
+
+    def _connected(self, client: "viser.ClientHandle") -> None:
+        tab = Tab(self, client)
+        with self._lock:
+            self.tabs[client.client_id] = tab
+
+    def _left(self, client: "viser.ClientHandle") -> None:
+        with self._lock:
+            tab = self.tabs.pop(client.client_id, None)
+        if tab is not None:
+            tab.live.close()
+
+    def close(self) -> None:
+        """End all tabs' threads and the server."""
+        with self._lock:
+            tabs, self.tabs = list(self.tabs.values()), {}
+        for tab in tabs:
+            tab.live.close()
+        self.server.stop()
+
+
+class Tab:
+    """One browser tab."""
+
+    def __init__(self, app: ViewerApp, client: "viser.ClientHandle"):
+        """Build the controls, and show the place from its most central photo."""
+        self.app, self.client = app, client
+        place = app.place
+        eye = still(place.scene, None, 1, None)
+        self.session = RenderSession(
+            place.field, place.scene, Weather(), kept=place.kept, style=place.style,
+            progress=self._preparing,
+        )  # fmt: skip
+        self.shown: Shown | None = None
+        self.keyframes: list[tuple[np.ndarray, float]] = []
+        client.camera.position = tuple(eye.c2w[0, :3, 3])
+        client.camera.wxyz = tuple(quaternions(eye.c2w[0, :3, :3]))
+        client.camera.fov = float(2 * np.arctan(0.5 * eye.cameras[0].height / eye.cameras[0].fy))
+        self.live = LiveView(self.session, self._show, self._tell)
+        self._build(client.gui)
+        client.camera.on_update(lambda _: self._ask())
+        client.scene.on_click()(self._clicked)
+        self._ask()
+
+    # --- controls -------------------------------------------------------------------------------
+
+    def _build(self, gui: Any) -> None:
+        scene = self.app.place.scene
+        gui.add_markdown(f"**{scene.root.resolve().name}**: simulated weather, no forecast")
+        self._message = gui.add_markdown(" ")
+        self._measured = gui.add_markdown("Click the picture to measure.")
+        low = scene.lowest_ground_z - scene.ground_z - 0.5
+        eyes = [scene.c2w_world(view)[2, 3] for view in scene.of_split("train")]
+        levels = (float(np.floor(10 * low) / 10), float(max(min(eyes) - scene.ground_z, low + 1)))
+        self.controls = WeatherControls(
+            gui, self.session.effects, Weather(), levels, lambda _: self._ask(), self._tell
+        )
+        with gui.add_folder("show", expand_by_default=True):
+            names = ["picture", *(name for name in LAYERS if name)]
+            layer = gui.add_dropdown("layer", names, initial_value="picture")
+            self._legend = gui.add_markdown(" ")
+        self._layer = ""
+
+        @layer.on_update
+        def _(_: Any) -> None:
+            self._layer = "" if layer.value == "picture" else layer.value
+            self._legend.content = legend(self._layer) if self._layer else " "
+            self._ask()
+
+        with gui.add_folder("save", expand_by_default=False):
+            picture = gui.add_button("save the picture")
+            key = gui.add_button("add a key pose to the path")
+            self._command = gui.add_text("command", "", multiline=True)
+        picture.on_click(lambda _: self._saved(self.save_picture))
+        key.on_click(lambda _: self._saved(self.add_keyframe))
+
+    def _tell(self, sentence: str) -> None:
+        self._message.content = f"**{sentence}**" if sentence else " "
+
+    def _preparing(self, what: str, fraction: float) -> None:
+        self._tell(f"preparing {what}: {100 * fraction:.0f} %")
+
+    def _saved(self, save: Callable[[], Path]) -> None:
+        try:
+            self._tell(f"saved {save()}")
+        except UserError as error:
+            self._tell(str(error))
+
+    # --- pictures -------------------------------------------------------------------------------
+
+    def wanted(self) -> Wanted:
+        """Return what the tab shows now."""
+        camera = self.client.camera
+        aspect, fov = float(camera.aspect), float(camera.fov)
+        height = min(int(camera.image_height) or MAX_SIDE, MAX_SIDE)
+        width = round(height * aspect)
+        if width > MAX_SIDE:
+            width, height = MAX_SIDE, round(MAX_SIDE / aspect)
+        width, height = max(width, 16), max(height, 16)
+        focal = 0.5 * height / np.tan(fov / 2)
+        c2w = np.eye(4)
+        c2w[:3, :3] = rotation_matrices(np.asarray(camera.wxyz, float))
+        c2w[:3, 3] = camera.position
+        pinhole = Camera(width, height, focal, focal, width / 2, height / 2)
+        return Wanted(pinhole, c2w, self.controls.weather, self._layer, 0.0, time.monotonic())
+
+    def _ask(self) -> None:
+        wanted = self.wanted()
+        self.live.ask(wanted)
+        size = wanted.camera.width, wanted.camera.height
+        path = str(self.app.run / VIEWS / "camera_path.json") if self.keyframes else "still"
+        weather = self.controls.weather
+        command = render_command(self.app.run, weather, self.session.effects, path, size)
+        if self._command.value != command:
+            self._command.value = command
+
+    def _show(self, shown: Shown) -> None:
+        self.shown = shown
+        self.client.scene.set_background_image(
+            shown.picture, format="jpeg", jpeg_quality=JPEG_QUALITY[shown.state]
+        )
+
+    def _clicked(self, event: Any) -> None:
+        found = measure(self.session, np.array(event.ray_origin), np.array(event.ray_direction))
+        self._measured.content = found.sentence
+
+    # --- files ----------------------------------------------------------------------------------
+
+    def save_picture(self) -> Path:
+        """Write the picture that is shown, with a sidecar, and return its path.
+
+        Raises:
+            UserError: it is not full yet, or cannot be written.
+        """
+        shown = self.shown
+        if shown is None or shown.state != "full":
+            raise UserError("the picture is not finished yet; wait until it is, and save again")
+        folder = make_folder(self.app.run / VIEWS)
+        number = len(list(folder.glob("view-*.png"))) + 1
+        path = folder / f"view-{number:04d}.png"
+        Image.fromarray(shown.picture).save(path)
+        sidecar = {
+            "simulated": True,
+            "note": "weather is simulated",
+            "weather": weather_to_table(shown.wanted.weather, self.session.effects),
+            "layer": shown.wanted.layer or "picture",
+            "c2w_world": shown.wanted.c2w.tolist(),
+            "vertical_fov_deg": _vertical_fov(shown.wanted.camera),
+            "scale_error": self.app.place.scene.scale_error,
+        }
+        write_json(path.with_suffix(".json"), sidecar)
+        return path
+
+    def add_keyframe(self) -> Path:
+        """Add the pose to the camera path, and write it as nerfstudio's `camera_path.json`.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        wanted = self.wanted()
+        self.keyframes.append((wanted.c2w, _vertical_fov(wanted.camera)))
+        poses, fovs = zip(*self.keyframes, strict=True)
+        size = wanted.camera.width, wanted.camera.height
+        drawn = DrawnPath(np.stack(poses), np.array(fovs), size, 24.0, "")
+        folder = make_folder(self.app.run / VIEWS)
+        path = write_drawn_path(folder / "camera_path.json", self.app.place.scene, drawn)
+        self._ask()
+        return path
+
+
+def _vertical_fov(camera: Camera) -> float:
+    """Vertical field of view, degrees."""
+    return float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy)))
+
+
+def tunnel_line(port: int) -> str:
+    """Return how to reach the viewer from another machine."""
+    return f"ssh -L {port}:127.0.0.1:{port} THIS-MACHINE"

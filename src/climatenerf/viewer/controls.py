@@ -1,0 +1,264 @@
+"""Weather as controls: a folder for each effect, a slider, list or text for each parameter."""
+
+import math
+import shlex
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from climatenerf.core.errors import UserError
+from climatenerf.weather.effect import Effect
+from climatenerf.weather.units import Choice, Folder, Parameter
+from climatenerf.weather.weather import Weather, check
+
+STEPS = 200  # of a slider
+MAIN = {
+    "flood": ("level", "wind_speed", "clarity"),
+    "snow": ("depth",),
+    "smog": ("visibility", "kind"),
+    "sky": ("kind",),
+    "sun": ("elevation", "azimuth"),
+    "season": ("kind", "strength"),
+}
+"""Parameters that are in sight at first, by effect, in the order of the folders; others follow."""
+RANGES = {
+    "smog.visibility": (10.0, 500.0),
+    "snow.depth": (0.0, 0.6),
+    "flood.wind_speed": (0.0, 15.0),
+    "flood.clarity": (0.05, 5.0),
+    "flood.fetch": (10.0, 1000.0),
+}
+"""Ranges of sliders where the parameter's own is much larger, SI."""
+MAX_RANGE = 1000.0  # parameters with a larger range have a text alone
+
+
+def slider_range(
+    name: str, parameter: Parameter, levels: tuple[float, float]
+) -> tuple[float, float] | None:
+    """Return the range of a parameter's slider, SI; None: it has a text alone.
+
+    Args:
+        name: such as "flood.level".
+        parameter: its unit and range.
+        levels: water levels that the scene can show, m above the ground datum.
+    """
+    if isinstance(parameter, Choice | Folder) or parameter.count > 1:
+        return None
+    if name == "flood.level":
+        return levels
+    if name in RANGES:
+        return RANGES[name]
+    low, high = parameter.low, parameter.high
+    wide = not math.isfinite(low) or not math.isfinite(high) or high - low > MAX_RANGE
+    return None if wide else (low, high)
+
+
+def render_command(
+    run: Path, weather: Weather, effects: Sequence[Effect], path: str, size: tuple[int, int]
+) -> str:
+    """Return the line that renders what the viewer shows.
+
+    Args:
+        run: the run folder.
+        weather: what is put in.
+        effects: those that may differ from their defaults.
+        path: value of --path.
+        size: of the picture, pixels.
+    """
+    words = ["climatenerf", "render", str(run), "-o", "out", "--path", path]
+    words += ["--size", f"{size[0]}x{size[1]}"]
+    for effect in effects:
+        for item, parameter in effect.fields().items():
+            value = weather.value(f"{effect.name}.{item}")
+            if value == effect.defaults()[item]:
+                continue
+            flag = f"--{effect.name}.{item}".replace("_", "-")
+            written = parameter.write(value)
+            given = [str(x) for x in written] if isinstance(written, list) else [str(written)]
+            # One word, since a value that begins with "-" would be taken for a flag.
+            words += [f"{flag}={given[0]}"] if len(given) == 1 else [flag, *given]
+    if weather.seed:
+        words += ["--seed", str(weather.seed)]
+    return shlex.join(words)
+
+
+class WeatherControls:
+    """Controls of one viewer's weather."""
+
+    def __init__(
+        self,
+        gui: Any,
+        effects: Sequence[Effect],
+        weather: Weather,
+        levels: tuple[float, float],
+        changed: Callable[[Weather], None],
+        tell: Callable[[str], None],
+    ):
+        """Add the controls.
+
+        Args:
+            gui: of the viewer, by viser.
+            effects: in the order of their folders.
+            weather: to begin with.
+            levels: water levels that the scene can show, m above the ground datum.
+            changed: takes each new weather.
+            tell: takes what is wrong with an input; "" clears it.
+        """
+        self._effects, self._changed, self._tell = tuple(effects), changed, tell
+        self.weather = weather
+        self._texts: dict[str, Any] = {}
+        self._sliders: dict[str, Any] = {}
+        self._switches: dict[str, Any] = {}
+        self._updating = False
+        order = {name: index for index, name in enumerate(MAIN)}
+        for effect in sorted(self._effects, key=lambda each: order.get(each.name, len(order))):
+            fields = effect.fields()
+            main = [item for item in MAIN.get(effect.name, fields) if item in fields]
+            rest = [item for item in fields if item not in main]
+            with gui.add_folder(effect.name):
+                if effect.enabled_by:
+                    self._add_switch(gui, effect)
+                for item in main:
+                    self._add(gui, f"{effect.name}.{item}", fields[item], levels)
+                if rest:
+                    with gui.add_folder("more", expand_by_default=False):
+                        for item in rest:
+                            self._add(gui, f"{effect.name}.{item}", fields[item], levels)
+        self._show()
+
+    # --- controls -------------------------------------------------------------------------------
+
+    def _add_switch(self, gui: Any, effect: Effect) -> None:
+        switch = gui.add_checkbox("on", effect.present(self.weather.sections[effect.name]))
+        self._switches[effect.name] = switch
+
+        @switch.on_update
+        def _(_: Any) -> None:
+            if self._updating:
+                return
+            main = f"{effect.name}.{effect.enabled_by[0]}"
+            if switch.value:
+                if main in self._sliders:
+                    self.set(main, self._sliders[main].value)
+                else:
+                    self._tell(f"give {main} a value")
+                    self._show()
+            else:
+                for item in effect.enabled_by:
+                    self.set(f"{effect.name}.{item}", None)
+
+    def _add(self, gui: Any, name: str, parameter: Parameter, levels: tuple[float, float]) -> None:
+        title = name.partition(".")[2].replace("_", " ")
+        if isinstance(parameter, Choice):
+            self._add_list(gui, name, title, parameter)
+        else:
+            self._add_number(gui, name, title, parameter, levels)
+
+    def _add_list(self, gui: Any, name: str, title: str, parameter: Choice) -> None:
+        value = self.weather.value(name)
+        shown = gui.add_dropdown(title, parameter.words, initial_value=value)
+        self._texts[name] = shown
+
+        @shown.on_update
+        def _(_: Any) -> None:
+            if not self._updating:
+                self.set(name, shown.value)
+
+    def _add_number(
+        self, gui: Any, name: str, title: str, parameter: Parameter, levels: tuple[float, float]
+    ) -> None:
+        found = slider_range(name, parameter, levels)
+        if found is not None:
+            low, high = (value / (parameter.kind.scale if parameter.kind else 1) for value in found)
+            value = self.weather.value(name)
+            scale = parameter.kind.scale if parameter.kind else 1.0
+            middle = (low + high) / 2 if value is None else value / scale
+            slider = gui.add_slider(
+                f"{title}{f', {parameter.kind.unit}' if parameter.kind else ''}",
+                low,
+                high,
+                (high - low) / STEPS,
+                min(max(middle, low), high),
+            )
+            self._sliders[name] = _Scaled(slider, scale)
+
+            @slider.on_update
+            def _(_: Any) -> None:
+                if not self._updating:
+                    self.set(name, slider.value * scale)
+
+        text = gui.add_text("" if found is not None else title, "")
+        self._texts[name] = text
+
+        @text.on_update
+        def _(_: Any) -> None:
+            if self._updating:
+                return
+            try:
+                self.set(name, parameter.parse(text.value, name.replace("_", "-")))
+            except UserError as error:
+                self._tell(str(error))
+
+    # --- values ---------------------------------------------------------------------------------
+
+    def set(self, name: str, value: Any) -> None:
+        """Change one parameter, named as "flood.level"; what does not fit is told and not taken."""
+        weather = self.weather.with_value(name, value)
+        effect = next(each for each in self._effects if each.name == name.partition(".")[0])
+        for pair in effect.alternatives:  # one of two replaces the other, as on the command line
+            if name.partition(".")[2] in pair and value is not None:
+                other = pair[1 - pair.index(name.partition(".")[2])]
+                default = effect.defaults()[other]
+                weather = weather.with_value(f"{effect.name}.{other}", default)
+        try:
+            check(weather, self._effects)
+        except UserError as error:
+            self._tell(str(error))
+            return
+        self.weather = weather
+        self._tell("")
+        self._show()
+        self._changed(weather)
+
+    def _show(self) -> None:
+        """Let all controls show the weather."""
+        self._updating = True
+        for effect in self._effects:
+            for item, parameter in effect.fields().items():
+                name = f"{effect.name}.{item}"
+                value = self.weather.value(name)
+                shown = value if isinstance(parameter, Choice) else _text(parameter, value)
+                if self._texts[name].value != shown:
+                    self._texts[name].value = shown
+                if name in self._sliders and value is not None:
+                    self._sliders[name].show(value)
+            if effect.name in self._switches:
+                present = effect.present(self.weather.sections[effect.name])
+                if self._switches[effect.name].value != present:
+                    self._switches[effect.name].value = present
+        self._updating = False
+
+
+class _Scaled:
+    """A slider in the unit of a parameter, read and set in SI."""
+
+    def __init__(self, slider: Any, scale: float):
+        self._slider, self._scale = slider, scale
+
+    @property
+    def value(self) -> float:
+        return self._slider.value * self._scale
+
+    def show(self, value: float) -> None:
+        shown = min(max(value / self._scale, self._slider.min), self._slider.max)
+        if abs(self._slider.value - shown) > 1e-9:
+            self._slider.value = shown
+
+
+def _text(parameter: Parameter, value: Any) -> str:
+    """Return a value as the text field shows it; `Parameter.parse` reads it."""
+    if value is None:
+        return "none"
+    if isinstance(value, tuple):
+        return " ".join(f"{x:g}" for x in value)
+    return parameter.text(value) if parameter.kind is not None else str(value)

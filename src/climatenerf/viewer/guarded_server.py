@@ -1,0 +1,105 @@
+"""A viser server on the loopback interface that answers this machine's own pages alone.
+
+A page of any web site can open a socket to the loopback interface, and viser checks no origin. So
+each request is checked before viser sees it: its Host must name this machine, and its Origin, if it
+has one, must equal its Host, since the GUI's own page comes from there.
+"""
+
+import contextlib
+import http
+import io
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from climatenerf.core.errors import UserError
+
+if TYPE_CHECKING:
+    import viser
+
+LOOPBACK = "127.0.0.1"
+OWN_NAMES = ("localhost", "127.0.0.1", "::1")
+
+
+def check_installed() -> None:
+    """Refuse to go on without the package.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise UserError(
+            'the viewer needs the package viser; install it by: pip install "climatenerf[view]"'
+        ) from error
+
+
+def is_allowed(host: str | None, origin: str | None, names: Sequence[str]) -> bool:
+    """Whether a request comes from a page of this server.
+
+    Args:
+        host: header Host.
+        origin: header Origin; None without one.
+        names: host names that count as this machine.
+    """
+    if host is None or (urlsplit(f"//{host}").hostname or "") not in names:
+        return False
+    return origin is None or urlsplit(origin).netloc == host
+
+
+@contextlib.contextmanager
+def guarded(names: Sequence[str]) -> Iterator[None]:
+    """Let servers that are started inside answer allowed requests alone."""
+    import websockets.asyncio.server as websockets_server
+
+    original = websockets_server.serve
+
+    def serve(*args: Any, process_request: Callable | None = None, **options: Any) -> Any:
+        def checked(connection: Any, request: Any) -> Any:
+            hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+            single = len(hosts) == 1 and len(origins) < 2
+            if not single or not is_allowed(hosts[0], origins[0] if origins else None, names):
+                return connection.respond(
+                    http.HTTPStatus.FORBIDDEN, "This page may be opened on its own machine only.\n"
+                )
+            return None if process_request is None else process_request(connection, request)
+
+        return original(*args, process_request=checked, **options)
+
+    websockets_server.serve = serve  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        websockets_server.serve = original
+
+
+def start(port: int, allowed_hosts: Sequence[str] = ()) -> "viser.ViserServer":
+    """Start a server on the loopback interface.
+
+    Args:
+        port: to listen on; 0 takes a free one.
+        allowed_hosts: names besides the loopback's under which a tunnel presents this machine.
+
+    Raises:
+        UserError: the package is missing, or the port is taken.
+    """
+    check_installed()
+    import viser
+
+    # viser counts a taken port up without a word.
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            raise UserError(
+                f"port {port} is in use or cannot be opened; give another --port, or --port 0 for"
+                " a free one"
+            ) from error
+    # viser prints a box of addresses, of which one would be taken for ours.
+    with guarded((*OWN_NAMES, *allowed_hosts)), contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False)
+    server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    return server

@@ -1,0 +1,239 @@
+"""Pictures for one viewer: the last picture warped while it moves, then coarse, half and full.
+
+Two threads: one renders what was asked for last, the other warps the last finished picture to the
+newest pose meanwhile. What is asked for lies in a mailbox of one place: newer requests replace
+older ones, and cancel their finer passes. No GUI is known here.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
+from climatenerf.field.compositing import RenderCancelled
+from climatenerf.render.session import RenderSession
+from climatenerf.viewer.overlays import picture_of
+from climatenerf.viewer.warp import warped
+from climatenerf.weather.description import KeyframedWeather
+from climatenerf.weather.weather import Weather
+
+STILL = 0.2  # s without a new pose after which finer passes begin
+FRAME = 1 / 30  # s between warped pictures
+MOVING_WIDTH = 480  # pixels of warped pictures
+COARSE = 4  # pixels along a side that share a ray while moving
+State = Literal["warped", "coarse", "half", "full"]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a viewer asks for.
+
+    Attributes:
+        camera: of the full picture, without distortion.
+        c2w: pose, world m.
+        weather: what is put in.
+        layer: name of a layer shown instead of the picture; "" shows the picture.
+        time: moment, s.
+        asked: when it was asked for, s of `time.monotonic`.
+    """
+
+    camera: Camera
+    c2w: Float[np.ndarray, "4 4"]
+    weather: KeyframedWeather | Weather
+    layer: str = ""
+    time: float = 0.0
+    asked: float = 0.0
+
+    def same_place(self, other: "Wanted") -> bool:
+        """Whether pose and size are equal."""
+        return self.camera == other.camera and np.array_equal(self.c2w, other.c2w)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture for a viewer.
+
+    Attributes:
+        picture: 8-bit sRGB.
+        wanted: what it shows.
+        state: how fine it is.
+    """
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    wanted: Wanted
+    state: State
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """A picture with depth, from which others are warped."""
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]
+    camera: Camera
+    c2w: Float[np.ndarray, "4 4"]
+
+
+class LiveView:
+    """Renders for one viewer until it is closed."""
+
+    def __init__(
+        self,
+        session: RenderSession,
+        show: Callable[[Shown], None],
+        tell: Callable[[str], None],
+    ):
+        """Start both threads.
+
+        Args:
+            session: of this viewer alone.
+            show: takes pictures; called from both threads.
+            tell: takes a sentence about what is prepared or wrong; "" clears it.
+        """
+        self._session, self._show, self._tell = session, show, tell
+        self._wanted: Wanted | None = None
+        self._moved = 0.0
+        self._finished: _Finished | None = None
+        self._sent: Wanted | None = None
+        self._open = True
+        self._changed = threading.Condition()
+        self._sending = threading.Lock()
+        self._threads = [
+            threading.Thread(target=work, name=name, daemon=True)
+            for name, work in (("viewer-render", self._render_all), ("viewer-warp", self._warp_all))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def ask(self, wanted: Wanted) -> None:
+        """Ask for a picture; what was asked for before is forgotten."""
+        with self._changed:
+            last = self._wanted
+            if last is not None and not last.same_place(wanted):
+                self._moved = time.monotonic()
+            self._wanted = wanted
+            self._changed.notify_all()
+
+    @property
+    def wanted(self) -> Wanted | None:
+        """What was asked for last."""
+        return self._wanted
+
+    def close(self) -> None:
+        """End both threads; returns when they have ended."""
+        with self._changed:
+            self._open = False
+            self._changed.notify_all()
+        for thread in self._threads:
+            thread.join()
+
+    # --- rendering ----------------------------------------------------------------------------
+
+    def _render_all(self) -> None:
+        done: Wanted | None = None
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda done=done: not self._open or self._wanted is not done)
+                if not self._open:
+                    return
+                wanted = self._wanted
+            assert wanted is not None
+            try:
+                finest = self._render(wanted)
+            except RenderCancelled:
+                continue
+            except UserError as error:
+                self._tell(str(error))
+                finest = True
+            except Exception as error:  # the viewer goes on with the next request
+                self._tell(f"internal error: {type(error).__name__}: {error}")
+                finest = True
+            if finest:
+                done = wanted
+
+    def _render(self, wanted: Wanted) -> bool:
+        """Render a coarse picture while moving, else all passes; returns whether it is full."""
+        if self._session.weather != wanted.weather:
+            self._session.change(wanted.weather)
+            self._tell("")
+        moving = time.monotonic() - self._moved < STILL
+        if moving or self._finished is None:
+            camera = wanted.camera
+            side = COARSE * max(camera.width / MOVING_WIDTH, 1)
+            coarse = camera.resized(
+                max(round(camera.width / side), 8), max(round(camera.height / side), 8)
+            )
+            # Not cancelled by newer poses: while moving, an older picture is better than none.
+            frame = self._session.frame(
+                coarse, wanted.c2w, wanted.time, cancelled=lambda: not self._open
+            )
+            picture = picture_of(wanted.layer, frame)
+            self._keep(picture, frame.layers["depth"], coarse, wanted)
+            self._send(Shown(picture, wanted, "coarse"), wanted)
+            if moving:
+                return False
+        passes: list[State] = ["coarse", "half", "full"]
+
+        def preview(picture: UInt8[np.ndarray, "h w 3"]) -> None:
+            state = passes.pop(0)
+            if state == "half" and not wanted.layer:
+                self._send(Shown(picture, wanted, state), wanted)
+
+        frame = self._session.frame(
+            wanted.camera,
+            wanted.c2w,
+            wanted.time,
+            layers=(wanted.layer,) if wanted.layer in ("normal", "label") else (),
+            preview=preview,
+            cancelled=lambda: not self._open or self._wanted is not wanted,
+        )
+        picture = picture_of(wanted.layer, frame)
+        self._keep(picture, frame.layers["depth"], wanted.camera, wanted)
+        self._send(Shown(picture, wanted, "full"), wanted)
+        return True
+
+    def _keep(self, picture: np.ndarray, depth: np.ndarray, camera: Camera, at: Wanted) -> None:
+        self._finished = _Finished(picture, depth, camera, at.c2w)
+
+    def _send(self, shown: Shown, wanted: Wanted) -> None:
+        """Show a picture unless its pose is no longer the newest."""
+        with self._sending:
+            newest = self._wanted
+            if self._open and newest is not None and newest.same_place(wanted):
+                self._sent = wanted
+                self._show(shown)
+
+    # --- warping ------------------------------------------------------------------------------
+
+    def _warp_all(self) -> None:
+        last: Wanted | None = None
+        while True:
+            with self._changed:
+                self._changed.wait_for(
+                    lambda last=last: (
+                        not self._open or (self._finished and self._wanted is not last)
+                    )
+                )
+                if not self._open:
+                    return
+                wanted, finished = self._wanted, self._finished
+            assert wanted is not None and finished is not None
+            begun = time.monotonic()
+            if time.monotonic() - self._moved < STILL:
+                width = min(MOVING_WIDTH, wanted.camera.width)
+                height = max(round(wanted.camera.height * width / wanted.camera.width), 1)
+                to = wanted.camera.resized(width, height)
+                given = finished.picture, finished.depth, finished.camera, finished.c2w
+                picture = warped(*given, to, wanted.c2w)
+                with self._sending:
+                    if self._open and self._wanted is wanted and self._sent is not wanted:
+                        self._sent = wanted
+                        self._show(Shown(picture, wanted, "warped"))
+            last = wanted
+            time.sleep(max(FRAME - (time.monotonic() - begun), 0.0))

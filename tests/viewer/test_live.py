@@ -1,0 +1,145 @@
+"""Pictures for one viewer: order, cancellation, bit identity, and the end of the threads."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from support.study_yard import pose, yard_place
+
+from climatenerf.core.cameras import Camera
+from climatenerf.render.session import RenderSession
+from climatenerf.viewer.live import LiveView, Wanted
+from climatenerf.viewer.measure import measure
+from climatenerf.viewer.overlays import LAYERS, legend, picture_of
+from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.weather import Weather
+
+CAMERA = Camera(96, 54, 80.0, 80.0, 48.0, 27.0)
+HERE = pose((0.0, 1.0, -0.1))
+
+
+class Viewer:
+    """Receives pictures as a browser tab does."""
+
+    def __init__(self, session):
+        self.pictures, self.told = [], []
+        self.live = LiveView(session, self.pictures.append, self.told.append)
+
+    def until(self, condition, seconds=60):
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, [p.state for p in self.pictures[-5:]]
+            time.sleep(0.01)
+
+    def full_of(self, wanted):
+        def last_is_full():
+            last = self.pictures[-1] if self.pictures else None
+            return last is not None and last.state == "full" and last.wanted is wanted
+
+        self.until(last_is_full)
+        return self.pictures[-1]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return yard_place(tmp_path_factory.mktemp("yard"))
+
+
+@pytest.fixture
+def viewer(place):
+    made = Viewer(RenderSession(place.field, place.scene, Weather()))
+    yield made
+    made.live.close()
+
+
+def flooded(level, c2w=HERE, layer=""):
+    weather = Weather(flood=Flood(level=level, wind_speed=0.0))
+    return Wanted(CAMERA, c2w, weather, layer, 0.0, time.monotonic())
+
+
+def test_the_full_picture_is_that_of_a_render_bit_for_bit(viewer, place):
+    wanted = flooded(0.4)
+    viewer.live.ask(wanted)
+    found = viewer.full_of(wanted)
+    session = RenderSession(place.field, place.scene, wanted.weather)
+    assert np.array_equal(found.picture, session.frame(CAMERA, HERE).picture)
+    states = [each.state for each in viewer.pictures]
+    assert states.index("coarse") < states.index("full")
+
+
+def test_the_last_of_ten_quick_changes_stays(viewer):
+    asked = [flooded(0.05 * i) for i in range(1, 11)]
+    for wanted in asked:
+        viewer.live.ask(wanted)
+        time.sleep(0.005)
+    viewer.full_of(asked[-1])
+    finished = [each for each in viewer.pictures if each.state == "full"]
+    assert finished[-1].wanted is asked[-1] and len(finished) < 10, "some were cancelled"
+    time.sleep(0.3)
+    assert viewer.pictures[-1].wanted is asked[-1]
+
+
+def test_pictures_follow_a_moving_camera(viewer):
+    first = flooded(0.3)
+    viewer.live.ask(first)
+    viewer.full_of(first)
+    begin = len(viewer.pictures)
+    for i in range(40):
+        wanted = flooded(0.3, pose((0.01 * i, 1.0, -0.1)))
+        viewer.live.ask(wanted)
+        time.sleep(0.025)
+    during = viewer.pictures[begin:]
+    warped = [each for each in during if each.state == "warped"]
+    assert len(warped) >= 10
+    order = [each.wanted.asked for each in warped]
+    assert order == sorted(order) and len(set(order)) > 8, "each shows a newer pose"
+    assert viewer.full_of(wanted).wanted is wanted
+
+
+def test_what_does_not_fit_is_told_and_the_viewer_goes_on(viewer):
+    viewer.live.ask(flooded(900.0))
+    viewer.until(lambda: any("level" in sentence for sentence in viewer.told))
+    good = flooded(0.2)
+    viewer.live.ask(good)
+    viewer.full_of(good)
+
+
+def test_closing_ends_the_threads(place):
+    before = threading.active_count()
+    made = Viewer(RenderSession(place.field, place.scene, Weather()))
+    made.live.ask(flooded(0.4))
+    assert threading.active_count() == before + 2
+    made.live.close()
+    assert threading.active_count() == before
+    count = len(made.pictures)
+    time.sleep(0.1)
+    assert len(made.pictures) == count
+
+
+@pytest.mark.parametrize("layer", [name for name in LAYERS if name not in ("", "label")])
+def test_layers_are_shown_with_a_legend(viewer, layer):
+    wanted = flooded(0.4, layer=layer)
+    viewer.live.ask(wanted)
+    found = viewer.full_of(wanted)
+    assert found.picture.std() > 5 or layer == "snow_thickness"
+    assert layer.split("_")[0].rstrip("s") in legend(layer)
+
+
+def test_a_layer_that_is_absent_shows_the_picture(place):
+    session = RenderSession(place.field, place.scene, Weather())
+    frame = session.frame(CAMERA, HERE)
+    assert picture_of("label", frame) is frame.picture
+
+
+def test_clicks_trace_their_ray(place):
+    """Ground at 0 m from an eye at 1.6 m, under 0.4 m of water: closed form."""
+    session = RenderSession(place.field, place.scene, flooded(0.4).weather)
+    down = np.array([0.0, 0.5, -1.0])
+    found = measure(session, HERE[:3, 3], 3 * down)
+    length = np.linalg.norm(down)
+    assert found.distance == pytest.approx(1.2 * length, abs=2e-3)
+    assert found.height == pytest.approx(0.0, abs=5e-3)
+    assert found.water_depth == pytest.approx(0.4, abs=0.01)
+    assert "water 0.4" in found.sentence and "deep" in found.sentence
+    assert measure(session, HERE[:3, 3], np.array([0.0, 0.1, 1.0])).sentence == "sky"

@@ -1,0 +1,187 @@
+"""The viewer in Chromium: drag, sliders, text, click, two tabs, saving, and foreign pages."""
+
+import functools
+import http.server
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+from PIL import Image
+from support.browser import chromium
+from support.study_yard import yard_place
+
+from climatenerf.paths.nerfstudio import read_drawn_path
+from climatenerf.render.session import RenderSession
+
+pytest.importorskip("viser", reason="needs viser (make setup installs it)")
+SIZE = {"width": 640, "height": 420}
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium("--use-angle=swiftshader", "--enable-unsafe-swiftshader") as started:
+        yield started
+
+
+@pytest.fixture
+def app(tmp_path):
+    from climatenerf.viewer.app import ViewerApp
+
+    place = yard_place(tmp_path)
+    (tmp_path / "run").mkdir()
+    made = ViewerApp(tmp_path / "run", place, 0)
+    yield made
+    made.close()
+
+
+def until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "in vain"
+        time.sleep(0.02)
+
+
+def opened(browser, app):
+    """Open a tab, and wait until its picture is full."""
+    known = set(app.tabs)
+    page = browser.new_context(viewport=SIZE).new_page()
+    page.set_default_timeout(20_000)
+    page.problems = []
+    page.on("pageerror", lambda error: page.problems.append(str(error)))
+    page.goto(f"http://localhost:{app.port}")
+    until(lambda: set(app.tabs) - known and page.wait_for_timeout(20) is None)
+    (number,) = set(app.tabs) - known
+    tab = app.tabs[number]
+    settled(page, tab)
+    return page, tab
+
+
+def settled(page, tab):
+    def is_full():
+        page.wait_for_timeout(20)
+        shown = tab.shown
+        return shown is not None and shown.state == "full" and shown.wanted is tab.live.wanted
+
+    until(is_full)
+
+
+def test_a_tab_shows_a_full_picture_that_is_a_render(browser, app):
+    page, tab = opened(browser, app)
+    wanted = tab.shown.wanted
+    session = RenderSession(app.place.field, app.place.scene, wanted.weather)
+    assert np.array_equal(tab.shown.picture, session.frame(wanted.camera, wanted.c2w).picture)
+    assert wanted.camera.width / wanted.camera.height == pytest.approx(640 / 420, abs=0.01)
+    assert page.problems == []
+    page.context.close()
+
+
+def test_dragging_turns_the_view_with_pictures_meanwhile(browser, app):
+    page, tab = opened(browser, app)
+    before, count = tab.shown.wanted.c2w.copy(), []
+    show = tab._show
+    tab.live._show = lambda shown: (count.append(shown.state), show(shown))
+    page.mouse.move(120, 260)
+    page.mouse.down()
+    for i in range(40):
+        page.mouse.move(120 + 2 * i, 260 + i)
+        page.wait_for_timeout(25)
+    page.mouse.up()
+    assert count.count("warped") >= 8
+    settled(page, tab)
+    assert not np.allclose(tab.shown.wanted.c2w, before, atol=1e-2)
+    assert count[-1] == "full"
+    page.context.close()
+
+
+@pytest.mark.slow
+def test_sliders_and_texts_change_the_weather(browser, app):
+    page, tab = opened(browser, app)
+    slider = page.get_by_role("slider").first
+    slider.focus()
+    page.keyboard.press("ArrowRight")
+    until(
+        lambda: page.wait_for_timeout(20) is None and tab.controls.weather.flood.level is not None
+    )
+    first = tab.controls.weather.flood.level
+    assert first == pytest.approx(float(slider.get_attribute("aria-valuenow")), abs=1e-6)
+    box = page.locator("input[type=text], input:not([type])").filter(visible=True)
+    values = [box.nth(i).input_value() for i in range(box.count())]
+    index = next(i for i, value in enumerate(values) if value.endswith(" m"))
+    box.nth(index).fill("20 in")
+    box.nth(index).press("Enter")
+    until(lambda: page.wait_for_timeout(20) is None
+          and abs(tab.controls.weather.flood.level - 0.508) < 1e-6)  # fmt: skip
+    settled(page, tab)
+    assert tab.shown.wanted.weather.flood.level == pytest.approx(0.508)
+    assert "--flood.level=0.508" in tab._command.value
+    page.context.close()
+
+
+@pytest.mark.slow
+def test_a_click_measures(browser, app):
+    page, tab = opened(browser, app)
+    tab.controls.set("flood.level", 0.4)
+    settled(page, tab)
+    page.mouse.click(150, 380)
+    until(lambda: page.wait_for_timeout(20) is None and "distance" in tab._measured.content)
+    assert "deep" in tab._measured.content
+    page.context.close()
+
+
+@pytest.mark.slow
+def test_tabs_have_weather_of_their_own_and_end_with_their_page(browser, app):
+    before = threading.active_count()
+    first, one = opened(browser, app)
+    second, two = opened(browser, app)
+    one.controls.set("flood.level", 0.3)
+    settled(first, one)
+    assert two.controls.weather.flood.level is None and len(app.tabs) == 2
+    first.context.close()
+    until(lambda: len(app.tabs) == 1 and second.wait_for_timeout(20) is None)
+    assert not any(thread.is_alive() for thread in one.live._threads)
+    second.reload()
+    until(lambda: two not in app.tabs.values() and len(app.tabs) == 1
+          and second.wait_for_timeout(20) is None)  # fmt: skip
+    second.context.close()
+    until(lambda: not app.tabs)
+    until(lambda: threading.active_count() <= before + 2)  # those of the server itself
+
+
+@pytest.mark.slow
+def test_pictures_and_paths_are_saved_into_the_run_alone(browser, app, tmp_path):
+    page, tab = opened(browser, app)
+    tab.controls.set("flood.level", 0.3)
+    settled(page, tab)
+    first, second = tab.save_picture(), tab.save_picture()
+    assert [each.name for each in (first, second)] == ["view-0001.png", "view-0002.png"]
+    assert np.array_equal(np.asarray(Image.open(first)), tab.shown.picture)
+    sidecar = json.loads(first.with_suffix(".json").read_text())
+    assert sidecar["simulated"] and sidecar["weather"]["flood"]["level"] == "0.3 m"
+    path = tab.add_keyframe()
+    drawn = read_drawn_path(path, app.place.scene)
+    np.testing.assert_allclose(drawn.c2w[0], tab.wanted().c2w, atol=1e-6)
+    assert {each.parent for each in (tmp_path / "run").rglob("*.*")} == {tmp_path / "run" / "views"}
+    page.context.close()
+
+
+def test_a_foreign_page_cannot_open_the_socket(browser, app, tmp_path):
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "index.html").write_text(
+        f"<script>const s = new WebSocket('ws://localhost:{app.port}', 'viser-v1.1.1');"
+        "s.onopen = () => document.title = 'open'; s.onerror = () => document.title = 'refused';"
+        "</script>"
+    )
+    handler = functools.partial(
+        http.server.SimpleHTTPRequestHandler, directory=str(tmp_path / "site")
+    )
+    handler.log_message = lambda *args: None
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as site:
+        threading.Thread(target=site.serve_forever, daemon=True).start()
+        page = browser.new_page()
+        page.goto(f"http://localhost:{site.server_address[1]}/index.html")
+        until(lambda: page.wait_for_timeout(20) is None and page.title() in ("open", "refused"))
+        assert page.title() == "refused" and not app.tabs
+        page.close()
+        site.shutdown()
