@@ -31,8 +31,12 @@ class Checkpoints:
     """Asks at many points of a render whether to stop, and keeps the longest time between two."""
 
     def __init__(self, cancelled: Callable[[], bool] | None):
-        """Takes the caller's question; None: the render cannot be cancelled."""
+        """Takes the caller's question; None: the render cannot be cancelled.
+
+        Its attribute `every`, if it has one, replaces `STAGE_SECONDS`: larger chunks cost less.
+        """
         self._cancelled = cancelled
+        self.every: float = getattr(cancelled, "every", STAGE_SECONDS)
         self._last = time.perf_counter()
         self.longest = 0.0
 
@@ -83,7 +87,7 @@ def chunks(rays: Tensor, checkpoint: Checkpoints = NEVER) -> Iterator[slice]:
         if checkpoint.active:
             checkpoint()
             # 1e-6 s: a clock too coarse to see the stage would divide by 0.
-            pace = STAGE_SECONDS / max(checkpoint.longest, 1e-6)
+            pace = checkpoint.every / max(checkpoint.longest, 1e-6)
             size = int(min(most, max(MIN_CHUNK, size * min(2.0, pace))))
 
 

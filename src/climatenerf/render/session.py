@@ -184,7 +184,8 @@ class RenderSession:
             layers: names of wanted layers; `normal` and `label` are computed on demand, the others
                 always.
             preview: called with the display picture as it becomes finer.
-            cancelled: asked every 10 to 20 ms of computing; True ends the render.
+            cancelled: asked every 10 to 20 ms of computing; True ends the render. Its attribute
+                `every`, if it has one, is a longer time (s), which costs less.
 
         Raises:
             RenderCancelled: `cancelled` has answered True.

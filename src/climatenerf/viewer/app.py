@@ -110,7 +110,8 @@ class Tab:
         self._measured = gui.add_markdown("Click the picture to measure.")
         low = scene.lowest_ground_z - scene.ground_z - 0.5
         eyes = [scene.c2w_world(view)[2, 3] for view in scene.of_split("train")]
-        levels = (float(np.floor(10 * low) / 10), float(max(min(eyes) - scene.ground_z, low + 1)))
+        high = max(min(eyes) - scene.ground_z, low + 1)
+        levels = float(np.floor(10 * low) / 10), float(np.floor(10 * high) / 10)
         self.controls = WeatherControls(
             gui, self.session.effects, Weather(), levels, lambda _: self._ask(), self._tell
         )

@@ -11,7 +11,7 @@ from climatenerf.weather.effect import Effect
 from climatenerf.weather.units import Choice, Folder, Parameter
 from climatenerf.weather.weather import Weather, check
 
-STEPS = 200  # of a slider
+MIN_STEPS = 100  # of a slider
 MAIN = {
     "flood": ("level", "wind_speed", "clarity"),
     "snow": ("depth",),
@@ -177,7 +177,7 @@ class WeatherControls:
                 f"{title}{f', {parameter.kind.unit}' if parameter.kind else ''}",
                 low,
                 high,
-                (high - low) / STEPS,
+                _step(high - low),
                 min(max(middle, low), high),
             )
             self._sliders[name] = _Scaled(slider, scale)
@@ -239,6 +239,11 @@ class WeatherControls:
         self._updating = False
 
 
+def _step(span: float) -> float:
+    """Return the largest power of ten that gives a slider enough steps."""
+    return 10.0 ** math.floor(math.log10(span / MIN_STEPS))
+
+
 class _Scaled:
     """A slider in the unit of a parameter, read and set in SI."""
 
@@ -261,4 +266,4 @@ def _text(parameter: Parameter, value: Any) -> str:
         return "none"
     if isinstance(value, tuple):
         return " ".join(f"{x:g}" for x in value)
-    return parameter.text(value) if parameter.kind is not None else str(value)
+    return parameter.text(value) if parameter.kind is not None else f"{value:g}"

@@ -27,6 +27,8 @@ STILL = 0.2  # s without a new pose after which finer passes begin
 FRAME = 1 / 30  # s between warped pictures
 MOVING_WIDTH = 480  # pixels of warped pictures
 COARSE = 4  # pixels along a side that share a ray while moving
+FIRST = 8  # of the first picture after a change of the weather
+PATIENCE = 0.08  # s of computing between two questions whether to stop
 State = Literal["warped", "coarse", "half", "full"]
 
 
@@ -78,6 +80,19 @@ class _Finished:
     depth: Float[np.ndarray, "h w"]
     camera: Camera
     c2w: Float[np.ndarray, "4 4"]
+    content: tuple[object, ...]
+    """Weather, layer and moment that it shows."""
+
+
+@dataclass(frozen=True)
+class _Patient:
+    """Asks whether to stop, less often than a render does by itself; see `Checkpoints`."""
+
+    asked: Callable[[], bool]
+    every: float = PATIENCE
+
+    def __call__(self) -> bool:
+        return self.asked()
 
 
 class LiveView:
@@ -97,6 +112,7 @@ class LiveView:
             tell: takes a sentence about what is prepared or wrong; "" clears it.
         """
         self._session, self._show, self._tell = session, show, tell
+        self._put_in: KeyframedWeather | Weather | None = None
         self._wanted: Wanted | None = None
         self._moved = 0.0
         self._finished: _Finished | None = None
@@ -159,30 +175,20 @@ class LiveView:
 
     def _render(self, wanted: Wanted) -> bool:
         """Render a coarse picture while moving, else all passes; returns whether it is full."""
-        if self._session.weather != wanted.weather:
+        if self._put_in != wanted.weather:
             self._session.change(wanted.weather)
+            self._put_in = wanted.weather
             self._tell("")
         moving = time.monotonic() - self._moved < STILL
-        if moving or self._finished is None:
-            camera = wanted.camera
-            side = COARSE * max(camera.width / MOVING_WIDTH, 1)
-            coarse = camera.resized(
-                max(round(camera.width / side), 8), max(round(camera.height / side), 8)
-            )
-            # Not cancelled by newer poses: while moving, an older picture is better than none.
-            frame = self._session.frame(
-                coarse, wanted.c2w, wanted.time, cancelled=lambda: not self._open
-            )
-            picture = picture_of(wanted.layer, frame)
-            self._keep(picture, frame.layers["depth"], coarse, wanted)
-            self._send(Shown(picture, wanted, "coarse"), wanted)
+        if moving or not self._same_content(wanted):
+            self._render_coarse(wanted, COARSE if moving else FIRST)
             if moving:
                 return False
         passes: list[State] = ["coarse", "half", "full"]
 
         def preview(picture: UInt8[np.ndarray, "h w 3"]) -> None:
             state = passes.pop(0)
-            if state == "half" and not wanted.layer:
+            if state != "full" and not wanted.layer:
                 self._send(Shown(picture, wanted, state), wanted)
 
         frame = self._session.frame(
@@ -191,15 +197,35 @@ class LiveView:
             wanted.time,
             layers=(wanted.layer,) if wanted.layer in ("normal", "label") else (),
             preview=preview,
-            cancelled=lambda: not self._open or self._wanted is not wanted,
+            cancelled=_Patient(lambda: not self._open or self._wanted is not wanted),
         )
         picture = picture_of(wanted.layer, frame)
         self._keep(picture, frame.layers["depth"], wanted.camera, wanted)
         self._send(Shown(picture, wanted, "full"), wanted)
         return True
 
+    def _render_coarse(self, wanted: Wanted, side: int) -> None:
+        """Render a small picture, and keep it for warping; newer requests do not cancel it."""
+        camera = wanted.camera
+        across = side * max(camera.width / MOVING_WIDTH, 1)
+        coarse = camera.resized(
+            max(round(camera.width / across), 8), max(round(camera.height / across), 8)
+        )
+        # While moving, an older picture to warp is better than none.
+        open_ = _Patient(lambda: not self._open)
+        frame = self._session.frame(coarse, wanted.c2w, wanted.time, cancelled=open_)
+        picture = picture_of(wanted.layer, frame)
+        self._keep(picture, frame.layers["depth"], coarse, wanted)
+        self._send(Shown(picture, wanted, "coarse"), wanted)
+
+    def _same_content(self, wanted: Wanted) -> bool:
+        """Whether the last finished picture shows the same weather and layer."""
+        last = self._finished
+        return last is not None and last.content == (wanted.weather, wanted.layer, wanted.time)
+
     def _keep(self, picture: np.ndarray, depth: np.ndarray, camera: Camera, at: Wanted) -> None:
-        self._finished = _Finished(picture, depth, camera, at.c2w)
+        content = at.weather, at.layer, at.time
+        self._finished = _Finished(picture, depth, camera, at.c2w, content)
 
     def _send(self, shown: Shown, wanted: Wanted) -> None:
         """Show a picture unless its pose is no longer the newest."""

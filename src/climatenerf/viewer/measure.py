@@ -45,7 +45,8 @@ class Measured:
         return ", ".join(parts)
 
     def _with_error(self, value: float) -> str:
-        return f"{value:.2f} ± {abs(value) * self.scale_error:.2f} m"
+        error = abs(value) * self.scale_error
+        return f"{value:.2f} m" if error < 0.005 else f"{value:.2f} ± {error:.2f} m"
 
 
 def measure(
