@@ -2,13 +2,16 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.study_yard import pose, yard_place
+from support.study_yard import BOX, pose, yard_place
 
 from climatenerf.core.cameras import Camera
+from climatenerf.field.analytic import AnalyticField, HalfSpace
 from climatenerf.render.session import RenderSession
+from climatenerf.verification.setting import protocol_of
 from climatenerf.viewer.live import LiveView, Wanted
 from climatenerf.viewer.measure import measure
 from climatenerf.viewer.overlays import LAYERS, legend, picture_of
@@ -55,7 +58,7 @@ def viewer(place):
 
 def flooded(level, c2w=HERE, layer=""):
     weather = Weather(flood=Flood(level=level, wind_speed=0.0))
-    return Wanted(CAMERA, c2w, weather, layer, 0.0, time.monotonic())
+    return Wanted(CAMERA, c2w, weather, layer, asked=time.monotonic())
 
 
 def test_the_full_picture_is_that_of_a_render_bit_for_bit(viewer, place):
@@ -115,6 +118,31 @@ def test_closing_ends_the_threads(place):
     count = len(made.pictures)
     time.sleep(0.1)
     assert len(made.pictures) == count
+
+
+def test_the_left_part_can_show_the_place_without_weather(viewer, place):
+    after = flooded(0.4)
+    split = replace(after, split=0.5)
+    viewer.live.ask(split)
+    found = viewer.full_of(split).picture
+    session = RenderSession(place.field, place.scene, after.weather)
+    wet = session.frame(CAMERA, HERE).picture
+    session.change(Weather())
+    dry = session.frame(CAMERA, HERE).picture
+    assert np.array_equal(found[:, :48], dry[:, :48])
+    assert np.array_equal(found[:, 48:], wet[:, 48:]) and not np.array_equal(wet, dry)
+
+
+def test_a_newer_fit_is_followed(viewer, place):
+    wanted = flooded(0.4)
+    viewer.live.ask(wanted)
+    viewer.full_of(wanted)
+    newer = AnalyticField([HalfSpace(colour=(0.9, 0.1, 0.1))], box=BOX)
+    viewer.live.use(RenderSession(protocol_of(newer), place.scene, Weather()))
+    expected = RenderSession(protocol_of(newer), place.scene, wanted.weather)
+    picture = expected.frame(CAMERA, HERE).picture
+    viewer.until(lambda: viewer.pictures[-1].state == "full"
+                 and np.array_equal(viewer.pictures[-1].picture, picture))  # fmt: skip
 
 
 @pytest.mark.parametrize("layer", [name for name in LAYERS if name not in ("", "label")])

@@ -5,15 +5,22 @@ import http.server
 import json
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 from support.browser import chromium
-from support.study_yard import yard_place
+from support.random_run import random_run, small
+from support.study_yard import BOX, yard_place
 
+from climatenerf.api import load_run
+from climatenerf.core.errors import UserError
+from climatenerf.field.analytic import AnalyticField, HalfSpace
 from climatenerf.paths.nerfstudio import read_drawn_path
 from climatenerf.render.session import RenderSession
+from climatenerf.studies.shot import Place
+from climatenerf.verification.setting import protocol_of
 
 pytest.importorskip("viser", reason="needs viser (make setup installs it)")
 SIZE = {"width": 640, "height": 420}
@@ -43,10 +50,10 @@ def until(condition, seconds=60.0):
         time.sleep(0.02)
 
 
-def opened(browser, app):
+def opened(browser, app, size=SIZE):
     """Open a tab, and wait until its picture is full."""
     known = set(app.tabs)
-    page = browser.new_context(viewport=SIZE).new_page()
+    page = browser.new_context(viewport=size).new_page()
     page.set_default_timeout(20_000)
     page.problems = []
     page.on("pageerror", lambda error: page.problems.append(str(error)))
@@ -162,6 +169,8 @@ def test_pictures_and_paths_are_saved_into_the_run_alone(browser, app, tmp_path)
     path = tab.add_keyframe()
     drawn = read_drawn_path(path, app.place.scene)
     np.testing.assert_allclose(drawn.c2w[0], tab.wanted().c2w, atol=1e-6)
+    tab.add_keyframe()
+    assert read_drawn_path(path, app.place.scene).c2w.shape == (25, 4, 4)
     assert {each.parent for each in (tmp_path / "run").rglob("*.*")} == {tmp_path / "run" / "views"}
     page.context.close()
 
@@ -185,3 +194,73 @@ def test_a_foreign_page_cannot_open_the_socket(browser, app, tmp_path):
         assert page.title() == "refused" and not app.tabs
         page.close()
         site.shutdown()
+
+
+@pytest.mark.slow
+def test_the_arrow_draws_the_water_up(browser, app):
+    page, tab = opened(browser, app, {"width": 1200, "height": 700})
+    tab._gui_handle.value = True
+    page.wait_for_timeout(500)
+    wanted = tab.wanted()
+    scale = 1200 / wanted.camera.width
+
+    def pixel(height):
+        local = wanted.c2w[:3, :3].T @ (np.array([*at[:2], at[2] + height]) - wanted.c2w[:3, 3])
+        return scale * wanted.camera.project(local[None])[0]
+
+    at = np.array(tab._handle.position)
+    x, y = pixel(0.3)
+    page.mouse.move(x, y)
+    page.wait_for_timeout(300)
+    page.mouse.down()
+    for step in range(1, 11):
+        page.mouse.move(x, y - 4 * step)
+        page.wait_for_timeout(40)
+    page.mouse.up()
+    controls = tab.controls
+    until(lambda: page.wait_for_timeout(20) is None and controls.weather.flood.level is not None)
+    page.wait_for_timeout(300)
+    level = controls.weather.flood.level
+    assert level == pytest.approx(
+        float(tab._handle.position[2]) - app.place.scene.ground_z, abs=2e-3
+    )
+    assert 0.1 < level < 1.0
+    page.context.close()
+
+
+@pytest.mark.slow
+def test_a_newer_fit_is_shown_with_the_weather_of_each_tab(browser, app):
+    page, tab = opened(browser, app)
+    tab.controls.set("flood.level", 0.4)
+    settled(page, tab)
+    before = tab.shown.picture
+    newer = AnalyticField([HalfSpace(colour=(0.9, 0.1, 0.1))], box=BOX)
+    app.use(replace(app.place, field=protocol_of(newer)), None)
+    until(lambda: page.wait_for_timeout(20) is None
+          and not np.array_equal(tab.shown.picture, before))  # fmt: skip
+    settled(page, tab)
+    assert tab.shown.wanted.weather.flood.level == 0.4
+    page.context.close()
+
+
+@pytest.mark.slow
+def test_the_path_is_rendered_as_a_movie_in_the_weather_that_is_shown(browser, tmp_path):
+    from climatenerf.viewer.app import ViewerApp
+
+    folder = random_run(tmp_path / "run", small("cpu"))
+    run = load_run(folder)
+    app = ViewerApp(folder, Place(run.field, run.scene), 0, digest=run.digest)
+    page, tab = opened(browser, app, {"width": 240, "height": 160})
+    tab.controls.set("smog.visibility", 50.0)
+    with pytest.raises(UserError, match="add key poses"):
+        tab.render_path()
+    tab.add_keyframe()
+    movie = tab.render_path()
+    assert movie == folder / "views" / "movie-0001" / "movie.mp4" and movie.stat().st_size > 500
+    sidecar = json.loads((movie.parent / "movie.json").read_text())
+    assert sidecar["weather"]["smog"]["visibility"] == "50 m"
+    settled(page, tab)
+    frame = np.asarray(Image.open(movie.parent / "frames" / "0000.png"))
+    assert np.abs(frame.astype(int) - tab.shown.picture).max() <= 1, "as the viewer shows it"
+    page.context.close()
+    app.close()

@@ -3,17 +3,23 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from climatenerf.cli import progress
 from climatenerf.core.errors import UserError
 
+if TYPE_CHECKING:
+    from climatenerf.studies.shot import Place
+
+POLL = 3.0  # s between looks for a newer checkpoint of a fit
+
 
 @dataclass(frozen=True)
 class View:
     """Look at a fitted place in a browser on this machine: move freely, and change the weather by
-    sliders. Ctrl-C ends it."""
+    sliders. A fit that is still at work is followed. Ctrl-C ends it."""
 
     run: tyro.conf.Positional[Path]
     """Run folder made by `climatenerf fit`."""
@@ -36,21 +42,40 @@ def run(options: View) -> int:
     from climatenerf.viewer.guarded_server import check_installed
 
     check_installed()
-    from climatenerf.api import load_run
-    from climatenerf.studies.shot import Place
+    from climatenerf.training.snapshot import FIELD, identity_of
     from climatenerf.viewer.app import ViewerApp, tunnel_line
-    from climatenerf.weather.world import Kept
 
-    fitted = load_run(options.run)
-    with progress.StageBars() as bars:
-        field = fitted.completed(bars) if options.complete_ground else fitted.field
-    kept = None if fitted.digest is None else Kept(fitted.folder, fitted.digest)
-    place = Place(field, fitted.scene, kept, fitted.style)
-    app = ViewerApp(options.run, place, options.port, options.allow_host)
+    place, digest = _place(options)
+    shown = identity_of(options.run / FIELD)
+    app = ViewerApp(options.run, place, options.port, options.allow_host, digest)
     progress.result(f"viewer: http://localhost:{app.port}")
     progress.say(f"from another machine: {tunnel_line(app.port)}, then the same address there")
     try:
         while True:
-            time.sleep(3600)
+            time.sleep(POLL)
+            newest = identity_of(options.run / FIELD)
+            if newest not in (shown, None):
+                app.use(*_place(options))
+                shown = newest
     finally:
         app.close()
+
+
+def _place(options: View) -> "tuple[Place, str | None]":
+    """Return the place of a run, and its identity; that of a fit at work has no completed ground.
+
+    Raises:
+        UserError: there is no run, or a damaged one.
+    """
+    from climatenerf.api import load_run
+    from climatenerf.studies.shot import Place
+    from climatenerf.weather.world import Kept
+
+    fitted = load_run(options.run)
+    finished = (options.run / "metrics.json").is_file()
+    field = fitted.field
+    if options.complete_ground and finished:
+        with progress.StageBars() as bars:
+            field = fitted.completed(bars)
+    kept = Kept(fitted.folder, fitted.digest) if fitted.digest is not None and finished else None
+    return Place(field, fitted.scene, kept, fitted.style), fitted.digest

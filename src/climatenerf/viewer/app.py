@@ -14,6 +14,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.rotations import quaternions, rotation_matrices
 from climatenerf.core.storage import make_folder, write_json
 from climatenerf.paths.camera_path import still
+from climatenerf.paths.key_poses import through
 from climatenerf.paths.nerfstudio import DrawnPath, write_drawn_path
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 MAX_SIDE = 960  # pixels of a full picture
 JPEG_QUALITY = {"warped": 70, "coarse": 75, "half": 80, "full": 90}
+FPS = 24.0
+HANDLE_DISTANCE = 5.0  # m, of the arrow for the water level from the first camera
 VIEWS = "views"
 """Folder in the run that pictures and paths are written into."""
 
@@ -37,7 +40,14 @@ VIEWS = "views"
 class ViewerApp:
     """Serves a fitted place to browser tabs of this machine."""
 
-    def __init__(self, run: Path, place: Place, port: int, allowed_hosts: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        run: Path,
+        place: Place,
+        port: int,
+        allowed_hosts: tuple[str, ...] = (),
+        digest: str | None = None,
+    ):
         """Start the server.
 
         Args:
@@ -45,12 +55,15 @@ class ViewerApp:
             place: field and scene.
             port: to listen on; 0 takes a free one.
             allowed_hosts: see `guarded_server.start`.
+            digest: identity of the run, for movies; None takes that of its files.
 
         Raises:
             UserError: the package is missing, or the port is taken.
         """
         self.run, self.place = run, place
         self.tabs: dict[int, Tab] = {}
+        self.digest = digest
+        self.rendering = threading.Lock()
         self._lock = threading.Lock()
         self.server = guarded_server.start(port, allowed_hosts)
         self.port = self.server.get_port()
@@ -69,6 +82,14 @@ class ViewerApp:
         if tab is not None:
             tab.live.close()
 
+    def use(self, place: Place, digest: str | None) -> None:
+        """Show a newer fit of the run in all tabs, with the weather that each has."""
+        with self._lock:
+            self.place, self.digest = place, digest
+            tabs = list(self.tabs.values())
+        for tab in tabs:
+            tab.follow()
+
     def close(self) -> None:
         """End all tabs' threads and the server."""
         with self._lock:
@@ -84,12 +105,8 @@ class Tab:
     def __init__(self, app: ViewerApp, client: "viser.ClientHandle"):
         """Build the controls, and show the place from its most central photo."""
         self.app, self.client = app, client
-        place = app.place
-        eye = still(place.scene, None, 1, None)
-        self.session = RenderSession(
-            place.field, place.scene, Weather(), kept=place.kept, style=place.style,
-            progress=self._preparing,
-        )  # fmt: skip
+        eye = still(app.place.scene, None, 1, None)
+        self.session = self._new_session()
         self.shown: Shown | None = None
         self.keyframes: list[tuple[np.ndarray, float]] = []
         client.camera.position = tuple(eye.c2w[0, :3, 3])
@@ -99,7 +116,24 @@ class Tab:
         self._build(client.gui)
         client.camera.on_update(lambda _: self._ask())
         client.scene.on_click()(self._clicked)
+        self._add_level_handle(eye.c2w[0])
         self._ask()
+
+    def _new_session(self) -> RenderSession:
+        place = self.app.place
+        return RenderSession(
+            place.field,
+            place.scene,
+            Weather(),
+            kept=place.kept,
+            style=place.style,
+            progress=self._preparing,
+        )
+
+    def follow(self) -> None:
+        """Show the newer place of the app."""
+        self.session = self._new_session()
+        self.live.use(self.session)
 
     # --- controls -------------------------------------------------------------------------------
 
@@ -119,7 +153,12 @@ class Tab:
             names = ["picture", *(name for name in LAYERS if name)]
             layer = gui.add_dropdown("layer", names, initial_value="picture")
             self._legend = gui.add_markdown(" ")
+            self._gui_handle = gui.add_checkbox("water level arrow", False)
+            self._before = gui.add_checkbox("before | after", False)
+            self._split = gui.add_slider("split, %", 1, 99, 1, 50)
         self._layer = ""
+        self._before.on_update(lambda _: self._ask())
+        self._split.on_update(lambda _: self._ask() if self._before.value else None)
 
         @layer.on_update
         def _(_: Any) -> None:
@@ -130,9 +169,35 @@ class Tab:
         with gui.add_folder("save", expand_by_default=False):
             picture = gui.add_button("save the picture")
             key = gui.add_button("add a key pose to the path")
+            movie = gui.add_button("render the path")
             self._command = gui.add_text("command", "", multiline=True)
         picture.on_click(lambda _: self._saved(self.save_picture))
         key.on_click(lambda _: self._saved(self.add_keyframe))
+        movie.on_click(lambda _: self._saved(self.render_path))
+
+    def _add_level_handle(self, c2w: np.ndarray) -> None:
+        """Put an arrow into the scene, by which the water level is drawn up and down."""
+        datum = self.app.place.scene.ground_z
+        at = c2w[:3, 3] + HANDLE_DISTANCE * c2w[:3, 2]
+        handle = self.client.scene.add_transform_controls(
+            "/water level",
+            scale=0.6,
+            active_axes=(False, False, True),
+            disable_rotations=True,
+            disable_sliders=True,
+            depth_test=False,
+            position=(at[0], at[1], datum),
+            visible=False,
+        )
+        self._handle = handle
+        shown = self._gui_handle
+        shown.on_update(lambda _: setattr(handle, "visible", shown.value))
+
+        @handle.on_update
+        def _(_: Any) -> None:
+            level = round(float(handle.position[2]) - datum, 3)
+            if level != self.controls.weather.flood.level:
+                self.controls.set("flood.level", level)
 
     def _tell(self, sentence: str) -> None:
         self._message.content = f"**{sentence}**" if sentence else " "
@@ -162,7 +227,15 @@ class Tab:
         c2w[:3, :3] = rotation_matrices(np.asarray(camera.wxyz, float))
         c2w[:3, 3] = camera.position
         pinhole = Camera(width, height, focal, focal, width / 2, height / 2)
-        return Wanted(pinhole, c2w, self.controls.weather, self._layer, 0.0, time.monotonic())
+        split = self._split.value / 100 if self._before.value else 0.0
+        return Wanted(
+            pinhole,
+            c2w,
+            self.controls.weather,
+            self._layer,
+            split=split,
+            asked=time.monotonic(),
+        )
 
     def _ask(self) -> None:
         wanted = self.wanted()
@@ -219,13 +292,42 @@ class Tab:
         """
         wanted = self.wanted()
         self.keyframes.append((wanted.c2w, _vertical_fov(wanted.camera)))
-        poses, fovs = zip(*self.keyframes, strict=True)
+        keys, angles = zip(*self.keyframes, strict=True)
+        poses, fovs = through(keys, angles)
         size = wanted.camera.width, wanted.camera.height
-        drawn = DrawnPath(np.stack(poses), np.array(fovs), size, 24.0, "")
+        drawn = DrawnPath(poses, fovs, size, FPS, "")
         folder = make_folder(self.app.run / VIEWS)
         path = write_drawn_path(folder / "camera_path.json", self.app.place.scene, drawn)
         self._ask()
         return path
+
+    def render_path(self) -> Path:
+        """Render the camera path in the weather that is shown, and return the movie.
+
+        Raises:
+            UserError: there is no path, or one is being rendered.
+        """
+        from climatenerf.api import Run, render_movie
+
+        if not self.keyframes:
+            raise UserError("add key poses to the path first")
+        place, run = self.app.place, self.app.run
+        if not self.app.rendering.acquire(blocking=False):
+            raise UserError("a movie is being rendered; wait until it is finished")
+        try:
+            folder = make_folder(run / VIEWS)
+            out = folder / f"movie-{len(list(folder.glob('movie-*'))) + 1:04d}"
+            fitted = Run(run, place.field, place.scene, self.app.digest, style=place.style)  # pyright: ignore[reportArgumentType]
+            return render_movie(
+                fitted,
+                out,
+                self.controls.weather,
+                path=str(folder / "camera_path.json"),
+                complete_ground=False,
+                progress=self._preparing,
+            )
+        finally:
+            self.app.rendering.release()
 
 
 def _vertical_fov(camera: Camera) -> float:

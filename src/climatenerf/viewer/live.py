@@ -8,7 +8,7 @@ older ones, and cancel their finer passes. No GUI is known here.
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -17,11 +17,13 @@ from jaxtyping import Float, UInt8
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.field.compositing import RenderCancelled
-from climatenerf.render.session import RenderSession
+from climatenerf.render.frame import FrameOptions, render_frame
+from climatenerf.render.session import Frame, RenderSession
 from climatenerf.viewer.overlays import picture_of
 from climatenerf.viewer.warp import warped
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.weather import Weather
+from climatenerf.weather.world import World
 
 STILL = 0.2  # s without a new pose after which finer passes begin
 FRAME = 1 / 30  # s between warped pictures
@@ -42,6 +44,7 @@ class Wanted:
         weather: what is put in.
         layer: name of a layer shown instead of the picture; "" shows the picture.
         time: moment, s.
+        split: fraction of the width, from the left, that shows the place without weather.
         asked: when it was asked for, s of `time.monotonic`.
     """
 
@@ -50,6 +53,7 @@ class Wanted:
     weather: KeyframedWeather | Weather
     layer: str = ""
     time: float = 0.0
+    split: float = 0.0
     asked: float = 0.0
 
     def same_place(self, other: "Wanted") -> bool:
@@ -81,7 +85,7 @@ class _Finished:
     camera: Camera
     c2w: Float[np.ndarray, "4 4"]
     content: tuple[object, ...]
-    """Weather, layer and moment that it shows."""
+    """See `_content`."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,11 @@ class _Patient:
 
     def __call__(self) -> bool:
         return self.asked()
+
+
+def _content(wanted: Wanted) -> tuple[object, ...]:
+    """What a picture shows, whatever its pose."""
+    return wanted.weather, wanted.layer, wanted.time, wanted.split
 
 
 class LiveView:
@@ -112,6 +121,7 @@ class LiveView:
             tell: takes a sentence about what is prepared or wrong; "" clears it.
         """
         self._session, self._show, self._tell = session, show, tell
+        self._next: RenderSession | None = None
         self._put_in: KeyframedWeather | Weather | None = None
         self._wanted: Wanted | None = None
         self._moved = 0.0
@@ -134,6 +144,14 @@ class LiveView:
             if last is not None and not last.same_place(wanted):
                 self._moved = time.monotonic()
             self._wanted = wanted
+            self._changed.notify_all()
+
+    def use(self, session: RenderSession) -> None:
+        """Render with another session from the next picture on, such as that of a newer fit."""
+        with self._changed:
+            self._next = session
+            if self._wanted is not None:
+                self._wanted = replace(self._wanted)  # asks again
             self._changed.notify_all()
 
     @property
@@ -175,6 +193,10 @@ class LiveView:
 
     def _render(self, wanted: Wanted) -> bool:
         """Render a coarse picture while moving, else all passes; returns whether it is full."""
+        with self._changed:
+            following, self._next = self._next, None
+        if following is not None:
+            self._session, self._put_in, self._finished = following, None, None
         if self._put_in != wanted.weather:
             self._session.change(wanted.weather)
             self._put_in = wanted.weather
@@ -188,18 +210,19 @@ class LiveView:
 
         def preview(picture: UInt8[np.ndarray, "h w 3"]) -> None:
             state = passes.pop(0)
-            if state != "full" and not wanted.layer:
+            if state != "full" and not wanted.layer and not wanted.split:
                 self._send(Shown(picture, wanted, state), wanted)
 
+        cancelled = _Patient(lambda: not self._open or self._wanted is not wanted)
         frame = self._session.frame(
             wanted.camera,
             wanted.c2w,
             wanted.time,
             layers=(wanted.layer,) if wanted.layer in ("normal", "label") else (),
             preview=preview,
-            cancelled=_Patient(lambda: not self._open or self._wanted is not wanted),
+            cancelled=cancelled,
         )
-        picture = picture_of(wanted.layer, frame)
+        picture = self._with_before(frame, wanted.camera, wanted, cancelled)
         self._keep(picture, frame.layers["depth"], wanted.camera, wanted)
         self._send(Shown(picture, wanted, "full"), wanted)
         return True
@@ -214,18 +237,30 @@ class LiveView:
         # While moving, an older picture to warp is better than none.
         open_ = _Patient(lambda: not self._open)
         frame = self._session.frame(coarse, wanted.c2w, wanted.time, cancelled=open_)
-        picture = picture_of(wanted.layer, frame)
+        picture = self._with_before(frame, coarse, wanted, open_)
         self._keep(picture, frame.layers["depth"], coarse, wanted)
         self._send(Shown(picture, wanted, "coarse"), wanted)
+
+    def _with_before(
+        self, frame: Frame, camera: Camera, wanted: Wanted, cancelled: Callable[[], bool]
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture of a frame, with the place without weather in its left part."""
+        picture = picture_of(wanted.layer, frame)
+        columns = round(wanted.split * camera.width)
+        if not columns:
+            return picture
+        dry = World(self._session.field)
+        options = FrameOptions(cancelled=cancelled)
+        before, _ = render_frame(dry, camera, wanted.c2w, options)
+        return np.concatenate([before[:, :columns], picture[:, columns:]], axis=1)
 
     def _same_content(self, wanted: Wanted) -> bool:
         """Whether the last finished picture shows the same weather and layer."""
         last = self._finished
-        return last is not None and last.content == (wanted.weather, wanted.layer, wanted.time)
+        return last is not None and last.content == _content(wanted)
 
     def _keep(self, picture: np.ndarray, depth: np.ndarray, camera: Camera, at: Wanted) -> None:
-        content = at.weather, at.layer, at.time
-        self._finished = _Finished(picture, depth, camera, at.c2w, content)
+        self._finished = _Finished(picture, depth, camera, at.c2w, _content(at))
 
     def _send(self, shown: Shown, wanted: Wanted) -> None:
         """Show a picture unless its pose is no longer the newest."""
