@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "studies": BELOW_STUDIES | {"styling"},
     "cluster": BELOW_STUDIES,
     "page": BELOW_STUDIES | {"studies"},
-    "viewer": BELOW_STUDIES | {"studies", "page"},
+    "viewer": BELOW_STUDIES | {"studies", "page", "api"},
     "extend": BELOW_RENDER,
     "api": BELOW_STUDIES | {"studies", "styling", "sfm", "perception", "cluster"},
     "cli": BELOW_STUDIES
