@@ -39,8 +39,9 @@ def test_help_has_no_words_of_the_parser(verb, capsys):
         main([verb, "--help"])
     found = capsys.readouterr().out
     assert end.value.code in (0, None) and f"climatenerf {verb}" in found
-    switches = found.replace("--no-complete-ground", "").replace("--no-truth", "")  # on by default
-    assert "None" not in found and "--no-" not in switches
+    for on_by_default in ("complete-ground", "truth", "objects"):
+        found = found.replace(f"--no-{on_by_default}", "")
+    assert "None" not in found and "--no-" not in found
 
 
 def test_boxes_of_utf_8_and_of_ascii_give_the_same_sentence():

@@ -140,6 +140,35 @@ def test_clicks_read_the_depth_of_the_water(browser, place, page_file):
         assert "± 0.04 m" in page.inner_text("#told")
 
 
+def test_what_is_drawn_dry_reads_dry(browser, page_file):
+    page = opened(browser, page_file)
+    set_level(page, 0.4)
+    wrong = page.evaluate(
+        "(() => { let wrong = 0; for (let i = 0; i < shown.flooding.length; i += 7) {"
+        " state.mark = [i % canvas.width, Math.floor(i / canvas.width)];"
+        " if ((markedDepth() > 0) !== (shown.flooding[i] < state.level)) wrong++; }"
+        " return wrong; })()"
+    )
+    assert wrong == 0
+
+
+def test_views_chosen_quickly_keep_their_own_pictures(browser, page_file):
+    page = opened(browser, page_file)
+    page.evaluate("Promise.all([choose(1, 'water'), choose(0, 'water')])")
+    assert page.evaluate("[state.view, shown.index]") == [0, 0]
+    page.evaluate("Promise.all([choose(0, 'water'), choose(1, 'smog', 1), choose(1, 'water')])")
+    assert page.evaluate("[state.view, state.kind, shown.index]") == [1, "water", 1]
+
+
+def test_a_changed_address_is_followed(browser, page_file):
+    page = opened(browser, page_file)
+    page.evaluate("location.hash = '#view=2&show=smog&step=1'")
+    wait_until(page, "state.kind === 'smog'")
+    assert page.evaluate("[state.view, state.step]") == [1, 1]
+    page.get_by_role("radio", name="none").check()
+    assert "step=0" in page.url
+
+
 def test_it_requests_itself_alone_and_works_by_keyboard(browser, page_file):
     page = opened(browser, page_file)
     page.keyboard.press("Tab")

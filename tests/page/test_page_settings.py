@@ -10,10 +10,12 @@ from support.study_yard import yard_place
 from climatenerf.cli.page import Page, settings_of
 from climatenerf.core.errors import UserError
 from climatenerf.page.languages import LANGUAGES
+from climatenerf.page.pictures import page_pictures
 from climatenerf.page.settings import PageSettings
 from climatenerf.page.views import Ground, find_ground, page_views, placed_objects, water_levels
 from climatenerf.render.placed_objects import StaffGauge
 from climatenerf.render.session import RenderSession
+from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.weather import Weather
 
 
@@ -96,7 +98,7 @@ def test_levels_outside_the_scene_are_refused(seen):
     _, views, grounds = seen
     with pytest.raises(UserError, match=r"a water level of 2 m lies above a camera at 1\.60 m"):
         water_levels((2.0,), grounds, views, 0.0)
-    with pytest.raises(UserError, match="far below the lowest ground"):
+    with pytest.raises(UserError, match="below all ground in these views"):
         water_levels((-30.0,), grounds, views, 0.0)
     nothing = [Ground(g.x, np.zeros_like(g.ground), g.t) for g in grounds]
     with pytest.raises(UserError, match="no level ground"):
@@ -115,3 +117,16 @@ def test_gauge_and_figure_stand_once_on_free_ground(seen):
         assert not in_house and 2.5 < each.base[1] < 14
     apart = np.hypot(*(np.array(gauge.base[:2]) - figure.base[:2]))
     assert apart == pytest.approx(0.9, abs=1e-6)
+
+
+def test_water_may_stand_close_below_the_cameras(seen):
+    """Levels are looked for around the ground's height, and none may drown a camera at 1.6 m."""
+    place, _, _ = seen
+    settings = PageSettings(
+        size=(48, 30), view_count=1, levels=(1.45,), snow_depths=(), visibilities=(), seasons=()
+    )
+    murky = Weather(flood=Flood(clarity=0.05))
+    found = page_pictures(place, settings, murky, lambda what, fraction: None)
+    flooding, heights = found.views[0].flooding, found.views[0].heights
+    near = np.isfinite(heights) & (np.abs(heights - 1.45) > 0.05)
+    assert ((flooding < 1.45) == (heights < 1.45))[near].all()

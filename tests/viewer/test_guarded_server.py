@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from climatenerf.core.errors import UserError
-from climatenerf.viewer.guarded_server import OWN_NAMES, is_allowed, start
+from climatenerf.viewer.guarded_server import OWN_NAMES, check_hosts, is_allowed, start
 
 pytest.importorskip("viser", reason="needs viser (make setup installs it)")
 
@@ -28,6 +28,8 @@ pytest.importorskip("viser", reason="needs viser (make setup installs it)")
         ("localhost.evil.example", None, False),
         ("", None, False),
         (None, None, False),
+        ("[::1", None, False),
+        ("localhost:7007", "http://[::1", False),
     ],
 )
 def test_host_and_origin_decide(host, origin, allowed):
@@ -79,6 +81,12 @@ def test_it_listens_on_the_loopback_interface_alone(server):
         if each.status == psutil.CONN_LISTEN and each.laddr.port == server.get_port()
     ]
     assert listening == ["127.0.0.1"]
+
+
+def test_names_of_hosts_have_no_port():
+    check_hosts(("box.example", "Box-2"))
+    with pytest.raises(UserError, match="without port"):
+        check_hosts(("box:7007",))
 
 
 def test_a_port_in_use_is_told(server):

@@ -20,7 +20,9 @@ class Report:
 
     run: tyro.conf.Positional[Path]
     """Run folder made by `climatenerf fit`."""
-    out: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
+    out: Annotated[
+        Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH", help_behavior_hint="")
+    ] = None
     """HTML file to write. Default: report.html in the run folder."""
 
 

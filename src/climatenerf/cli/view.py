@@ -39,9 +39,11 @@ def run(options: View) -> int:
     """
     if not 0 <= options.port < 65536:
         raise UserError("--port must be from 0 to 65535")
-    from climatenerf.viewer.guarded_server import check_installed
+    from climatenerf.viewer.guarded_server import check_hosts, check_installed, check_port
 
     check_installed()
+    check_hosts(options.allow_host)
+    check_port(options.port)
     from climatenerf.training.snapshot import FIELD, identity_of
     from climatenerf.viewer.app import ViewerApp, tunnel_line
 

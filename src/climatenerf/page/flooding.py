@@ -61,7 +61,7 @@ def flooding_levels(
     for begin in range(0, len(asked), CHUNK):
         rays = asked[begin : begin + CHUNK]
         z = flat[rays]
-        levels = _levels(z)
+        levels = _levels(z, highest)
         index = to_device(rays, device)
         given = rays_o[index], rays_d[index], angle[index]
         fractions = _fractions(session, water_at, levels, given)
@@ -69,11 +69,15 @@ def flooding_levels(
     return found.reshape(heights.shape)
 
 
-def _levels(z: Float[np.ndarray, "n"]) -> Float[np.ndarray, "k"]:
-    """Levels at which fractions are computed, for rays that end at these heights (m, ascending)."""
+def _levels(z: Float[np.ndarray, "n"], highest: float) -> Float[np.ndarray, "k"]:
+    """Levels at which fractions are computed, for rays that end at these heights (m, ascending).
+
+    None lies above the highest level of the page, beyond which water may drown a camera.
+    """
     count = int(np.clip((z[-1] - z[0]) / SPACING, *BETWEEN))
     inner = np.linspace(z[0], z[-1], count)
-    return np.unique(np.concatenate([z[0] - AROUND, inner, z[-1] + AROUND]))
+    around = np.concatenate([z[0] - AROUND, inner, z[-1] + AROUND, [highest - AROUND[0]]])
+    return np.unique(np.minimum(around, highest))
 
 
 @torch.no_grad()
@@ -121,4 +125,5 @@ def _crossing(
     level = np.where(
         first == 0, z - AROUND[-1], np.where(first == len(levels), z + AROUND[-1], level)
     )
-    return np.clip(level, z - AROUND[-1], z + AROUND[-1])
+    level = np.clip(level, z - AROUND[-1], z + AROUND[-1])
+    return np.where(first == len(levels), np.maximum(z, levels[-1] + AROUND[0]), level)

@@ -258,8 +258,9 @@ def _ground(scene: Scene, terrain: Terrain | None, given: Evidence) -> str:
         )
     )
     wide = picture.shape[1] * metres
+    seen = "not measured" if given.ground_seen is None else percent(given.ground_seen)
     rows = [
-        ("ground within 10 m of the cameras that photos show", percent(given.ground_seen or 0.0)),
+        ("ground within 10 m of the cameras that photos show", seen),
         ("median error of its height", f"{100 * float(np.median(terrain.error)):.0f} cm"),
         ("height of the datum", f"{scene.ground_z:.2f} m in the world frame"),
         ("lowest ground near the path", f"{scene.lowest_ground_z - scene.ground_z:.2f} m"),

@@ -138,10 +138,10 @@ def water_levels(
                 f"a water level of {max(given):g} m lies above a camera at {lowest_eye:.2f} m;"
                 " give lower --levels, or other --views"
             )
-        if z.size and min(given) < z.min() - 10:
+        if z.size and max(given) < z.min():
             raise UserError(
-                f"a water level of {min(given):g} m lies far below the lowest ground in these views"
-                f" ({z.min():.2f} m); give higher --levels"
+                f"a water level of {max(given):g} m lies below all ground in these views, which"
+                f" begins at {z.min():.2f} m; give higher --levels, or other --views"
             )
         return sorted(set(given))
     if z.size < 10:

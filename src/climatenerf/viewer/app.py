@@ -1,5 +1,8 @@
 """The viewer: one session, one set of controls and one live view for each browser tab."""
 
+import html
+import io
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -7,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.rotations import quaternions, rotation_matrices
-from climatenerf.core.storage import make_folder, write_json
+from climatenerf.core.storage import make_folder, write_bytes, write_json
 from climatenerf.paths.camera_path import still
 from climatenerf.paths.key_poses import through
 from climatenerf.paths.nerfstudio import DrawnPath, write_drawn_path
@@ -74,7 +77,11 @@ class ViewerApp:
     def _connected(self, client: "viser.ClientHandle") -> None:
         tab = Tab(self, client)
         with self._lock:
-            self.tabs[client.client_id] = tab
+            here = client.client_id in self.server.get_clients()
+            if here:
+                self.tabs[client.client_id] = tab
+        if not here:  # it has left while the tab was built
+            tab.live.close()
 
     def _left(self, client: "viser.ClientHandle") -> None:
         with self._lock:
@@ -109,15 +116,21 @@ class Tab:
         self.session = self._new_session()
         self.shown: Shown | None = None
         self.keyframes: list[tuple[np.ndarray, float]] = []
+        self._asking = threading.Lock()
+        self._saved_pose: tuple[np.ndarray, Path] | None = None
         client.camera.position = tuple(eye.c2w[0, :3, 3])
         client.camera.wxyz = tuple(quaternions(eye.c2w[0, :3, :3]))
         client.camera.fov = float(2 * np.arctan(0.5 * eye.cameras[0].height / eye.cameras[0].fy))
         self.live = LiveView(self.session, self._show, self._tell)
-        self._build(client.gui)
-        client.camera.on_update(lambda _: self._ask())
-        client.scene.on_click()(self._clicked)
-        self._add_level_handle(eye.c2w[0])
-        self._ask()
+        try:
+            self._build(client.gui)
+            self._add_level_handle(eye.c2w[0])
+            client.camera.on_update(lambda _: self._ask())
+            client.scene.on_click()(self._clicked)
+            self._ask()
+        except BaseException:
+            self.live.close()
+            raise
 
     def _new_session(self) -> RenderSession:
         place = self.app.place
@@ -139,7 +152,8 @@ class Tab:
 
     def _build(self, gui: Any) -> None:
         scene = self.app.place.scene
-        gui.add_markdown(f"**{scene.root.resolve().name}**: simulated weather, no forecast")
+        name = html.escape(scene.root.resolve().name)
+        gui.add_markdown(f"**{name}**: simulated weather, no forecast")
         self._message = gui.add_markdown(" ")
         self._measured = gui.add_markdown("Click the picture to measure.")
         low = scene.lowest_ground_z - scene.ground_z - 0.5
@@ -200,7 +214,7 @@ class Tab:
                 self.controls.set("flood.level", level)
 
     def _tell(self, sentence: str) -> None:
-        self._message.content = f"**{sentence}**" if sentence else " "
+        self._message.content = f"**{html.escape(sentence)}**" if sentence else " "
 
     def _preparing(self, what: str, fraction: float) -> None:
         self._tell(f"preparing {what}: {100 * fraction:.0f} %")
@@ -208,7 +222,7 @@ class Tab:
     def _saved(self, save: Callable[[], Path]) -> None:
         try:
             self._tell(f"saved {save()}")
-        except UserError as error:
+        except (UserError, OSError) as error:
             self._tell(str(error))
 
     # --- pictures -------------------------------------------------------------------------------
@@ -238,14 +252,22 @@ class Tab:
         )
 
     def _ask(self) -> None:
-        wanted = self.wanted()
-        self.live.ask(wanted)
+        with self._asking:  # a callback of an older pose must not overtake a newer one
+            wanted = self.wanted()
+            self.live.ask(wanted)
         size = wanted.camera.width, wanted.camera.height
-        path = str(self.app.run / VIEWS / "camera_path.json") if self.keyframes else "still"
         weather = self.controls.weather
+        path = self._path_of(wanted)
         command = render_command(self.app.run, weather, self.session.effects, path, size)
         if self._command.value != command:
             self._command.value = command
+
+    def _path_of(self, wanted: Wanted) -> str:
+        """Return the --path that shows a pose: that of a saved picture, or of the key poses."""
+        saved = self._saved_pose
+        if saved is not None and np.array_equal(saved[0], wanted.c2w):
+            return str(saved[1])
+        return str(self.app.run / VIEWS / "camera_path.json") if self.keyframes else "still"
 
     def _show(self, shown: Shown) -> None:
         self.shown = shown
@@ -269,9 +291,17 @@ class Tab:
         if shown is None or shown.state != "full":
             raise UserError("the picture is not finished yet; wait until it is, and save again")
         folder = make_folder(self.app.run / VIEWS)
-        number = len(list(folder.glob("view-*.png"))) + 1
-        path = folder / f"view-{number:04d}.png"
-        Image.fromarray(shown.picture).save(path)
+        path = folder / f"view-{_next_number(folder, 'view')}.png"
+        picture = io.BytesIO()
+        Image.fromarray(shown.picture).save(picture, "PNG", pnginfo=_simulated())
+        write_bytes(path, picture.getvalue())
+        wanted = shown.wanted
+        size = wanted.camera.width, wanted.camera.height
+        fov = np.array([_vertical_fov(wanted.camera)])
+        drawn = DrawnPath(wanted.c2w[None], fov, size, FPS, "")
+        pose = path.with_name(f"{path.stem}-pose.json")
+        write_drawn_path(pose, self.app.place.scene, drawn)
+        self._saved_pose = wanted.c2w, pose
         sidecar = {
             "simulated": True,
             "note": "weather is simulated",
@@ -282,6 +312,7 @@ class Tab:
             "scale_error": self.app.place.scene.scale_error,
         }
         write_json(path.with_suffix(".json"), sidecar)
+        self._ask()
         return path
 
     def add_keyframe(self) -> Path:
@@ -316,7 +347,7 @@ class Tab:
             raise UserError("a movie is being rendered; wait until it is finished")
         try:
             folder = make_folder(run / VIEWS)
-            out = folder / f"movie-{len(list(folder.glob('movie-*'))) + 1:04d}"
+            out = folder / f"movie-{_next_number(folder, 'movie')}"
             fitted = Run(run, place.field, place.scene, self.app.digest, style=place.style)  # pyright: ignore[reportArgumentType]
             return render_movie(
                 fitted,
@@ -333,6 +364,23 @@ class Tab:
 def _vertical_fov(camera: Camera) -> float:
     """Vertical field of view, degrees."""
     return float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy)))
+
+
+def _next_number(folder: Path, kind: str) -> str:
+    """Return the number after the greatest of the folder's files of a kind, four digits."""
+    numbers = [
+        int(found[1])
+        for each in folder.iterdir()
+        if (found := re.match(rf"{kind}-(\d+)", each.name)) is not None
+    ]
+    return f"{max(numbers, default=0) + 1:04d}"
+
+
+def _simulated() -> PngImagePlugin.PngInfo:
+    """Text chunk that marks a picture as simulated."""
+    info = PngImagePlugin.PngInfo()
+    info.add_text("simulated", "weather simulated by climatenerf")
+    return info
 
 
 def tunnel_line(port: int) -> str:

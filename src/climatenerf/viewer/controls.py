@@ -2,6 +2,7 @@
 
 import math
 import shlex
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -110,9 +111,11 @@ class WeatherControls:
         self._sliders: dict[str, Any] = {}
         self._switches: dict[str, Any] = {}
         self._updating = False
+        self._lock = threading.RLock()  # viser runs callbacks on many threads
         order = {name: index for index, name in enumerate(MAIN)}
         for effect in sorted(self._effects, key=lambda each: order.get(each.name, len(order))):
-            fields = effect.fields()
+            # Folders of this machine are nothing that a page may name.
+            fields = {k: v for k, v in effect.fields().items() if not isinstance(v, Folder)}
             main = [item for item in MAIN.get(effect.name, fields) if item in fields]
             rest = [item for item in fields if item not in main]
             with gui.add_folder(effect.name):
@@ -132,10 +135,7 @@ class WeatherControls:
         switch = gui.add_checkbox("on", effect.present(self.weather.sections[effect.name]))
         self._switches[effect.name] = switch
 
-        @switch.on_update
-        def _(_: Any) -> None:
-            if self._updating:
-                return
+        def changed() -> None:
             main = f"{effect.name}.{effect.enabled_by[0]}"
             if switch.value:
                 if main in self._sliders:
@@ -146,6 +146,8 @@ class WeatherControls:
             else:
                 for item in effect.enabled_by:
                     self.set(f"{effect.name}.{item}", None)
+
+        self._listen(switch, changed)
 
     def _add(self, gui: Any, name: str, parameter: Parameter, levels: tuple[float, float]) -> None:
         title = name.partition(".")[2].replace("_", " ")
@@ -159,10 +161,7 @@ class WeatherControls:
         shown = gui.add_dropdown(title, parameter.words, initial_value=value)
         self._texts[name] = shown
 
-        @shown.on_update
-        def _(_: Any) -> None:
-            if not self._updating:
-                self.set(name, shown.value)
+        self._listen(shown, lambda: self.set(name, shown.value, shown))
 
     def _add_number(
         self, gui: Any, name: str, title: str, parameter: Parameter, levels: tuple[float, float]
@@ -182,61 +181,82 @@ class WeatherControls:
             )
             self._sliders[name] = _Scaled(slider, scale)
 
-            @slider.on_update
-            def _(_: Any) -> None:
-                if not self._updating:
-                    self.set(name, slider.value * scale)
+            self._listen(slider, lambda: self.set(name, slider.value * scale, slider))
 
         text = gui.add_text("" if found is not None else title, "")
         self._texts[name] = text
 
-        @text.on_update
-        def _(_: Any) -> None:
-            if self._updating:
-                return
+        def typed() -> None:
             try:
-                self.set(name, parameter.parse(text.value, name.replace("_", "-")))
+                self.set(name, parameter.parse(text.value, name.replace("_", "-")), text)
             except UserError as error:
                 self._tell(str(error))
 
+        self._listen(text, typed)
+
+    def _listen(self, control: Any, changed: Callable[[], None]) -> None:
+        """Call a function when a user changes a control, one at a time."""
+
+        @control.on_update
+        def _(_: Any) -> None:
+            with self._lock:
+                if not self._updating:
+                    changed()
+
     # --- values ---------------------------------------------------------------------------------
 
-    def set(self, name: str, value: Any) -> None:
-        """Change one parameter, named as "flood.level"; what does not fit is told and not taken."""
-        weather = self.weather.with_value(name, value)
-        effect = next(each for each in self._effects if each.name == name.partition(".")[0])
-        for pair in effect.alternatives:  # one of two replaces the other, as on the command line
-            if name.partition(".")[2] in pair and value is not None:
-                other = pair[1 - pair.index(name.partition(".")[2])]
-                default = effect.defaults()[other]
-                weather = weather.with_value(f"{effect.name}.{other}", default)
-        try:
-            check(weather, self._effects)
-        except UserError as error:
-            self._tell(str(error))
-            return
-        self.weather = weather
-        self._tell("")
-        self._show()
-        self._changed(weather)
+    def set(self, name: str, value: Any, source: Any = None) -> None:
+        """Change one parameter; what does not fit is told and not taken.
 
-    def _show(self) -> None:
-        """Let all controls show the weather."""
-        self._updating = True
-        for effect in self._effects:
-            for item, parameter in effect.fields().items():
-                name = f"{effect.name}.{item}"
-                value = self.weather.value(name)
-                shown = value if isinstance(parameter, Choice) else _text(parameter, value)
-                if self._texts[name].value != shown:
-                    self._texts[name].value = shown
-                if name in self._sliders and value is not None:
-                    self._sliders[name].show(value)
-            if effect.name in self._switches:
-                present = effect.present(self.weather.sections[effect.name])
-                if self._switches[effect.name].value != present:
-                    self._switches[effect.name].value = present
-        self._updating = False
+        Args:
+            name: such as "flood.level".
+            value: SI.
+            source: the control that a user has moved or types into, which is left as it is.
+        """
+        with self._lock:
+            weather = self.weather.with_value(name, value)
+            effect = next(each for each in self._effects if each.name == name.partition(".")[0])
+            for pair in effect.alternatives:  # one replaces the other, as on the command line
+                if name.partition(".")[2] in pair and value is not None:
+                    other = pair[1 - pair.index(name.partition(".")[2])]
+                    default = effect.defaults()[other]
+                    weather = weather.with_value(f"{effect.name}.{other}", default)
+            try:
+                check(weather, self._effects)
+            except UserError as error:
+                self._tell(str(error))
+                return
+            if weather == self.weather:
+                return
+            self.weather = weather
+            self._tell("")
+            self._show(source)
+            self._changed(weather)
+
+    def _show(self, source: Any = None) -> None:
+        """Let all controls but one show the weather."""
+        with self._lock:
+            self._updating = True
+            try:
+                for effect in self._effects:
+                    self._show_effect(effect, source)
+            finally:
+                self._updating = False
+
+    def _show_effect(self, effect: Effect, source: Any) -> None:
+        for item, parameter in effect.fields().items():
+            name = f"{effect.name}.{item}"
+            text, slider = self._texts.get(name), self._sliders.get(name)
+            value = self.weather.value(name)
+            shown = value if isinstance(parameter, Choice) else _text(parameter, value)
+            if text is not None and text is not source and text.value != shown:
+                text.value = shown
+            if slider is not None and not slider.moves(source) and value is not None:
+                slider.show(value)
+        switch = self._switches.get(effect.name)
+        present = effect.present(self.weather.sections[effect.name])
+        if switch is not None and switch.value != present:
+            switch.value = present
 
 
 def _step(span: float) -> float:
@@ -254,6 +274,9 @@ class _Scaled:
     def value(self) -> float:
         return self._slider.value * self._scale
 
+    def moves(self, control: Any) -> bool:
+        return control is self._slider
+
     def show(self, value: float) -> None:
         shown = min(max(value / self._scale, self._slider.min), self._slider.max)
         if abs(self._slider.value - shown) > 1e-9:
@@ -264,6 +287,8 @@ def _text(parameter: Parameter, value: Any) -> str:
     """Return a value as the text field shows it; `Parameter.parse` reads it."""
     if value is None:
         return "none"
+    if isinstance(value, str):
+        return value
     if isinstance(value, tuple):
         return " ".join(f"{x:g}" for x in value)
     return parameter.text(value) if parameter.kind is not None else f"{value:g}"

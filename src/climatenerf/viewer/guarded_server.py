@@ -8,12 +8,13 @@ has one, must equal its Host, since the GUI's own page comes from there.
 import contextlib
 import http
 import io
+import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, one_line
 
 if TYPE_CHECKING:
     import viser
@@ -44,9 +45,12 @@ def is_allowed(host: str | None, origin: str | None, names: Sequence[str]) -> bo
         origin: header Origin; None without one.
         names: host names that count as this machine.
     """
-    if host is None or (urlsplit(f"//{host}").hostname or "") not in names:
+    try:
+        if host is None or (urlsplit(f"//{host}").hostname or "") not in names:
+            return False
+        return origin is None or urlsplit(origin).netloc == host
+    except ValueError:  # neither is a name
         return False
-    return origin is None or urlsplit(origin).netloc == host
 
 
 @contextlib.contextmanager
@@ -75,6 +79,37 @@ def guarded(names: Sequence[str]) -> Iterator[None]:
         websockets_server.serve = original
 
 
+def check_port(port: int) -> None:
+    """Check that a port is free.
+
+    Raises:
+        UserError: it is in use or cannot be opened.
+    """
+    # viser counts a taken port up without a word.
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            raise UserError(
+                f"port {port} is in use or cannot be opened; give another --port, or --port 0 for"
+                " a free one"
+            ) from error
+
+
+def check_hosts(names: Sequence[str]) -> None:
+    """Check names that are given besides the loopback's.
+
+    Raises:
+        UserError: one is not the name of a host alone.
+    """
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z0-9._-]+", name):
+            raise UserError(
+                f'--allow-host must be the name of a host, without port; got "{one_line(name, 60)}"'
+            )
+
+
 def start(port: int, allowed_hosts: Sequence[str] = ()) -> "viser.ViserServer":
     """Start a server on the loopback interface.
 
@@ -88,18 +123,10 @@ def start(port: int, allowed_hosts: Sequence[str] = ()) -> "viser.ViserServer":
     check_installed()
     import viser
 
-    # viser counts a taken port up without a word.
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            raise UserError(
-                f"port {port} is in use or cannot be opened; give another --port, or --port 0 for"
-                " a free one"
-            ) from error
+    check_port(port)
+    names = [name.lower() for name in allowed_hosts]
     # viser prints a box of addresses, of which one would be taken for ours.
-    with guarded((*OWN_NAMES, *allowed_hosts)), contextlib.redirect_stdout(io.StringIO()):
+    with guarded((*OWN_NAMES, *names)), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False)
     server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
     return server

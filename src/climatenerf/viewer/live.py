@@ -5,6 +5,7 @@ newest pose meanwhile. What is asked for lies in a mailbox of one place: newer r
 older ones, and cancel their finer passes. No GUI is known here.
 """
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -182,11 +183,11 @@ class LiveView:
                 finest = self._render(wanted)
             except RenderCancelled:
                 continue
-            except UserError as error:
-                self._tell(str(error))
-                finest = True
             except Exception as error:  # the viewer goes on with the next request
-                self._tell(f"internal error: {type(error).__name__}: {error}")
+                known = isinstance(error, UserError)
+                with contextlib.suppress(Exception):  # the tab may be gone
+                    kind = "" if known else f"internal error: {type(error).__name__}: "
+                    self._tell(f"{kind}{error}")
                 finest = True
             if finest:
                 done = wanted
@@ -198,9 +199,13 @@ class LiveView:
         if following is not None:
             self._session, self._put_in, self._finished = following, None, None
         if self._put_in != wanted.weather:
-            self._session.change(wanted.weather)
             self._put_in = wanted.weather
-            self._tell("")
+            try:
+                self._session.change(wanted.weather)
+                self._session.world(wanted.time)  # prepares what is put off until it is seen
+                self._tell("")
+            except UserError as error:  # the weather of before stays in
+                self._tell(str(error))
         moving = time.monotonic() - self._moved < STILL
         if moving or not self._same_content(wanted):
             self._render_coarse(wanted, COARSE if moving else FIRST)
@@ -218,7 +223,7 @@ class LiveView:
             wanted.camera,
             wanted.c2w,
             wanted.time,
-            layers=(wanted.layer,) if wanted.layer in ("normal", "label") else (),
+            layers=(wanted.layer,),
             preview=preview,
             cancelled=cancelled,
         )
@@ -236,7 +241,11 @@ class LiveView:
         )
         # While moving, an older picture to warp is better than none.
         open_ = _Patient(lambda: not self._open)
-        frame = self._session.frame(coarse, wanted.c2w, wanted.time, cancelled=open_)
+        frame = self._session.frame(
+            coarse, wanted.c2w, wanted.time, layers=(wanted.layer,), cancelled=open_
+        )
+        if wanted.layer and wanted.layer not in frame.layers:
+            self._tell(f"this place has no layer {wanted.layer}")
         picture = self._with_before(frame, coarse, wanted, open_)
         self._keep(picture, frame.layers["depth"], coarse, wanted)
         self._send(Shown(picture, wanted, "coarse"), wanted)
@@ -273,6 +282,14 @@ class LiveView:
     # --- warping ------------------------------------------------------------------------------
 
     def _warp_all(self) -> None:
+        while self._open:
+            try:
+                self._warp_until_closed()
+            except Exception as error:  # the viewer goes on with the next pose
+                with contextlib.suppress(Exception):
+                    self._tell(f"internal error: {type(error).__name__}: {error}")
+
+    def _warp_until_closed(self) -> None:
         last: Wanted | None = None
         while True:
             with self._changed:

@@ -78,15 +78,16 @@ async function mapsOf(view) {
   return { flooding, heights };
 }
 
-/** Decode what a view needs; pictures of other kinds follow when they are chosen. */
+/** Decode what a view needs, and return it; pictures of other kinds follow when they are chosen. */
 async function load(index, kind) {
   const view = data.views[index];
-  if (!shown || shown.index !== index) {
+  let held = shown && shown.index === index ? shown : null;
+  if (!held) {
     const [maps, dry] = await Promise.all([mapsOf(view), colours(view.dry)]);
-    shown = { index, ...maps, dry };
+    held = { index, ...maps, dry };
   }
-  const held = shown;
   if (!held[kind]) held[kind] = await Promise.all(view[kind].map(colours));
+  return held;
 }
 
 /** Blend two packed pixels; weight of the second in 256ths. */
@@ -178,9 +179,8 @@ function draw() {
 
 function caption() {
   if (state.kind !== "water") return stepText(state.kind, state.step);
-  const narrow = canvas.clientWidth > 0 && canvas.clientWidth < 520;
-  const datum = data.datum ? ` ${words.above_datum} ${data.datum}` : narrow ? "" : ` ${words.above}`;
-  return `${words.level} ${metres(state.level)}${plusMinus(heightError(state.level))}${datum}`;
+  const datum = data.datum ? `${words.above_datum} ${data.datum}` : words.above;
+  return `${words.level} ${metres(state.level)}${plusMinus(heightError(state.level))} ${datum}`;
 }
 
 /** Draw the texts into the picture, so that they travel with every copy of it. */
@@ -268,10 +268,11 @@ function markedHeight() {
   return shown.heights[state.mark[1] * canvas.width + state.mark[0]];
 }
 
-/** Depth of the water at the mark, m; 0 where it is dry. */
+/** Depth of the water at the mark, m; 0 where it is drawn dry. */
 function markedDepth() {
   const height = markedHeight();
-  return height === null ? 0 : Math.max(0, state.level - height);
+  if (height === null || shown.flooding[state.mark[1] * canvas.width + state.mark[0]] >= state.level) return 0;
+  return Math.max(data.step, state.level - height);
 }
 
 function measured() {
@@ -327,13 +328,15 @@ async function choose(view, kind, step = 0) {
   if (view !== state.view) state.mark = null;
   const wanted = [view, kind].join();
   choose.wanted = wanted;
+  let held;
   try {
-    await load(view, kind);
+    held = await load(view, kind);
   } catch (error) {
     find("told").textContent = words.broken;
     throw error;
   }
   if (choose.wanted !== wanted) return; // another was chosen meanwhile
+  shown = held;
   Object.assign(state, { view, kind, step });
   find("told").textContent = "";
   find("water").hidden = kind !== "water";
@@ -349,6 +352,7 @@ async function choose(view, kind, step = 0) {
     radios(find("steps"), "step", texts, step, chosen => {
       state.step = chosen;
       draw();
+      remember();
     });
   }
   draw();
@@ -457,6 +461,12 @@ function start() {
   radios(find("views"), "view", data.views.map((_, i) => `${words.view} ${i + 1}`), view,
     chosen => choose(chosen, state.kind, state.step));
   addEventListener("resize", () => draw());
+  addEventListener("hashchange", () => {
+    const [other, what, which] = fromAddress();
+    slider.value = state.level;
+    find("views").querySelectorAll("input").forEach((each, i) => { each.checked = i === other; });
+    choose(other, what, which);
+  });
   return choose(view, kind, step);
 }
 
