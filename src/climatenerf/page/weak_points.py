@@ -177,7 +177,7 @@ def _pictures(given: Evidence) -> list[WeakPoint]:
             WeakPoint(
                 "No classes",
                 "the run was fitted without class labels of the ground and what stands on it",
-                "seasons are refused; roofs, crowns and ground are told apart by shape alone",
+                "seasons are refused; roofs, crowns and ground are distinguished by shape alone",
                 "give labels by --labels",
             )
         )

@@ -16,11 +16,10 @@ from torch import Tensor
 
 from climatenerf.core.classes import SOLID, TERRAIN, UNKNOWN
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.core.samples import COMPLETED, Samples
+from climatenerf.core.samples import COMPLETED
 from climatenerf.field.capabilities import COMPLETES
-from climatenerf.field.inserted import NO_ID, OPTICAL_DEPTH, with_surface
+from climatenerf.field.inserted import FieldWithSurface
 from climatenerf.field.protocol import observed
-from climatenerf.field.wrapped import WrappedField
 from climatenerf.ops import heightfield
 from climatenerf.ops.heightfield_reference import bilinear
 from climatenerf.scene.terrain import Terrain, nearest_known
@@ -34,9 +33,11 @@ SMOOTHING = 20  # steps of diffusion at each level of a continuation
 
 
 @dataclass(frozen=True)
-class CompletedField(WrappedField):
+class CompletedField(FieldWithSurface):
     """A field (`field.protocol.RadianceField`) with completed ground."""
 
+    surface_id = COMPLETED
+    extent = THICKNESS
     terrain: Terrain
     """The ground; its `completed` nodes are what this class adds."""
 
@@ -94,7 +95,7 @@ class CompletedField(WrappedField):
         """Convert positions (world m) to cells of the raster."""
         return (x - self._origin) / self.terrain.cell
 
-    def _on_ground(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    def on_surface(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         """Return which positions (world m) lie on completed ground."""
         at = self._cells(x)
         height = bilinear(self._height, at[:, :2])
@@ -128,60 +129,16 @@ class CompletedField(WrappedField):
         """Those of the field, but for rendering in one launch; and `COMPLETES`."""
         return super().capabilities | {COMPLETES}
 
-    def march(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        t_min: Float[Tensor, "n"],
-        t_max: Float[Tensor, "n"],
-        step_scale: float = 1.0,
-        *,
-        stop: float = 1e-3,
-        pruning_threshold: float | None = None,
-    ) -> Samples:
-        """Samples of the field, and one where a ray meets completed ground."""
-        t = self.crossing(rays_o, rays_d, t_min, t_max)
-        hit = (t < t_max).nonzero()[:, 0]
-        t_end = torch.minimum(t_max, t)  # what lies below the completed ground is no evidence
-        inner = self.field.march(
-            rays_o,
-            rays_d,
-            t_min,
-            t_end,
-            step_scale,
-            stop=stop,
-            pruning_threshold=pruning_threshold,
-        )
-        if not hit.numel():
-            return inner
-        return with_surface(inner, t, hit, THICKNESS, COMPLETED)
+    def solid(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Return which positions (world m) lie on completed ground."""
+        return self.on_surface(x)
 
-    def colour(
-        self,
-        x: Float[Tensor, "s 3"],
-        d: Float[Tensor, "n 3"],
-        ray: Int[Tensor, "s"] | None = None,
-        *,
-        ids: Int[Tensor, "s"] | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
-    ) -> Float[Tensor, "s 3"]:
-        """Linear radiance; that of completed ground is the same in all directions."""
-        own = self._on_ground(x) if ids is None else ids == COMPLETED
-        # Samples of a field without ids have `NO_ID`.
-        inner_ids = ids if ids is None or not bool((ids[~own] == NO_ID).any()) else None
-        if not bool(own.any()):
-            return self.field.colour(x, d, ray, ids=inner_ids, appearance=appearance)
-        rows = torch.arange(x.shape[0], device=x.device) if ray is None else ray
-        colour = torch.empty(x.shape[0], 3, device=x.device)
-        rest = ~own
-        inner_ids = None if inner_ids is None else inner_ids[rest]
-        colour[rest] = self.field.colour(
-            x[rest], d, rows[rest], ids=inner_ids, appearance=appearance
-        )
-        at = self._cells(x[own])[:, :2]
-        raster = self._colour_raster(appearance)
-        colour[own] = torch.stack([bilinear(raster[..., k], at) for k in range(3)], dim=-1)
-        return colour
+    def surface_radiance(
+        self, x: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None
+    ) -> Float[Tensor, "n 3"]:
+        """Return linear radiance of completed ground at positions (world m)."""
+        at, raster = self._cells(x)[:, :2], self._colour_raster(appearance)
+        return torch.stack([bilinear(raster[..., k], at) for k in range(3)], dim=-1)
 
     def ground_height(self, xy: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
         """Height of the terrain (world m) at horizontal positions (m).
@@ -193,40 +150,17 @@ class CompletedField(WrappedField):
         known = ((at >= 0) & (at <= side)).all(-1) & (bilinear(self._bridged, at) > 0.5)
         return torch.where(known, bilinear(self._surface, at) * self.terrain.cell, torch.nan)
 
-    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Extinction at positions (m), 1/m."""
-        own = self._on_ground(x)
-        return torch.where(own, OPTICAL_DEPTH / THICKNESS, self.field.density(x))
-
-    def surface_heads(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        samples: Samples,
-        selected: Int[Tensor, "k"],
-    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
-        """Normals and class logits of some samples; of the raster on completed ground."""
-        normal, logits = self.field.surface_heads(rays_o, rays_d, samples, selected)
-        ray = samples.ray_index()[selected]
-        x = rays_o[ray] + samples.t[selected, None] * rays_d[ray]
-        if samples.ids is None:
-            completed = self._on_ground(x)
-        else:
-            completed = samples.ids[selected] == COMPLETED
-        own = completed.nonzero()[:, 0]
-        at = self._cells(x[own])[:, :2]
-        normal[own] = self._normal(at)
+    def surface_class(self, x: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+        """Return classes of the raster at positions (world m), as indices in `SOLID`."""
+        at = self._cells(x)
         rows, columns = self._label.shape
         column = at[:, 0].round().long().clamp(0, columns - 1)
         row = at[:, 1].round().long().clamp(0, rows - 1)
-        # As sure as a trained head: a logit of 10 against 0.
-        classes = torch.nn.functional.one_hot(self._label[row, column], logits.shape[1])
-        logits[own] = 10.0 * classes.to(logits)
-        return normal, logits
+        return self._label[row, column]
 
-    def _normal(self, at: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
-        """Unit normals of the raster at positions in cells."""
-        step = torch.eye(2, device=at.device)
+    def surface_normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return unit normals of the raster at positions (world m)."""
+        at, step = self._cells(x)[:, :2], torch.eye(2, device=x.device)
         slope = [
             bilinear(self._surface, at + step[k]) - bilinear(self._surface, at - step[k])
             for k in range(2)

@@ -19,11 +19,9 @@ from torch import Tensor
 
 from climatenerf.core.classes import PERSON, SOLID_OF
 from climatenerf.core.device import to_device
-from climatenerf.core.samples import PLACED, Samples
-from climatenerf.field.capabilities import CLASSES
-from climatenerf.field.inserted import NO_ID, OPTICAL_DEPTH, with_surface
+from climatenerf.core.samples import PLACED
+from climatenerf.field.inserted import FieldWithSurface
 from climatenerf.field.protocol import RadianceField, observed
-from climatenerf.field.wrapped import WrappedField
 
 FIGURE_HEIGHT = 1.75
 """m."""
@@ -254,7 +252,7 @@ def _capsule_distance(
 
 
 @dataclass(frozen=True)
-class PlacedField(WrappedField):
+class PlacedField(FieldWithSurface):
     """A field (`field.protocol.RadianceField`) with objects in it.
 
     Attributes:
@@ -263,70 +261,41 @@ class PlacedField(WrappedField):
         irradiance: linear irradiance on open level ground, which lights the objects.
     """
 
+    surface_id = PLACED
+    extent = EXTENT
     objects: Sequence[PlacedObject]
     irradiance: Float[Tensor, "3"]
-
-    def _on_object(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        return self._nearest(x)[0].abs() < NEAR_SURFACE
 
     def _nearest(self, x: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
         """Signed distance (m) to the nearest object, and its index."""
         distances = torch.stack([each.signed_distance(x) for each in self.objects])
         return distances.min(0)
 
-    def march(
+    def crossing(
         self,
         rays_o: Float[Tensor, "n 3"],
         rays_d: Float[Tensor, "n 3"],
         t_min: Float[Tensor, "n"],
         t_max: Float[Tensor, "n"],
-        step_scale: float = 1.0,
-        *,
-        stop: float = 1e-3,
-        pruning_threshold: float | None = None,
-    ) -> Samples:
-        """Samples of the field up to the first object, and one on it."""
+    ) -> Float[Tensor, "n"]:
+        """Return the ray lengths (m) at which rays meet the first object; +inf elsewhere."""
         t = torch.stack([each.distance(rays_o, rays_d) for each in self.objects]).amin(0)
-        t = torch.where(t > t_min, t, torch.inf)
-        hit = (t < t_max).nonzero()[:, 0]
-        inner = self.field.march(
-            rays_o,
-            rays_d,
-            t_min,
-            torch.minimum(t_max, t),
-            step_scale,
-            stop=stop,
-            pruning_threshold=pruning_threshold,
-        )
-        return with_surface(inner, t, hit, EXTENT, PLACED) if hit.numel() else inner
+        return torch.where(t > t_min, t, torch.inf)
 
-    def colour(
-        self,
-        x: Float[Tensor, "s 3"],
-        d: Float[Tensor, "n 3"],
-        ray: Int[Tensor, "s"] | None = None,
-        *,
-        ids: Int[Tensor, "s"] | None = None,
-        appearance: Float[Tensor, "1 e"] | None = None,
-    ) -> Float[Tensor, "s 3"]:
-        """Linear radiance; objects are matt and lit by an even sky and the ground below it."""
-        own = self._on_object(x) if ids is None else ids == PLACED
-        rest = ~own
-        inner_ids = None if ids is None else ids[rest]
-        if inner_ids is not None and bool((inner_ids == NO_ID).any()):
-            inner_ids = None
-        rows = torch.arange(x.shape[0], device=x.device) if ray is None else ray
-        colour = torch.empty(x.shape[0], 3, device=x.device)
-        colour[rest] = self.field.colour(
-            x[rest], d, rows[rest], ids=inner_ids, appearance=appearance
-        )
-        if bool(own.any()):
-            colour[own] = self._radiance(x[own])
-        return colour
+    def on_surface(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Return which positions (world m) lie on an object."""
+        return self._nearest(x)[0].abs() < NEAR_SURFACE
 
-    def _radiance(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        up = self._normal(x)[:, 2:]
-        # An even hemisphere above, light ground below: the closed form for a tilted plane.
+    def solid(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Return which positions (world m) lie in an object."""
+        return self._nearest(x)[0] < 0
+
+    def surface_radiance(
+        self, x: Float[Tensor, "n 3"], appearance: Float[Tensor, "1 e"] | None
+    ) -> Float[Tensor, "n 3"]:
+        """Return linear radiance of matt objects below an even sky, at positions (world m)."""
+        up = self.surface_normal(x)[:, 2:]
+        # An even hemisphere above, darker ground below: the closed form for a tilted plane.
         sky, ground = (1 + up) / 2, GROUND_ALBEDO * (1 - up) / 2
         nearest = self._nearest(x)[1]
         albedo = torch.empty_like(x)
@@ -335,8 +304,8 @@ class PlacedField(WrappedField):
             albedo[mine] = each.albedo(x[mine])
         return albedo * (sky + ground) * self.irradiance / math.pi
 
-    def _normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-        """Outward unit normals by central differences of the signed distance."""
+    def surface_normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+        """Return outward unit normals, by central differences of the signed distance."""
         step = 1e-3  # m
         slopes = []
         for axis in range(3):
@@ -345,30 +314,9 @@ class PlacedField(WrappedField):
             slopes.append(self._nearest(x + shift)[0] - self._nearest(x - shift)[0])
         return torch.nn.functional.normalize(torch.stack(slopes, dim=-1), dim=-1)
 
-    def density(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Extinction at positions (m), 1/m."""
-        inside = self._nearest(x)[0] < 0
-        return torch.where(inside, OPTICAL_DEPTH / EXTENT, self.field.density(x))
-
-    def surface_heads(
-        self,
-        rays_o: Float[Tensor, "n 3"],
-        rays_d: Float[Tensor, "n 3"],
-        samples: Samples,
-        selected: Int[Tensor, "k"],
-    ) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k c"]]:
-        """Normals and class logits of some samples; objects count as persons."""
-        normal, logits = self.field.surface_heads(rays_o, rays_d, samples, selected)
-        ray = samples.ray_index()[selected]
-        x = rays_o[ray] + samples.t[selected, None] * rays_d[ray]
-        placed = self._on_object(x) if samples.ids is None else samples.ids[selected] == PLACED
-        own = placed.nonzero()[:, 0]
-        normal[own] = self._normal(x[own])
-        if CLASSES in self.field.capabilities:
-            classes = torch.zeros_like(logits[own])
-            classes[:, int(SOLID_OF[PERSON])] = 10.0  # as sure as a trained head
-            logits[own] = classes
-        return normal, logits
+    def surface_class(self, x: Float[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+        """Return the class of objects: all count as persons."""
+        return torch.full((x.shape[0],), int(SOLID_OF[PERSON]), device=x.device)
 
     def observed_only(self) -> RadianceField:
         """The field that photos show: without the objects."""

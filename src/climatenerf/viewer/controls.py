@@ -206,7 +206,7 @@ class WeatherControls:
     # --- values ---------------------------------------------------------------------------------
 
     def set(self, name: str, value: Any, source: Any = None) -> None:
-        """Change one parameter; what does not fit is told and not taken.
+        """Change one parameter; an invalid value is refused with a message.
 
         Args:
             name: such as "flood.level".

@@ -101,7 +101,7 @@ class _Patient:
 
 
 def _content(wanted: Wanted) -> tuple[object, ...]:
-    """What a picture shows, whatever its pose."""
+    """Weather, layer, moment and split of a picture."""
     return wanted.weather, wanted.layer, wanted.time, wanted.split
 
 
