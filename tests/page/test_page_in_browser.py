@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from PIL import Image
-from support.browser import chromium
+from support.browser import chromium, opened_page, wait_until
 from support.study_yard import yard_place
 
 from climatenerf.page.encoding import OPEN, SKY, height_text
@@ -56,25 +56,10 @@ def page_file(place, tmp_path_factory):
 
 def opened(browser, file, address="", **options):
     context = browser.new_context(**{"viewport": {"width": 1280, "height": 900}, **options})
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    page.problems, page.requests = [], []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
-    page.on("console", lambda told: page.problems.append(told.text))
-    page.on("request", lambda request: page.requests.append(request.url))
-    page.goto(file.as_uri() + address)
+    page = opened_page(context, file.as_uri() + address)
     if options.get("java_script_enabled", True):
         wait_until(page, "shown !== null && composed !== null")
     return page
-
-
-def wait_until(page, condition):
-    """Playwright's own way is by `eval`, which the page's policy forbids."""
-    for _ in range(2000):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(10)
-    pytest.fail(f"in vain: {condition}")
 
 
 def set_level(page, level):

@@ -6,7 +6,7 @@ import json
 from collections import Counter
 
 import pytest
-from support.browser import chromium
+from support.browser import chromium, opened_page, wait_until
 from support.command_line import run_cli
 from support.compare_folders import METHODS, write_compare_folder
 
@@ -39,23 +39,8 @@ def study(tmp_path_factory):
 def opened(browser, folder, number="", viewport=DESKTOP, context=None):
     """Open the page; what goes wrong in it, and what it requests, is collected."""
     context = context or browser.new_context(viewport=viewport, accept_downloads=True)
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    page.problems, page.requests = [], []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
-    page.on("console", lambda told: page.problems.append(told.text))
-    page.on("request", lambda request: page.requests.append(request.url))
-    page.goto((folder / "index.html").as_uri() + (f"#{number}" if number else ""))
-    return page
-
-
-def wait_until(page, condition):
-    """Wait for a condition; playwright's own way is by `eval`, which the page's policy forbids."""
-    for _ in range(2000):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(10)
-    pytest.fail(f"in vain: {condition}")
+    address = (folder / "index.html").as_uri() + (f"#{number}" if number else "")
+    return opened_page(context, address)
 
 
 def start(page):
