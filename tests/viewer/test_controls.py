@@ -85,16 +85,6 @@ def test_switches_and_sliders(shown):
     assert shown.changes[-1].sky.kind == "overcast"
 
 
-def test_a_text_is_left_alone_while_it_is_typed(shown):
-    text = shown.controls._texts["flood.level"]
-    for typed in ("0.3 m", "0.30 m", "0.305 m"):
-        text.value = typed
-        assert text.value == typed
-    assert shown.changes[-1].flood.level == pytest.approx(0.305)
-    shown.controls.set("flood.level", 0.5)
-    assert text.value == "0.5 m"
-
-
 def test_sliders_have_useful_ranges():
     for effect in EFFECTS:
         for item, parameter in effect.fields().items():

@@ -84,6 +84,16 @@ def test_the_last_of_ten_quick_changes_stays(viewer):
     assert viewer.pictures[-1].wanted is asked[-1]
 
 
+def test_a_newer_request_cancels_the_finer_passes_of_an_older_one(viewer):
+    large = CAMERA.resized(768, 432)
+    older, newer = (replace(flooded(level), camera=large) for level in (0.3, 0.5))
+    viewer.live.ask(older)
+    viewer.until(lambda: any(each.wanted is older for each in viewer.pictures))
+    viewer.live.ask(newer)
+    viewer.full_of(newer)
+    assert not any(each.wanted is older and each.state == "full" for each in viewer.pictures)
+
+
 def test_pictures_follow_a_moving_camera(viewer):
     first = flooded(0.3)
     viewer.live.ask(first)

@@ -120,6 +120,15 @@ def test_sliders_and_texts_change_the_weather(browser, app):
     box.nth(index).press("Enter")
     until(lambda: page.wait_for_timeout(20) is None
           and abs(tab.controls.weather.flood.level - 0.508) < 1e-6)  # fmt: skip
+    box.nth(index).fill("")
+    box.nth(index).press_sequentially("0.305 m", delay=80)
+    until(lambda: page.wait_for_timeout(20) is None
+          and abs(tab.controls.weather.flood.level - 0.305) < 1e-6)  # fmt: skip
+    assert box.nth(index).input_value() == "0.305 m", "nothing is rewritten while one types"
+    box.nth(index).fill("20 in")
+    settled(page, tab)
+    until(lambda: page.wait_for_timeout(20) is None
+          and abs(tab.controls.weather.flood.level - 0.508) < 1e-6)  # fmt: skip
     settled(page, tab)
     assert tab.shown.wanted.weather.flood.level == pytest.approx(0.508)
     assert "--flood.level=0.508" in tab._command.value
