@@ -273,3 +273,16 @@ def test_the_path_is_rendered_as_a_movie_in_the_weather_that_is_shown(browser, t
     assert np.abs(frame.astype(int) - tab.shown.picture).max() <= 1, "as the viewer shows it"
     page.context.close()
     app.close()
+
+
+@pytest.mark.slow
+def test_a_tab_that_leaves_while_it_is_built_leaves_no_threads(browser, app):
+    def threads():
+        return [each for each in threading.enumerate() if each.name.startswith("viewer-")]
+
+    for _ in range(4):
+        page = browser.new_context(viewport=SIZE).new_page()
+        page.goto(f"http://localhost:{app.port}")
+        until(lambda page=page: page.wait_for_timeout(2) is None and threads())
+        page.context.close()
+        until(lambda: not threads() and not app.tabs, 30.0)
