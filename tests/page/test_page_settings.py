@@ -5,14 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.command_line import error_message
-from support.study_yard import yard_place
+from support.holed_ground import LabelledField, terrain_of
+from support.study_yard import BOX, HORIZON, SOLIDS, ZENITH, yard_place
 
 from climatenerf.cli.page import Page, settings_of
+from climatenerf.core.classes import BUILDING, VEGETATION
 from climatenerf.core.errors import UserError
 from climatenerf.page.languages import LANGUAGES
 from climatenerf.page.pictures import page_pictures
 from climatenerf.page.settings import PageSettings
 from climatenerf.page.views import Ground, find_ground, page_views, placed_objects, water_levels
+from climatenerf.render.completed_ground import CompletedField
 from climatenerf.render.placed_objects import StaffGauge
 from climatenerf.render.session import RenderSession
 from climatenerf.weather.flood.parameters import Flood
@@ -130,3 +133,19 @@ def test_water_may_stand_close_below_the_cameras(seen):
     flooding, heights = found.views[0].flooding, found.views[0].heights
     near = np.isfinite(heights) & (np.abs(heights - 1.45) > 0.05)
     assert ((flooding < 1.45) == (heights < 1.45))[near].all()
+
+
+def test_ground_is_that_of_the_terrain_whatever_its_label(seen):
+    """Predicted labels take leaf litter for vegetation."""
+    place, views, _ = seen
+    classes = (VEGETATION, BUILDING, VEGETATION)
+    field = CompletedField(
+        LabelledField(SOLIDS, zenith=ZENITH, horizon=HORIZON, box=BOX, classes=classes),
+        terrain_of(half=0.01, side=15.0),
+    )
+    session = RenderSession(field, place.scene, Weather())
+    found = find_ground(session, views[0])
+    shown = np.isfinite(found.t) & (np.abs(found.x[..., 0]) < 12) & (found.x[..., 1] < 12)
+    true = np.abs(found.x[..., 2]) < 0.15
+    assert shown.sum() > 1000 and (found.ground == true)[shown].mean() > 0.99
+    assert len(placed_objects(views[:1], [found], 0.0, 1.0)) == 2

@@ -19,7 +19,7 @@ from climatenerf.page.views import (
     water_levels,
 )
 from climatenerf.render.irradiance import scene_irradiance
-from climatenerf.render.placed_objects import with_objects
+from climatenerf.render.placed_objects import PlacedField, with_objects
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
 from climatenerf.weather.weather import Weather
@@ -113,6 +113,8 @@ def page_pictures(
     """Render all pictures of a page; arguments and errors as in `prepared`."""
     session, views, levels = prepared(place, settings, weather, progress)
     seasons, notes = _seasons(session, settings, weather)
+    if settings.objects and not isinstance(session.field, PlacedField):
+        notes = (*notes, "no staff gauge and figure: the views show no free, level ground nearby")
     steps = [
         ("dry", weather),
         *(("water", under_water(weather, level)) for level in levels),

@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import GROUND
+from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
+from climatenerf.field.protocol import RadianceField, device_of, ground_height
 from climatenerf.paths.camera_path import still
 from climatenerf.paths.framing import train_views
 from climatenerf.render.placed_objects import Figure, PlacedObject, StaffGauge
@@ -23,6 +25,7 @@ LEVELS = 5
 FAR = 40.0  # m; ground beyond says nothing of where water stands
 CLEARANCE = 0.3  # m, of the cameras above the highest water
 UPRIGHT = 0.9  # z of normals of level ground
+ON_TERRAIN = 0.2  # m; what is this near to the terrain is ground
 NEAREST, BEST, FARTHEST = 3.0, 6.0, 14.0  # m, of gauge and figure from the camera
 APART = 0.9  # m, of gauge and figure
 SHOWN_AGAIN = 12.0  # m within which another view's gauge counts as seen
@@ -97,16 +100,32 @@ def spread(scene: Scene, count: int) -> list:
 
 
 def find_ground(session: RenderSession, view: PageView) -> Ground:
-    """Render a view small and dry, and find the level ground in it."""
+    """Render a view small and dry, and find the ground in it.
+
+    Ground is what lies at the height of the terrain. Without a terrain it is what faces up and, if
+    there are labels of ground, has one.
+    """
     camera = view.camera
     camera = camera.resized(SMALL, max(1, round(SMALL * camera.height / camera.width)))
     layers = session.frame(camera, view.c2w, layers=("normal", "label")).layers
     t = layers["depth"].astype(float)
     x = positions(camera, view.c2w, t)
-    ground = np.isfinite(t) & (layers["normal"][..., 2] > UPRIGHT)
+    shown = np.isfinite(t)
+    known = terrain_height(session.field, x[shown])
+    if np.isfinite(known).any():
+        ground = np.zeros(t.shape, bool)
+        ground[shown] = np.abs(x[shown][:, 2] - known) < ON_TERRAIN
+        return Ground(x, ground, t)
+    ground = shown & (layers["normal"][..., 2] > UPRIGHT)
     if "label" in layers and np.isin(layers["label"], GROUND).any():
         ground &= np.isin(layers["label"], GROUND)
     return Ground(x, ground, t)
+
+
+def terrain_height(field: RadianceField, x: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Return the height of the terrain below or above positions (world m); NaN if unknown."""
+    xy = to_device(x[:, :2].astype(np.float32), device_of(field))
+    return to_numpy(ground_height(field, xy)).astype(float)
 
 
 def positions(
