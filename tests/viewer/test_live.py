@@ -124,7 +124,7 @@ def test_closing_ends_the_threads(place):
     before = threading.active_count()
     made = Viewer(RenderSession(place.field, place.scene, Weather()))
     made.live.ask(flooded(0.4))
-    assert threading.active_count() == before + 2
+    assert threading.active_count() == before + 3
     made.live.close()
     assert threading.active_count() == before
     count = len(made.pictures)

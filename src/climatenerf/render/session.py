@@ -4,6 +4,7 @@ Every effect is prepared from the parameters that it names in `Effect.prepared_f
 parameter prepares only the effects that name it; all others are placed anew at the next frame.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -131,10 +132,36 @@ class RenderSession:
                 entity = function(self._preparation(own))
                 prepared[effect.name] = key, entity
             entity.check(own)
-        for name, (key, entity) in prepared.items():
-            self._keys[name], self._entities[name] = key, entity
+        # Not in place, since a copy may be rendered meanwhile.
+        self._keys = self._keys | {name: key for name, (key, _) in prepared.items()}
+        self._entities = self._entities | {name: made for name, (_, made) in prepared.items()}
         self.weather = weather
         return tuple(prepared)
+
+    def changed(
+        self,
+        weather: KeyframedWeather | Weather,
+        times: Float[np.ndarray, "f"] | None = None,
+        progress: Callable[[str, float], None] | None = None,
+    ) -> "RenderSession":
+        """Return a session with other weather, while this one can be rendered meanwhile.
+
+        Both share what the changed parameters leave valid.
+
+        Args:
+            weather: what to put in.
+            times: moments of the frames, s; None: those of this session.
+            progress: see the constructor; None: that of this session. It may raise, which ends the
+                preparation.
+
+        Raises:
+            UserError: as the constructor.
+        """
+        other = copy.copy(self)
+        other._times = self._times if times is None else times
+        other._progress = progress or self._progress
+        other.change(weather)
+        return other
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the receiver of progress out of a pickle: it belongs to one process."""

@@ -113,7 +113,6 @@ class Tab:
         """Build the controls, and show the place from its most central photo."""
         self.app, self.client = app, client
         eye = still(app.place.scene, None, 1, None)
-        self.session = self._new_session()
         self.shown: Shown | None = None
         self.keyframes: list[tuple[np.ndarray, float]] = []
         self._asking = threading.Lock()
@@ -121,7 +120,7 @@ class Tab:
         client.camera.position = tuple(eye.c2w[0, :3, 3])
         client.camera.wxyz = tuple(quaternions(eye.c2w[0, :3, :3]))
         client.camera.fov = float(2 * np.arctan(0.5 * eye.cameras[0].height / eye.cameras[0].fy))
-        self.live = LiveView(self.session, self._show, self._tell)
+        self.live = LiveView(self._new_session(), self._show, self._tell)
         try:
             self._build(client.gui)
             self._add_level_handle(eye.c2w[0])
@@ -140,13 +139,11 @@ class Tab:
             Weather(),
             kept=place.kept,
             style=place.style,
-            progress=self._preparing,
         )
 
     def follow(self) -> None:
         """Show the newer place of the app."""
-        self.session = self._new_session()
-        self.live.use(self.session)
+        self.live.use(self._new_session())
 
     # --- controls -------------------------------------------------------------------------------
 
@@ -161,7 +158,7 @@ class Tab:
         high = max(min(eyes) - scene.ground_z, low + 1)
         levels = float(np.floor(10 * low) / 10), float(np.floor(10 * high) / 10)
         self.controls = WeatherControls(
-            gui, self.session.effects, Weather(), levels, lambda _: self._ask(), self._tell
+            gui, self.live.session.effects, Weather(), levels, lambda _: self._ask(), self._tell
         )
         with gui.add_folder("show", expand_by_default=True):
             names = ["picture", *(name for name in LAYERS if name)]
@@ -258,7 +255,7 @@ class Tab:
         size = wanted.camera.width, wanted.camera.height
         weather = self.controls.weather
         path = self._path_of(wanted)
-        command = render_command(self.app.run, weather, self.session.effects, path, size)
+        command = render_command(self.app.run, weather, self.live.session.effects, path, size)
         if self._command.value != command:
             self._command.value = command
 
@@ -276,7 +273,7 @@ class Tab:
         )
 
     def _clicked(self, event: Any) -> None:
-        found = measure(self.session, np.array(event.ray_origin), np.array(event.ray_direction))
+        found = measure(self.live.session, np.array(event.ray_origin), np.array(event.ray_direction))
         self._measured.content = found.sentence
 
     # --- files ----------------------------------------------------------------------------------
@@ -305,7 +302,7 @@ class Tab:
         sidecar = {
             "simulated": True,
             "note": "weather is simulated",
-            "weather": weather_to_table(shown.wanted.weather, self.session.effects),
+            "weather": weather_to_table(shown.weather, self.live.session.effects),
             "layer": shown.wanted.layer or "picture",
             "c2w_world": shown.wanted.c2w.tolist(),
             "vertical_fov_deg": _vertical_fov(shown.wanted.camera),

@@ -1,11 +1,13 @@
 """Pictures for one viewer: the last picture warped while it moves, then coarse, half and full.
 
-Two threads: one renders what was asked for last, the other warps the last finished picture to the
-newest pose meanwhile. What is asked for lies in a mailbox of one place: newer requests replace
-older ones, and cancel their finer passes. No GUI is known here.
+Three threads: one puts new weather in, one renders what was asked for last, and one warps the last
+finished picture to the newest pose meanwhile. While weather is prepared, the one before is shown.
+What is asked for lies in a mailbox of one place: newer requests replace older ones, and cancel
+their finer passes and preparations. No GUI is known here.
 """
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -31,6 +33,7 @@ FRAME = 1 / 30  # s between warped pictures
 MOVING_WIDTH = 480  # pixels of warped pictures
 COARSE = 4  # pixels along a side that share a ray while moving
 FIRST = 8  # of the first picture after a change of the weather
+FPS = 24.0  # moments a second for which keyframed weather is prepared, as for a movie of `render`
 PATIENCE = 0.08  # s of computing between two questions whether to stop
 State = Literal["warped", "coarse", "half", "full"]
 
@@ -70,11 +73,13 @@ class Shown:
         picture: 8-bit sRGB.
         wanted: what it shows.
         state: how fine it is.
+        weather: what is in it: that of `wanted` unless it was refused.
     """
 
     picture: UInt8[np.ndarray, "h w 3"]
     wanted: Wanted
     state: State
+    weather: KeyframedWeather | Weather
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,19 @@ class _Finished:
     """See `_content`."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Ready:
+    """Prepared weather.
+
+    Attributes:
+        session: with the weather.
+        asked: the weather that was asked for; another than the session's if it was refused.
+    """
+
+    session: RenderSession
+    asked: KeyframedWeather | Weather
+
+
 @dataclass(frozen=True)
 class _Patient:
     """Asks whether to stop, less often than a render does by itself; see `Checkpoints`."""
@@ -100,13 +118,29 @@ class _Patient:
         return self.asked()
 
 
+def _moments(weather: KeyframedWeather | Weather) -> Float[np.ndarray, "f"]:
+    """Moments of the frames of a movie of keyframed weather, s."""
+    duration = weather.duration if isinstance(weather, KeyframedWeather) else 0.0
+    return np.arange(math.floor(duration * FPS + 1e-6) + 1) / FPS
+
+
+def _sentence(error: Exception) -> str:
+    """What is wrong, as a tab is told."""
+    known = isinstance(error, UserError)
+    return f"{'' if known else f'internal error: {type(error).__name__}: '}{error}"
+
+
 def _content(wanted: Wanted) -> tuple[object, ...]:
     """Weather, layer, moment and split of a picture."""
     return wanted.weather, wanted.layer, wanted.time, wanted.split
 
 
 class LiveView:
-    """Renders for one viewer until it is closed."""
+    """Renders for one viewer until it is closed.
+
+    Attributes:
+        session: with the weather that is shown.
+    """
 
     def __init__(
         self,
@@ -114,16 +148,18 @@ class LiveView:
         show: Callable[[Shown], None],
         tell: Callable[[str], None],
     ):
-        """Start both threads.
+        """Start the threads.
 
         Args:
-            session: of this viewer alone.
-            show: takes pictures; called from both threads.
+            session: field and scene; it stays as it is.
+            show: takes pictures; called from two threads.
             tell: takes a sentence about what is prepared or wrong; "" clears it.
         """
-        self._session, self._show, self._tell = session, show, tell
-        self._next: RenderSession | None = None
-        self._put_in: KeyframedWeather | Weather | None = None
+        self._show, self._tell = show, tell
+        self._next: RenderSession | None = session
+        self._ready: _Ready | None = None
+        self.session = session
+        self._preparing: KeyframedWeather | Weather | None = None
         self._wanted: Wanted | None = None
         self._moved = 0.0
         self._finished: _Finished | None = None
@@ -133,7 +169,11 @@ class LiveView:
         self._sending = threading.Lock()
         self._threads = [
             threading.Thread(target=work, name=name, daemon=True)
-            for name, work in (("viewer-render", self._render_all), ("viewer-warp", self._warp_all))
+            for name, work in (
+                ("viewer-prepare", self._prepare_all),
+                ("viewer-render", self._render_all),
+                ("viewer-warp", self._warp_all),
+            )
         ]
         for thread in self._threads:
             thread.start()
@@ -151,8 +191,6 @@ class LiveView:
         """Render with another session from the next picture on, such as that of a newer fit."""
         with self._changed:
             self._next = session
-            if self._wanted is not None:
-                self._wanted = replace(self._wanted)  # asks again
             self._changed.notify_all()
 
     @property
@@ -161,65 +199,116 @@ class LiveView:
         return self._wanted
 
     def close(self) -> None:
-        """End both threads; returns when they have ended."""
+        """End the threads; returns when they have ended."""
         with self._changed:
             self._open = False
             self._changed.notify_all()
         for thread in self._threads:
             thread.join()
 
+    # --- preparing ----------------------------------------------------------------------------
+
+    def _prepare_all(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: not self._open or self._outdated())
+                if not self._open:
+                    return
+                wanted, following = self._wanted, self._next
+            assert wanted is not None
+            session = following or self.session
+            self._preparing = wanted.weather
+            problem = ""
+            try:
+                session = session.changed(wanted.weather, _moments(wanted.weather), self._report)
+                session.world(wanted.time)  # prepares what is put off until it is seen
+            except RenderCancelled:
+                continue
+            except Exception as error:  # the weather of before stays in
+                problem = _sentence(error)
+            with self._changed:
+                if following is not None and self._next is following:
+                    self._next, self._finished = None, None
+                self.session, self._ready = session, _Ready(session, wanted.weather)
+                self._changed.notify_all()
+            with contextlib.suppress(Exception):  # the tab may be gone
+                self._tell(problem)
+
+    def _outdated(self) -> bool:
+        """Whether other weather, or another session, is wanted than is ready."""
+        wanted, ready = self._wanted, self._ready
+        if wanted is None:
+            return False
+        return self._next is not None or ready is None or ready.asked != wanted.weather
+
+    def _report(self, what: str, fraction: float) -> None:
+        """Tell what is prepared.
+
+        Raises:
+            RenderCancelled: other weather is wanted by now.
+        """
+        wanted, preparing = self._wanted, self._preparing
+        if not self._open or wanted is None or wanted.weather != preparing:
+            raise RenderCancelled
+        self._tell(f"preparing {what}: {100 * fraction:.0f} %")
+
     # --- rendering ----------------------------------------------------------------------------
 
     def _render_all(self) -> None:
-        done: Wanted | None = None
+        done: tuple[Wanted, _Ready] | None = None
         while True:
             with self._changed:
-                self._changed.wait_for(lambda done=done: not self._open or self._wanted is not done)
+                self._changed.wait_for(lambda done=done: not self._open or self._due(done))
                 if not self._open:
                     return
-                wanted = self._wanted
-            assert wanted is not None
+                wanted, ready = self._wanted, self._ready
+            assert wanted is not None and ready is not None
             try:
-                finest = self._render(wanted)
+                finest = self._render(wanted, ready)
             except RenderCancelled:
                 continue
             except Exception as error:  # the viewer goes on with the next request
-                known = isinstance(error, UserError)
                 with contextlib.suppress(Exception):  # the tab may be gone
-                    kind = "" if known else f"internal error: {type(error).__name__}: "
-                    self._tell(f"{kind}{error}")
+                    self._tell(_sentence(error))
                 finest = True
             if finest:
-                done = wanted
+                done = wanted, ready
 
-    def _render(self, wanted: Wanted) -> bool:
-        """Render a coarse picture while moving, else all passes; returns whether it is full."""
-        with self._changed:
-            following, self._next = self._next, None
-        if following is not None:
-            self._session, self._put_in, self._finished = following, None, None
-        if self._put_in != wanted.weather:
-            self._put_in = wanted.weather
-            try:
-                self._session.change(wanted.weather)
-                self._session.world(wanted.time)  # prepares what is put off until it is seen
-                self._tell("")
-            except UserError as error:  # the weather of before stays in
-                self._tell(str(error))
+    def _due(self, done: tuple[Wanted, _Ready] | None) -> bool:
+        """Whether something can be rendered that has not been."""
+        wanted, ready, last = self._wanted, self._ready, self._finished
+        if wanted is None or ready is None:
+            return False
+        if done is not None and done[0] is wanted and done[1] is ready:
+            return False
+        waits = ready.asked != wanted.weather  # for its weather, in a pose that is shown
+        return not (waits and last is not None and np.array_equal(last.c2w, wanted.c2w))
+
+    def _render(self, wanted: Wanted, ready: _Ready) -> bool:
+        """Render a coarse picture while moving or preparing, else all passes.
+
+        Returns:
+            Whether nothing finer is due.
+        """
+        session, prepared = ready.session, ready.asked == wanted.weather
+        shown = wanted if prepared else replace(wanted, weather=ready.asked)
         moving = time.monotonic() - self._moved < STILL
-        if moving or not self._same_content(wanted):
-            self._render_coarse(wanted, COARSE if moving else FIRST)
-            if moving:
-                return False
+        if moving or not prepared or not self._same_content(shown):
+            side = COARSE if moving or not prepared else FIRST
+            self._render_coarse(session, shown, side)
+            if moving or not prepared:
+                return not moving
         passes: list[State] = ["coarse", "half", "full"]
 
         def preview(picture: UInt8[np.ndarray, "h w 3"]) -> None:
             state = passes.pop(0)
             if state != "full" and not wanted.layer and not wanted.split:
-                self._send(Shown(picture, wanted, state), wanted)
+                self._send(Shown(picture, wanted, state, session.weather), wanted)
 
-        cancelled = _Patient(lambda: not self._open or self._wanted is not wanted)
-        frame = self._session.frame(
+        cancelled = _Patient(
+            lambda: not self._open or self._wanted is not wanted or self._ready is not ready
+        )
+        frame = session.frame(
             wanted.camera,
             wanted.c2w,
             wanted.time,
@@ -227,12 +316,12 @@ class LiveView:
             preview=preview,
             cancelled=cancelled,
         )
-        picture = self._with_before(frame, wanted.camera, wanted, cancelled)
+        picture = self._with_before(session, frame, wanted.camera, wanted, cancelled)
         self._keep(picture, frame.layers["depth"], wanted.camera, wanted)
-        self._send(Shown(picture, wanted, "full"), wanted)
+        self._send(Shown(picture, wanted, "full", session.weather), wanted)
         return True
 
-    def _render_coarse(self, wanted: Wanted, side: int) -> None:
+    def _render_coarse(self, session: RenderSession, wanted: Wanted, side: int) -> None:
         """Render a small picture, and keep it for warping; newer requests do not cancel it."""
         camera = wanted.camera
         across = side * max(camera.width / MOVING_WIDTH, 1)
@@ -241,24 +330,29 @@ class LiveView:
         )
         # While moving, an older picture to warp is better than none.
         open_ = _Patient(lambda: not self._open)
-        frame = self._session.frame(
+        frame = session.frame(
             coarse, wanted.c2w, wanted.time, layers=(wanted.layer,), cancelled=open_
         )
         if wanted.layer and wanted.layer not in frame.layers:
             self._tell(f"this place has no layer {wanted.layer}")
-        picture = self._with_before(frame, coarse, wanted, open_)
+        picture = self._with_before(session, frame, coarse, wanted, open_)
         self._keep(picture, frame.layers["depth"], coarse, wanted)
-        self._send(Shown(picture, wanted, "coarse"), wanted)
+        self._send(Shown(picture, wanted, "coarse", session.weather), wanted)
 
     def _with_before(
-        self, frame: Frame, camera: Camera, wanted: Wanted, cancelled: Callable[[], bool]
+        self,
+        session: RenderSession,
+        frame: Frame,
+        camera: Camera,
+        wanted: Wanted,
+        cancelled: Callable[[], bool],
     ) -> UInt8[np.ndarray, "h w 3"]:
         """The picture of a frame, with the place without weather in its left part."""
         picture = picture_of(wanted.layer, frame)
         columns = round(wanted.split * camera.width)
         if not columns:
             return picture
-        dry = World(self._session.field)
+        dry = World(session.field)
         options = FrameOptions(cancelled=cancelled)
         before, _ = render_frame(dry, camera, wanted.c2w, options)
         return np.concatenate([before[:, :columns], picture[:, columns:]], axis=1)
@@ -312,6 +406,6 @@ class LiveView:
                 with self._sending:
                     if self._open and self._wanted is wanted and self._sent is not wanted:
                         self._sent = wanted
-                        self._show(Shown(picture, wanted, "warped"))
+                        self._show(Shown(picture, wanted, "warped", self.session.weather))
             last = wanted
             time.sleep(max(FRAME - (time.monotonic() - begun), 0.0))

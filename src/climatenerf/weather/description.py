@@ -17,6 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from climatenerf.core.errors import UserError, excerpt, one_line
 from climatenerf.core.parsing import read_toml
 from climatenerf.weather.effect import Effect
@@ -45,6 +47,11 @@ class KeyframedWeather:
         once = {name for effect in effects for name in effect.prepared_from
                 if name.startswith(f"{effect.name}.")}  # fmt: skip
         return sorted(once & set(self.keyframes))
+
+    @property
+    def duration(self) -> float:
+        """Time of the last keyframe, s; 0 without keyframes."""
+        return max((frames[-1][0] for frames in self.keyframes.values()), default=0.0)
 
     def at(self, time: float) -> Weather:
         """The weather `time` seconds into the movie; the end values hold before and after."""
@@ -135,6 +142,54 @@ def weather_to_table(
             elif value is not None:
                 entries[key] = parameter.write(value)
     return table
+
+
+def weather_to_toml(
+    weather: Weather | KeyframedWeather, effects: Sequence[Effect] = EFFECTS
+) -> str:
+    """Return a weather file, without the values that are the defaults; `read_weather` reads it."""
+    table = weather_to_table(weather, effects)
+    plain = weather_to_table(Weather(effects=effects), effects)
+    changed: dict[str, Any] = {"seed": table["seed"]} if table["seed"] != plain["seed"] else {}
+    for effect in effects:
+        entries = {
+            key: value
+            for key, value in table[effect.name].items()
+            if plain[effect.name].get(key) != value
+        }
+        if entries:
+            changed[effect.name] = entries
+    return tomli_w.dumps(changed)
+
+
+def from_moments(
+    moments: Mapping[float, Weather], effects: Sequence[Effect] = EFFECTS
+) -> KeyframedWeather:
+    """Return the weather that passes through that of some moments.
+
+    Args:
+        moments: by time in s, at least one.
+        effects: the effects in use.
+
+    Raises:
+        UserError: a value is "none" at one moment and given at another.
+    """
+    times = sorted(moments)
+    first = moments[times[0]]
+    keyframes: dict[str, Keyframes] = {}
+    for effect in effects:
+        for item in effect.fields():
+            name = f"{effect.name}.{item}"
+            values = [moments[time].value(name) for time in times]
+            if all(value == values[0] for value in values):
+                continue
+            if None in values:
+                raise UserError(
+                    f"{name.replace('_', '-')} has no value at {times[values.index(None)]:g} s, but"
+                    " one at another keyframe; give it one at each"
+                )
+            keyframes[name] = tuple(zip(times, values, strict=True))
+    return KeyframedWeather(first, keyframes)
 
 
 def given_flags(arguments: Sequence[str], effects: Sequence[Effect] = EFFECTS) -> frozenset[str]:

@@ -59,8 +59,9 @@ MIN_SKY, MAX_SKY = 50, 1500  # pixels of the reduced photos that show sky
 MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
 CLOUDS = 60  # independent patches of the sky that photos show
 SKY_ERROR = 0.08  # of log radiance, by clouds
-GROUND_ALBEDO, ALBEDO_SPREAD = 0.15, 0.5  # asphalt and grass .1, soil .15, concrete .3; of its log
+GROUND_ALBEDO, ALBEDO_SPREAD = 0.18, 0.5  # a grey card; asphalt, grass .1, concrete .3; of its log
 RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
+LOBE_RATIO, LOBE_RATIO_SPREAD = -0.2, 0.15  # of a sky with a bright lobe, see `fit_sky`
 TYPICAL_WIDTH, WIDTH_SPREAD = np.radians(20.0), 0.5  # of a sun behind thin cloud; of its log
 WHITE = np.ones(3)
 
@@ -426,6 +427,10 @@ def fit_sky(
     one looks like a low and dim one. Of these the fit takes the one whose light on level ground
     agrees best with an albedo of `GROUND_ALBEDO`.
 
+    Photos show the sky near the horizon, where clouds and hills can rise faster than the sky does.
+    A sky with a bright lobe is held to what the CIE's general skies with one have (ISO 15469, types
+    7 to 15): their zenith is as bright as their horizon or darker.
+
     Args:
         d: directions of sky in the photos.
         radiance: of the fitted sky there.
@@ -449,7 +454,8 @@ def fit_sky(
         shown = np.log(np.minimum(model(p, d), 1.0)) - np.log(brightness)
         level = (model(p, grid) * grid[:, 2]).sum() * 4 * np.pi / DIRECTIONS
         expected = np.log(level / np.pi * GROUND_ALBEDO / ground) if ground > 0 else 0.0
-        prior = [p[1] / RATIO_SPREAD, expected / ALBEDO_SPREAD]
+        ratio = (p[1] - LOBE_RATIO) / LOBE_RATIO_SPREAD if lobe else p[1] / RATIO_SPREAD
+        prior = [ratio, expected / ALBEDO_SPREAD]
         if lobe:
             prior.append((p[4] - np.log(TYPICAL_WIDTH)) / WIDTH_SPREAD)
         return np.concatenate([share * shown, prior])
