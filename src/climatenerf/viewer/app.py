@@ -273,7 +273,9 @@ class Tab:
         )
 
     def _clicked(self, event: Any) -> None:
-        found = measure(self.live.session, np.array(event.ray_origin), np.array(event.ray_direction))
+        found = measure(
+            self.live.session, np.array(event.ray_origin), np.array(event.ray_direction)
+        )
         self._measured.content = found.sentence
 
     # --- files ----------------------------------------------------------------------------------
