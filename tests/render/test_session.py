@@ -333,3 +333,17 @@ def test_a_cancellable_frame_is_identical(session_of):
     assert np.array_equal(free.picture, bound.picture)
     for name, values in free.layers.items():
         assert np.allclose(values, bound.layers[name], atol=1e-5, equal_nan=True), name
+
+
+def test_a_changed_session_leaves_the_first_as_it_was(session_of):
+    first = session_of({"flood": {"level": "0.1 m", "wind-speed": "0 m/s"}}, [0.0])
+    before = first.frame(CAMERA, C2W).picture
+    other = first.changed(weather_from_table({"flood": {"level": "0.6 m"}}), np.array([0.0, 1.0]))
+    assert np.array_equal(first.frame(CAMERA, C2W).picture, before)
+    assert first.weather.base.flood.level == 0.1 and other.weather.base.flood.level == 0.6
+    fresh = session_of({"flood": {"level": "0.6 m"}}, [0.0, 1.0])
+    assert np.array_equal(other.frame(CAMERA, C2W).picture, fresh.frame(CAMERA, C2W).picture)
+    with pytest.raises(UserError, match="above the whole scene"):
+        first.changed(weather_from_table({"flood": {"level": "900 m"}}))
+    back = other.changed(first.weather)
+    assert np.array_equal(back.frame(CAMERA, C2W).picture, before)

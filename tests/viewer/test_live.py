@@ -1,5 +1,6 @@
 """Pictures for one viewer: order, cancellation, bit identity, and the end of the threads."""
 
+import copy
 import threading
 import time
 from dataclasses import replace
@@ -10,11 +11,13 @@ from support.study_yard import BOX, patch_shot, pose, yard_place
 
 from climatenerf.core.cameras import Camera
 from climatenerf.field.analytic import AnalyticField, HalfSpace
+from climatenerf.field.compositing import RenderCancelled
 from climatenerf.render.session import RenderSession
 from climatenerf.verification.setting import protocol_of
 from climatenerf.viewer.live import LiveView, Wanted
 from climatenerf.viewer.measure import measure
 from climatenerf.viewer.overlays import LAYERS, legend, picture_of
+from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
@@ -198,3 +201,99 @@ def test_clicks_trace_their_ray(place):
     assert found.water_depth == pytest.approx(0.4, abs=0.01)
     assert "water 0.4" in found.sentence and "deep" in found.sentence
     assert measure(session, HERE[:3, 3], np.array([0.0, 0.1, 1.0])).sentence == "sky"
+
+
+class SlowSession:
+    """A session whose changes report progress until they are released or cancelled."""
+
+    def __init__(self, session):
+        self.session, self.released, self.cancelled = session, threading.Event(), []
+
+    def frame(self, *arguments, **options):
+        return self.session.frame(*arguments, **options)
+
+    def world(self, moment):
+        return self.session.world(moment)
+
+    @property
+    def weather(self):
+        return self.session.weather
+
+    @property
+    def field(self):
+        return self.session.field
+
+    def changed(self, weather, times, progress):
+        made = copy.copy(self)
+        made.session = self.session.changed(weather, times)
+        if weather != Weather():
+            for step in range(100_000):
+                try:
+                    progress("snow", min(step / 1000, 1))
+                except RenderCancelled:
+                    self.cancelled.append(weather)
+                    raise
+                if self.released.wait(0.005):
+                    break
+        return made
+
+
+def test_pictures_go_on_while_weather_is_prepared(place):
+    slow = SlowSession(RenderSession(place.field, place.scene, Weather()))
+    viewer = Viewer(slow)
+    try:
+        dry = Wanted(CAMERA, HERE, Weather())
+        viewer.live.ask(dry)
+        before = viewer.full_of(dry).picture
+        wet, moved = flooded(0.4), flooded(0.4, pose((0.4, 1.0, -0.1)))
+        viewer.live.ask(wet)
+        viewer.until(lambda: any("preparing snow" in each for each in viewer.told))
+        viewer.live.ask(moved)
+        viewer.until(lambda: viewer.pictures[-1].state == "coarse"
+                     and viewer.pictures[-1].wanted.same_place(moved))  # fmt: skip
+        assert viewer.pictures[-1].weather.at(0.0) == Weather(), "that of before"
+        slow.released.set()
+        found = viewer.full_of(moved)
+        assert found.weather.at(0.0) == moved.weather and viewer.told[-1] == ""
+        assert not slow.cancelled, "the same weather in another pose is no reason to begin again"
+        assert not np.array_equal(found.picture, before)
+    finally:
+        viewer.live.close()
+
+
+def test_newer_weather_cancels_the_preparation_of_older(place):
+    slow = SlowSession(RenderSession(place.field, place.scene, Weather()))
+    viewer = Viewer(slow)
+    try:
+        older, newer = flooded(0.3), flooded(0.5)
+        viewer.live.ask(older)
+        viewer.until(lambda: viewer.told)
+        viewer.live.ask(newer)
+        viewer.until(lambda: slow.cancelled)
+        slow.released.set()
+        assert viewer.full_of(newer).weather.at(0.0) == newer.weather
+        assert slow.cancelled == [older.weather]
+    finally:
+        viewer.live.close()
+
+
+def test_refused_weather_leaves_that_of_before_in_the_picture(viewer):
+    good = flooded(0.2)
+    viewer.live.ask(good)
+    viewer.full_of(good)
+    viewer.live.ask(flooded(900.0))
+    viewer.until(lambda: viewer.told and "level" in viewer.told[-1])
+    moved = flooded(900.0, pose((0.3, 1.0, -0.1)))
+    viewer.live.ask(moved)
+    assert viewer.full_of(moved).weather.at(0.0) == good.weather
+
+
+def test_a_film_is_shown_at_its_moment(viewer, place):
+    keyframes = {"flood.level": ((0.0, 0.1), (2.0, 0.5))}
+    film = KeyframedWeather(Weather(flood=Flood(level=0.1, wind_speed=3.0)), keyframes)
+    wanted = Wanted(CAMERA, HERE, film, time=1.5)
+    viewer.live.ask(wanted)
+    found = viewer.full_of(wanted).picture
+    session = RenderSession(place.field, place.scene, film, times=np.arange(49) / 24)
+    assert np.array_equal(found, session.frame(CAMERA, HERE, 1.5).picture)
+    assert not np.array_equal(found, session.frame(CAMERA, HERE, 0.0).picture)

@@ -21,6 +21,7 @@ from climatenerf.paths.nerfstudio import read_drawn_path
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
 from climatenerf.verification.setting import protocol_of
+from climatenerf.weather.description import read_weather
 
 pytest.importorskip("viser", reason="needs viser (make setup installs it)")
 SIZE = {"width": 640, "height": 420}
@@ -273,6 +274,46 @@ def test_the_path_is_rendered_as_a_movie_in_the_weather_that_is_shown(browser, t
     settled(page, tab)
     frame = np.asarray(Image.open(movie.parent / "frames" / "0000.png"))
     assert np.abs(frame.astype(int) - tab.shown.picture).max() <= 1, "as the viewer shows it"
+    page.context.close()
+    app.close()
+
+
+@pytest.mark.slow
+def test_keyframed_weather_is_moved_through_played_and_kept(browser, tmp_path):
+    from climatenerf.viewer.app import ViewerApp
+
+    place = yard_place(tmp_path)
+    (tmp_path / "run").mkdir()
+    given = tmp_path / "given.toml"
+    given.write_text('[flood]\nwind-speed = "0 m/s"\nlevel = { "0 s" = "0 m", "2 s" = "0.6 m" }')
+    app = ViewerApp(tmp_path / "run", place, 0, weather=given)
+    page, tab = opened(browser, app)
+    assert f"--weather {given}" in tab._command.value and "--frames 49" in tab._command.value
+    page.get_by_label("time, s").first.fill("1")
+    until(lambda: page.wait_for_timeout(20) is None and tab.film.now == 1.0)
+    settled(page, tab)
+    assert tab.shown.weather == tab.film.film and tab.shown.wanted.time == 1.0
+    assert tab.controls.weather.flood.level == pytest.approx(0.3)
+    shown = tab.shown.picture
+    tab.controls.set("flood.level", 0.8)
+    tab.film.keep()
+    kept = tmp_path / "run" / "views" / "weather.toml"
+    assert read_weather(kept).keyframes["flood.level"] == ((0.0, 0.0), (1.0, 0.8), (2.0, 0.6))
+    assert f"--weather {kept}" in tab._command.value and "0.8 m" in tab._file.value
+    settled(page, tab)
+    assert not np.array_equal(tab.shown.picture, shown)
+    moments = set()
+    page.get_by_text("play", exact=True).click()
+
+    def played():
+        page.wait_for_timeout(20)
+        moments.add(tab.shown.wanted.time)
+        return len(moments) > 4
+
+    until(played)
+    tab._play = page.get_by_text("play", exact=True).click()
+    settled(page, tab)
+    assert page.problems == []
     page.context.close()
     app.close()
 

@@ -11,10 +11,12 @@ from climatenerf.core.errors import UserError
 from climatenerf.weather.description import (
     KeyframedWeather,
     combine,
+    from_moments,
     given_flags,
     read_weather,
     weather_from_table,
     weather_to_table,
+    weather_to_toml,
 )
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.registry import EFFECTS
@@ -156,3 +158,23 @@ def test_keyframes_of_what_a_movie_reads_once_are_named():
     levels = {"0 s": "0 m", "3 s": "1 m"}
     film = weather_from_table({"flood": {"level": levels, "wind-speed": keys}})
     assert film.frozen(EFFECTS) == ["flood.wind_speed"]
+
+
+def test_a_written_weather_file_has_what_was_changed_alone(film, tmp_path):
+    text = weather_to_toml(film)
+    (tmp_path / "weather.toml").write_text(text)
+    assert read_weather(tmp_path / "weather.toml") == film
+    assert "[season]" not in text
+    assert weather_to_toml(Weather()) == ""
+
+
+def test_moments_become_keyframes_of_what_changes():
+    first = Weather(flood=Flood(level=0.1, wind_speed=3.0))
+    second = first.with_value("flood.level", 0.5).with_value("smog.visibility", 30.0)
+    with pytest.raises(UserError, match=r"smog.visibility has no value at 0 s, but one at another"):
+        from_moments({2.0: second, 0.0: first})
+    second = second.with_value("smog.visibility", None)
+    found = from_moments({2.0: second, 0.0: first})
+    assert found == KeyframedWeather(first, {"flood.level": ((0.0, 0.1), (2.0, 0.5))})
+    assert found.duration == 2.0 and found.at(2.0) == second
+    assert from_moments({1.0: first}).duration == 0.0

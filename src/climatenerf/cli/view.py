@@ -3,12 +3,15 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from climatenerf.cli import progress
+from climatenerf.cli.flags import optional
 from climatenerf.core.errors import UserError
+from climatenerf.weather.description import read_weather
+from climatenerf.weather.registry import installed_effects
 
 if TYPE_CHECKING:
     from climatenerf.studies.shot import Place
@@ -25,6 +28,8 @@ class View:
     """Run folder made by `climatenerf fit`."""
     port: int = 7007
     """Port on the loopback interface; 0 takes a free one."""
+    weather: Annotated[Path | None, optional("PATH")] = None
+    """Weather file to begin with. If it has keyframes, the time can be moved and played."""
     allow_host: tuple[str, ...] = ()
     """Further host names under which a tunnel presents this machine, such as box.example.org."""
     complete_ground: bool = True
@@ -35,10 +40,13 @@ def run(options: View) -> int:
     """Serve the place until Ctrl-C.
 
     Raises:
-        UserError: the port is taken, the package is missing, or there is no run.
+        UserError: the port is taken, the package is missing, the weather file is wrong, or there is
+            no run.
     """
     if not 0 <= options.port < 65536:
         raise UserError("--port must be from 0 to 65535")
+    if options.weather is not None:
+        read_weather(options.weather, installed_effects())
     from climatenerf.viewer.guarded_server import check_hosts, check_installed, check_port
 
     check_installed()
@@ -49,7 +57,7 @@ def run(options: View) -> int:
 
     place, digest = _place(options)
     shown = identity_of(options.run / FIELD)
-    app = ViewerApp(options.run, place, options.port, options.allow_host, digest)
+    app = ViewerApp(options.run, place, options.port, options.allow_host, digest, options.weather)
     progress.result(f"viewer: http://localhost:{app.port}")
     progress.say(f"from another machine: {tunnel_line(app.port)}, then the same address there")
     try:

@@ -22,11 +22,18 @@ from climatenerf.paths.nerfstudio import DrawnPath, write_drawn_path
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
 from climatenerf.viewer import guarded_server
-from climatenerf.viewer.controls import WeatherControls, render_command
+from climatenerf.viewer.controls import FPS, WeatherControls, render_command
+from climatenerf.viewer.film import TimeControls
 from climatenerf.viewer.live import LiveView, Shown, Wanted
 from climatenerf.viewer.measure import measure
 from climatenerf.viewer.overlays import LAYERS, legend
-from climatenerf.weather.description import weather_to_table
+from climatenerf.weather.description import (
+    KeyframedWeather,
+    read_weather,
+    weather_to_table,
+    weather_to_toml,
+)
+from climatenerf.weather.registry import installed_effects
 from climatenerf.weather.weather import Weather
 
 if TYPE_CHECKING:
@@ -34,8 +41,8 @@ if TYPE_CHECKING:
 
 MAX_SIDE = 960  # pixels of a full picture
 JPEG_QUALITY = {"warped": 70, "coarse": 75, "half": 80, "full": 90}
-FPS = 24.0
 HANDLE_DISTANCE = 5.0  # m, of the arrow for the water level from the first camera
+WEATHER_FILE = "weather.toml"
 VIEWS = "views"
 """Folder in the run that pictures and paths are written into."""
 
@@ -50,6 +57,7 @@ class ViewerApp:
         port: int,
         allowed_hosts: tuple[str, ...] = (),
         digest: str | None = None,
+        weather: Path | None = None,
     ):
         """Start the server.
 
@@ -59,11 +67,16 @@ class ViewerApp:
             port: to listen on; 0 takes a free one.
             allowed_hosts: see `guarded_server.start`.
             digest: identity of the run, for movies; None takes that of its files.
+            weather: weather file that each tab begins with; None: no weather.
 
         Raises:
             UserError: the package is missing, or the port is taken.
         """
         self.run, self.place = run, place
+        effects = installed_effects()
+        clear = KeyframedWeather(Weather(effects=effects), {})
+        self.weather = clear if weather is None else read_weather(weather, effects)
+        self.weather_file = weather
         self.tabs: dict[int, Tab] = {}
         self.digest = digest
         self.rendering = threading.Lock()
@@ -81,13 +94,13 @@ class ViewerApp:
             if here:
                 self.tabs[client.client_id] = tab
         if not here:  # it has left while the tab was built
-            tab.live.close()
+            tab.close()
 
     def _left(self, client: "viser.ClientHandle") -> None:
         with self._lock:
             tab = self.tabs.pop(client.client_id, None)
         if tab is not None:
-            tab.live.close()
+            tab.close()
 
     def use(self, place: Place, digest: str | None) -> None:
         """Show a newer fit of the run in all tabs, with the weather that each has."""
@@ -102,7 +115,7 @@ class ViewerApp:
         with self._lock:
             tabs, self.tabs = list(self.tabs.values()), {}
         for tab in tabs:
-            tab.live.close()
+            tab.close()
         self.server.stop()
 
 
@@ -116,11 +129,13 @@ class Tab:
         self.shown: Shown | None = None
         self.keyframes: list[tuple[np.ndarray, float]] = []
         self._asking = threading.Lock()
+        self._weather_file = app.weather_file
         self._saved_pose: tuple[np.ndarray, Path] | None = None
         client.camera.position = tuple(eye.c2w[0, :3, 3])
         client.camera.wxyz = tuple(quaternions(eye.c2w[0, :3, :3]))
         client.camera.fov = float(2 * np.arctan(0.5 * eye.cameras[0].height / eye.cameras[0].fy))
         self.live = LiveView(self._new_session(), self._show, self._tell)
+        self._ends = [self.live.close]
         try:
             self._build(client.gui)
             self._add_level_handle(eye.c2w[0])
@@ -128,8 +143,13 @@ class Tab:
             client.scene.on_click()(self._clicked)
             self._ask()
         except BaseException:
-            self.live.close()
+            self.close()
             raise
+
+    def close(self) -> None:
+        """End the threads; returns when they have ended."""
+        for end in self._ends:
+            end()
 
     def _new_session(self) -> RenderSession:
         place = self.app.place
@@ -157,9 +177,20 @@ class Tab:
         eyes = [scene.c2w_world(view)[2, 3] for view in scene.of_split("train")]
         high = max(min(eyes) - scene.ground_z, low + 1)
         levels = float(np.floor(10 * low) / 10), float(np.floor(10 * high) / 10)
+        effects, begun = self.live.session.effects, self.app.weather
         self.controls = WeatherControls(
-            gui, self.live.session.effects, Weather(), levels, lambda _: self._ask(), self._tell
+            gui, effects, begun.at(0.0), levels, lambda _: self._ask(), self._tell
         )
+        self.film = TimeControls(
+            gui,
+            effects,
+            begun,
+            lambda: self.controls.weather,
+            self._put,
+            lambda: self._saved(self.save_keyframes),
+            self._tell,
+        )
+        self._ends.insert(0, self.film.close)
         with gui.add_folder("show", expand_by_default=True):
             names = ["picture", *(name for name in LAYERS if name)]
             layer = gui.add_dropdown("layer", names, initial_value="picture")
@@ -182,6 +213,7 @@ class Tab:
             key = gui.add_button("add a key pose to the path")
             movie = gui.add_button("render the path")
             self._command = gui.add_text("command", "", multiline=True)
+            self._file = gui.add_text("weather file", "", multiline=True)
         picture.on_click(lambda _: self._saved(self.save_picture))
         key.on_click(lambda _: self._saved(self.add_keyframe))
         movie.on_click(lambda _: self._saved(self.render_path))
@@ -209,6 +241,11 @@ class Tab:
             level = round(float(handle.position[2]) - datum, 3)
             if level != self.controls.weather.flood.level:
                 self.controls.set("flood.level", level)
+
+    def _put(self, weather: Weather | None) -> None:
+        if weather is not None:
+            self.controls.put(weather)
+        self._ask()
 
     def _tell(self, sentence: str) -> None:
         self._message.content = f"**{html.escape(sentence)}**" if sentence else " "
@@ -242,9 +279,10 @@ class Tab:
         return Wanted(
             pinhole,
             c2w,
-            self.controls.weather,
+            self.film.weather(),
             self._layer,
-            split=split,
+            self.film.now,
+            split,
             asked=time.monotonic(),
         )
 
@@ -252,10 +290,17 @@ class Tab:
         with self._asking:  # a callback of an older pose must not overtake a newer one
             wanted = self.wanted()
             self.live.ask(wanted)
-        size = wanted.camera.width, wanted.camera.height
-        weather = self.controls.weather
-        path = self._path_of(wanted)
-        command = render_command(self.app.run, weather, self.live.session.effects, path, size)
+        effects, film = self.live.session.effects, self.film.film
+        size, path = (wanted.camera.width, wanted.camera.height), self._path_of(wanted)
+        file = weather_to_toml(film or self.controls.weather, effects)
+        if self._file.value != file:
+            self._file.value = file
+        if film is None:
+            command = render_command(self.app.run, self.controls.weather, effects, path, size)
+        else:
+            seconds = film.duration if path == "still" else 0.0
+            kept = self._weather_file or self.app.run / VIEWS / WEATHER_FILE
+            command = render_command(self.app.run, kept, effects, path, size, seconds)
         if self._command.value != command:
             self._command.value = command
 
@@ -314,6 +359,19 @@ class Tab:
         self._ask()
         return path
 
+    def save_keyframes(self) -> Path:
+        """Write the weather file of the keyframes, and return its path.
+
+        Raises:
+            UserError: it cannot be written.
+        """
+        path = make_folder(self.app.run / VIEWS) / WEATHER_FILE
+        weather = self.film.film or self.controls.weather
+        write_bytes(path, weather_to_toml(weather, self.live.session.effects).encode())
+        self._weather_file = path
+        self._ask()
+        return path
+
     def add_keyframe(self) -> Path:
         """Add the pose to the camera path, and write it as nerfstudio's `camera_path.json`.
 
@@ -323,35 +381,43 @@ class Tab:
         wanted = self.wanted()
         self.keyframes.append((wanted.c2w, _vertical_fov(wanted.camera)))
         keys, angles = zip(*self.keyframes, strict=True)
-        poses, fovs = through(keys, angles)
-        size = wanted.camera.width, wanted.camera.height
-        drawn = DrawnPath(poses, fovs, size, FPS, "")
-        folder = make_folder(self.app.run / VIEWS)
-        path = write_drawn_path(folder / "camera_path.json", self.app.place.scene, drawn)
+        path = self._write_path(*through(keys, angles), wanted.camera)
         self._ask()
         return path
 
+    def _write_path(self, poses: np.ndarray, fovs: np.ndarray, camera: Camera) -> Path:
+        drawn = DrawnPath(poses, fovs, (camera.width, camera.height), FPS, "")
+        path = make_folder(self.app.run / VIEWS) / "camera_path.json"
+        return write_drawn_path(path, self.app.place.scene, drawn)
+
     def render_path(self) -> Path:
         """Render the camera path in the weather that is shown, and return the movie.
+
+        With keyframes of the weather and without key poses it stands still.
 
         Raises:
             UserError: there is no path, or one is being rendered.
         """
         from climatenerf.api import Run, render_movie
 
-        if not self.keyframes:
+        film = self.film.film
+        if not self.keyframes and film is None:
             raise UserError("add key poses to the path first")
         place, run = self.app.place, self.app.run
         if not self.app.rendering.acquire(blocking=False):
             raise UserError("a movie is being rendered; wait until it is finished")
         try:
             folder = make_folder(run / VIEWS)
+            if not self.keyframes and film is not None:
+                frames, here = round(film.duration * FPS) + 1, self.wanted()
+                fovs = np.full(frames, _vertical_fov(here.camera))
+                self._write_path(np.repeat(here.c2w[None], frames, axis=0), fovs, here.camera)
             out = folder / f"movie-{_next_number(folder, 'movie')}"
             fitted = Run(run, place.field, place.scene, self.app.digest, style=place.style)  # pyright: ignore[reportArgumentType]
             return render_movie(
                 fitted,
                 out,
-                self.controls.weather,
+                film or self.controls.weather,
                 path=str(folder / "camera_path.json"),
                 complete_ground=False,
                 progress=self._preparing,

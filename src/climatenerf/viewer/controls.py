@@ -12,6 +12,7 @@ from climatenerf.weather.effect import Effect
 from climatenerf.weather.units import Choice, Folder, Parameter
 from climatenerf.weather.weather import Weather, check
 
+FPS = 24.0  # of movies
 MIN_STEPS = 100  # of a slider
 MAIN = {
     "flood": ("level", "wind_speed", "clarity"),
@@ -55,19 +56,29 @@ def slider_range(
 
 
 def render_command(
-    run: Path, weather: Weather, effects: Sequence[Effect], path: str, size: tuple[int, int]
+    run: Path,
+    weather: Weather | Path,
+    effects: Sequence[Effect],
+    path: str,
+    size: tuple[int, int],
+    seconds: float = 0.0,
 ) -> str:
     """Return the line that renders what the viewer shows.
 
     Args:
         run: the run folder.
-        weather: what is put in.
+        weather: what is put in, or the weather file that holds it.
         effects: those that may differ from their defaults.
         path: value of --path.
         size: of the picture, pixels.
+        seconds: length of a movie that stands still; 0: that of the path.
     """
     words = ["climatenerf", "render", str(run), "-o", "out", "--path", path]
     words += ["--size", f"{size[0]}x{size[1]}"]
+    if seconds > 0:
+        words += ["--frames", str(round(seconds * FPS) + 1), "--fps", f"{FPS:g}"]
+    if isinstance(weather, Path):
+        return shlex.join([*words, "--weather", str(weather)])
     for effect in effects:
         for item, parameter in effect.fields().items():
             value = weather.value(f"{effect.name}.{item}")
@@ -232,6 +243,13 @@ class WeatherControls:
             self._tell("")
             self._show(source)
             self._changed(weather)
+
+    def put(self, weather: Weather) -> None:
+        """Show other weather, which is valid, in all controls."""
+        with self._lock:
+            if weather != self.weather:
+                self.weather = weather
+                self._show()
 
     def _show(self, source: Any = None) -> None:
         """Let all controls but one show the weather."""

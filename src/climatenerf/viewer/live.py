@@ -22,6 +22,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.field.compositing import RenderCancelled
 from climatenerf.render.frame import FrameOptions, render_frame
 from climatenerf.render.session import Frame, RenderSession
+from climatenerf.viewer.controls import FPS
 from climatenerf.viewer.overlays import picture_of
 from climatenerf.viewer.warp import warped
 from climatenerf.weather.description import KeyframedWeather
@@ -33,7 +34,6 @@ FRAME = 1 / 30  # s between warped pictures
 MOVING_WIDTH = 480  # pixels of warped pictures
 COARSE = 4  # pixels along a side that share a ray while moving
 FIRST = 8  # of the first picture after a change of the weather
-FPS = 24.0  # moments a second for which keyframed weather is prepared, as for a movie of `render`
 PATIENCE = 0.08  # s of computing between two questions whether to stop
 State = Literal["warped", "coarse", "half", "full"]
 
@@ -119,7 +119,7 @@ class _Patient:
 
 
 def _moments(weather: KeyframedWeather | Weather) -> Float[np.ndarray, "f"]:
-    """Moments of the frames of a movie of keyframed weather, s."""
+    """Moments of the frames of a movie, for which keyframed weather is prepared, s."""
     duration = weather.duration if isinstance(weather, KeyframedWeather) else 0.0
     return np.arange(math.floor(duration * FPS + 1e-6) + 1) / FPS
 
