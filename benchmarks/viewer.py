@@ -5,10 +5,12 @@ python benchmarks/viewer.py RUN
 Poses arrive 30 times a second for two seconds, as from a drag, in the place as it is, flooded and
 under snow. The age of a picture is the time since its pose was asked for. Then the pose rests until
 the full picture; then the water level changes. No browser takes part, but for the first picture:
-from opening the page in Chromium to the first picture that is sent.
+from opening the page in Chromium to the first picture that is sent. With --pictures,
+docs/gallery/street-viewer.jpg shows it on a wide screen and on a phone.
 """
 
 import argparse
+import io
 import shutil
 import threading
 import time
@@ -16,10 +18,12 @@ from pathlib import Path
 
 import common
 import numpy as np
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from climatenerf import Flood, Snow, Weather, api
 from climatenerf.core.cameras import Camera
+from climatenerf.output.contact_sheet import write_jpeg
 from climatenerf.paths.camera_path import still
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
@@ -27,6 +31,7 @@ from climatenerf.viewer.app import ViewerApp
 from climatenerf.viewer.live import LiveView, Wanted
 from climatenerf.weather.world import Kept
 
+GALLERY = Path(__file__).resolve().parents[1] / "docs" / "gallery"
 RATE, SECONDS = 30, 2.0
 WEATHERS = {
     "clean": Weather(),
@@ -114,14 +119,51 @@ def first_picture(run: Path, place: Place) -> dict[str, float]:
     return common.spread(times[1:])
 
 
+def pictures(run: Path, place: Place) -> None:
+    """Write the viewer with a flood, on a wide screen and on a phone, into the gallery."""
+    app, shots = ViewerApp(run, place, 0), []
+    flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
+        for width in (1280, 400):
+            page = browser.new_context(viewport={"width": width, "height": 760}).new_page()
+            page.goto(f"http://localhost:{app.port}")
+            while not app.tabs:
+                page.wait_for_timeout(20)
+            (tab,) = app.tabs.values()
+            page.wait_for_timeout(2000)
+            for notice in page.locator(".mantine-Notification-closeButton").all():
+                notice.click()  # of rendering without a GPU
+            tab.controls.set("flood.level", 0.45)
+            tab._before.value = True
+            tab._split.value = 30
+            while tab.shown is None or tab.shown.state != "full" or not tab.shown.wanted.split:
+                page.wait_for_timeout(50)
+            page.wait_for_timeout(1000)
+            shots.append(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+            page.context.close()
+            while app.tabs:
+                time.sleep(0.01)
+        browser.close()
+    app.close()
+    sheet = Image.new("RGB", (sum(s.width for s in shots) + 8, shots[0].height), (90, 90, 90))
+    sheet.paste(shots[0], (0, 0))
+    sheet.paste(shots[1], (shots[0].width + 8, 0))
+    write_jpeg(GALLERY / "street-viewer.jpg", np.asarray(sheet), max_bytes=150_000)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path)
     parser.add_argument("--size", default="480x270")
+    parser.add_argument("--pictures", action="store_true", help="draw the gallery's sheet alone")
     options = parser.parse_args()
     width, height = (int(side) for side in options.size.split("x"))
     run = api.load_run(options.run)
     place = Place(run.completed(), run.scene, Kept(run.folder, run.digest or ""), run.style)
+    if options.pictures:
+        pictures(options.run, place)
+        return
     path = still(run.scene, None, 1, (width, height))
     found: dict[str, object] = {"size": options.size}
     for name, weather in WEATHERS.items():

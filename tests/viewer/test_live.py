@@ -201,6 +201,11 @@ def test_clicks_trace_their_ray(place):
     assert found.water_depth == pytest.approx(0.4, abs=0.01)
     assert "water 0.4" in found.sentence and "deep" in found.sentence
     assert measure(session, HERE[:3, 3], np.array([0.0, 0.1, 1.0])).sentence == "sky"
+    unsure = measure(session, HERE[:3, 3], 3 * down, depth_error=0.1)
+    assert unsure.distance_error == pytest.approx(0.1 * unsure.distance)
+    assert unsure.height_error == pytest.approx(0.1 * 1.6, abs=1e-3), "1.6 m down the ray"
+    assert unsure.water_error == unsure.height_error
+    assert "water 0.40 ± 0.16 m deep" in unsure.sentence
 
 
 class SlowSession:

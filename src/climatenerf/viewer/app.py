@@ -1,5 +1,6 @@
 """The viewer: one session, one set of controls and one live view for each browser tab."""
 
+import contextlib
 import html
 import io
 import re
@@ -15,12 +16,13 @@ from PIL import Image, PngImagePlugin
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.rotations import quaternions, rotation_matrices
-from climatenerf.core.storage import make_folder, write_bytes, write_json
+from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
 from climatenerf.paths.camera_path import still
 from climatenerf.paths.key_poses import through
 from climatenerf.paths.nerfstudio import DrawnPath, write_drawn_path
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
+from climatenerf.training.run import METRICS
 from climatenerf.viewer import guarded_server
 from climatenerf.viewer.controls import FPS, WeatherControls, render_command
 from climatenerf.viewer.film import TimeControls
@@ -77,6 +79,7 @@ class ViewerApp:
         clear = KeyframedWeather(Weather(effects=effects), {})
         self.weather = clear if weather is None else read_weather(weather, effects)
         self.weather_file = weather
+        self.depth_error = _depth_error(run)
         self.tabs: dict[int, Tab] = {}
         self.digest = digest
         self.rendering = threading.Lock()
@@ -116,7 +119,8 @@ class ViewerApp:
             tabs, self.tabs = list(self.tabs.values()), {}
         for tab in tabs:
             tab.close()
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # viser says that it ends
+            self.server.stop()
 
 
 class Tab:
@@ -424,6 +428,13 @@ class Tab:
             )
         finally:
             self.app.rendering.release()
+
+
+def _depth_error(run: Path) -> float:
+    """Relative error of a run's depth at withheld points; 0 where it is not known."""
+    path = run / METRICS
+    found = read_json(path).get("points.abs_rel") if path.is_file() else None
+    return 0.0 if found is None else float(found)
 
 
 def _vertical_fov(camera: Camera) -> float:

@@ -6,11 +6,13 @@ has one, must equal its Host, since the GUI's own page comes from there.
 """
 
 import contextlib
+import gzip
 import http
 import io
 import re
 import socket
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
@@ -20,6 +22,15 @@ if TYPE_CHECKING:
     import viser
 
 LOOPBACK = "127.0.0.1"
+NOTICE = """<script>
+if (!document.createElement("canvas").getContext("webgl2")) {
+  document.body.insertAdjacentHTML("afterbegin",
+    '<p role="alert" style="position:fixed; z-index:9999; margin:1em; padding:1em;' +
+    'max-width:30em; background:#fff; color:#111; border:2px solid #b00; font:16px sans-serif">' +
+    'This browser has no WebGL 2, which the viewer needs: switch hardware acceleration on or ' +
+    'take another browser, or write a page that needs none by <code>climatenerf page</code>.</p>');
+}
+</script>"""
 OWN_NAMES = ("localhost", "127.0.0.1", "::1")
 
 
@@ -68,7 +79,10 @@ def guarded(names: Sequence[str]) -> Iterator[None]:
                 return connection.respond(
                     http.HTTPStatus.FORBIDDEN, "This page may be opened on its own machine only.\n"
                 )
-            return None if process_request is None else process_request(connection, request)
+            response = None if process_request is None else process_request(connection, request)
+            if response is not None and "html" in response.headers.get("Content-Type", ""):
+                return _with_notice(response)
+            return response
 
         return original(*args, process_request=checked, **options)
 
@@ -77,6 +91,18 @@ def guarded(names: Sequence[str]) -> Iterator[None]:
         yield
     finally:
         websockets_server.serve = original
+
+
+def _with_notice(response: Any) -> Any:
+    """The GUI's own page, which says so where it cannot draw."""
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    page = gzip.decompress(response.body) if packed else response.body
+    body = page.replace(b"</body>", NOTICE.encode() + b"</body>")
+    headers = response.headers.copy()
+    for name, value in (("Content-Encoding", "identity"), ("Content-Length", str(len(body)))):
+        del headers[name]
+        headers[name] = value
+    return replace(response, headers=headers, body=body)
 
 
 def check_port(port: int) -> None:
@@ -128,5 +154,6 @@ def start(port: int, allowed_hosts: Sequence[str] = ()) -> "viser.ViserServer":
     # viser prints a box of addresses, of which one would be taken for ours.
     with guarded((*OWN_NAMES, *names)), contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False)
-    server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="large")
+    server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
+    server.gui.main_panel.dock_right()  # beside the picture, not over it
     return server
