@@ -6,6 +6,7 @@ import pytest
 from support.command_line import error_message
 
 from climatenerf.cli import VERBS, main
+from climatenerf.cli.flags import names_of
 
 RENDER = ("render", "run", "-o", "out")
 
@@ -57,3 +58,8 @@ def test_help_into_a_pipe_that_closes_is_silent():
     command = f"{sys.executable} -m climatenerf render --help | head -n 1"
     done = subprocess.run(command, shell=True, capture_output=True, text=True)
     assert done.stdout.startswith("usage:") and done.stderr == ""
+
+
+def test_names_may_have_commas_or_spaces_between():
+    assert names_of("depth,normal", "label", " a , ,b") == ("depth", "normal", "label", "a", "b")
+    assert names_of() == ()

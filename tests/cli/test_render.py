@@ -32,12 +32,13 @@ OURS = ["frames/0000.png", "movie.mp4", "movie.json", "depth/0000.npz", "preview
 
 @pytest.mark.slow
 def test_a_shorter_render_removes_the_frames_of_an_earlier_longer_one(run_folder, tmp_path):
-    args = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--layers", "depth"]
+    args = ["render", run_folder, "-o", tmp_path, "--size", "48x27", "--layers", "depth,seen"]
     assert run_cli(*args, "--frames", "3") == 0
     (tmp_path / "frames" / "mine.png").write_bytes(b"not a frame")
     assert run_cli(*args, "--frames", "1", "--smog.visibility", "50 m") == 0
     assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == ["0000.png", "mine.png"]
     assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["0000.npz"]
+    assert (tmp_path / "seen" / "0000.npz").is_file()
     sidecar = json.loads((tmp_path / "movie.json").read_text())
     assert len(sidecar["frames"]) == 1 and sidecar["weather"]["smog"]["visibility"] == "50 m"
 

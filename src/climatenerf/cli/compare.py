@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.flags import optional
+from climatenerf.cli.flags import names_of, optional
 from climatenerf.cli.render import check_out, parse_size
 from climatenerf.core.errors import UserError
 from climatenerf.core.input_limits import check_fps, check_seed
@@ -72,7 +72,7 @@ def run(options: Compare) -> int:
     from climatenerf.studies.compare.uvq import LICENCE, uvq
 
     check_fps(options.fps)
-    effects = cases.check_effects(options.effects)
+    effects = cases.check_effects(names_of(*options.effects))
     weathers = cases.weathers_of(options.weather, effects, options.seed)
     # All adapters are checked before anything is rendered.
     methods = (

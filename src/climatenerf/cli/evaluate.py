@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.flags import optional
+from climatenerf.cli.flags import names_of, optional
 from climatenerf.core.errors import UserError
 from climatenerf.core.locks import only_writer
 
@@ -105,7 +105,7 @@ def run(options: Evaluate) -> int:
 
     if kind == "--ablation geometry":
         extent = options.minutes, options.downscale, options.seeds
-        return studies.geometry(options.run, options.out, *extent, options.rows)
+        return studies.geometry(options.run, options.out, *extent, names_of(*options.rows))
     picture = studies.Picture(options.run, options.weather, options.view, options.size)
     if options.sweep is not None:
         return studies.sweep(picture, options.out, options.sweep)
@@ -131,7 +131,7 @@ def run_reference(options: Evaluate) -> int:
         )
     field, scene = fitted.field, fitted.scene
     config = check_config(options.run)
-    reference = read_reference(scene.root, options.views, options.weathers)
+    reference = read_reference(scene.root, names_of(*options.views), names_of(*options.weathers))
     if options.out.resolve().is_relative_to(reference.folder.resolve()):
         raise UserError(f"{options.out} lies in the reference set; choose another folder with -o")
     check_views(scene, reference)

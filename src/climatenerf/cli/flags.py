@@ -27,6 +27,11 @@ def optional(metavar: str) -> Any:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
+def names_of(*words: str) -> tuple[str, ...]:
+    """Return the names in a flag's words, which spaces or commas separate."""
+    return tuple(name.strip() for word in words for name in word.split(",") if name.strip())
+
+
 def parse_flags(kind: type, prog: str, words: Sequence[str]) -> Any:
     """Return the options of a verb; tyro prints help itself and exits with status 0.
 

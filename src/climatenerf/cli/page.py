@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.flags import optional
+from climatenerf.cli.flags import names_of, optional
 from climatenerf.cli.render import parse_size
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.page.languages import LANGUAGES
@@ -128,13 +128,13 @@ def settings_of(options: Page) -> PageSettings:
             f'--language must be one of {", ".join(LANGUAGES)}; got "'
             f'{one_line(options.language, 20)}"'
         )
-    names = _words(options.views)
+    names = names_of(options.views)
     count = 6
     if len(names) == 1 and names[0].isdecimal() and len(names[0]) < 4:
         count, names = int(names[0]), ()
     if not 1 <= (len(names) or count) <= MAX_VIEWS:
         raise UserError(f"--views must be 1 to {MAX_VIEWS}, or as many names of photos")
-    seasons = _words(options.seasons)
+    seasons = names_of(options.seasons)
     unknown = set(seasons) - set(SEASONS)
     if unknown:
         raise UserError(f"there is no season {min(unknown)!r}; use {', '.join(SEASONS)}")
@@ -156,13 +156,9 @@ def settings_of(options: Page) -> PageSettings:
     )
 
 
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(",") if word.strip())
-
-
 def _lengths(flag: str, text: str, low: float, high: float) -> tuple[float, ...]:
     """Return lengths given with commas between, in m."""
-    values = tuple(parse_quantity(word, LENGTH, f"each of {flag}") for word in _words(text))
+    values = tuple(parse_quantity(word, LENGTH, f"each of {flag}") for word in names_of(text))
     if len(values) > MAX_STEPS or any(not low <= value <= high for value in values):
         raise UserError(f"{flag} must be at most {MAX_STEPS} lengths from {low:g} m to {high:g} m")
     return tuple(dict.fromkeys(values))

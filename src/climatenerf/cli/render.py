@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from climatenerf.cli import progress
-from climatenerf.cli.flags import optional
+from climatenerf.cli.flags import names_of, optional
 from climatenerf.cluster.workers import parse_workers
 from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.input_limits import MAX_FRAMES
@@ -136,7 +136,7 @@ def run(
             size=size,
             supersample=options.supersample,
             appearance=options.appearance,
-            layers=options.layers,
+            layers=names_of(*options.layers),
             formats=options.layer_format,
             part=part,
             join_only=options.join,
