@@ -6,8 +6,9 @@ python benchmarks/styles.py RUN --size 480x270 --pairs 4
 Vegetation: mean turn of hue (degrees), and chroma (over lightness) and luminance over those of
 the clean frame, of pixels labelled so and green. Kept: mean change of roads and buildings, 8-bit
 values.
-Edges: structural similarity and gain of the magnitude of edges. Warp: error between neighbouring
-frames over the clean one's. Frames are timed in turns, clean and styled.
+Halo: mean change of the sky within 5 pixels of vegetation, and of the sky farther than 15 pixels,
+8-bit values. Edges: structural similarity and gain of the magnitude of edges. Warp: error between
+neighbouring frames over the clean one's. Frames are timed in turns, clean and styled.
 """
 
 import argparse
@@ -17,10 +18,11 @@ from pathlib import Path
 import common
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 
 import climatenerf
 from climatenerf.cli.render import parse_size
-from climatenerf.core.classes import BUILDING, ROAD, VEGETATION
+from climatenerf.core.classes import BUILDING, ROAD, SKY, VEGETATION
 from climatenerf.core.srgb import LUMA, to_linear
 from climatenerf.evaluation.consistency import Frame, warp_error
 from climatenerf.evaluation.edit_scores import edge_ssim
@@ -61,6 +63,17 @@ def gain(styled, clean):
     """Return the mean step between neighbouring pixels over that of the clean picture."""
     steps = [np.abs(np.diff(p @ np.array(LUMA), axis=1)).mean() for p in (styled, clean)]
     return float(steps[0] / steps[1])
+
+
+def halo(styled, clean, label):
+    """Return the mean change of the sky near vegetation, and far from it, 8-bit values."""
+    near, far = [], []
+    for a, b, classes in zip(styled, clean, label, strict=True):
+        away = distance_transform_edt(classes != VEGETATION)
+        change, sky = 255 * np.abs(a - b).mean(-1), classes == SKY
+        near.append(change[sky & (away <= 5)])
+        far.append(change[sky & (away > 15)])
+    return {"near": float(np.concatenate(near).mean()), "far": float(np.concatenate(far).mean())}
 
 
 def score(folder: Path, size: str, pairs: int) -> dict[str, object]:
@@ -112,6 +125,7 @@ def score(folder: Path, size: str, pairs: int) -> dict[str, object]:
         rows[name] = {
             "vegetation": vegetation(linear[leaf], to_linear(styled)[leaf]),
             "kept_change_255": float(255 * np.abs(styled - clean)[kept].mean()),
+            "halo_255": halo(styled, clean, label),
             "edge_ssim": float(
                 np.mean([edge_ssim(a, b) for a, b in zip(styled, clean, strict=True)])
             ),
