@@ -74,8 +74,8 @@ class Sheet:
 class Glitter(Sheet):
     """A sheet that adds light where a pixel on it is narrower than 20 mm."""
 
-    def glints(self, x, d, width):
-        return torch.where(width < 0.02, 0.25, 0.0)[:, None].expand_as(x)
+    def colour_towards(self, x, d, width):
+        return self.colour(x) + torch.where(width < 0.02, 0.25, 0.0)[:, None]
 
 
 def rays(n=200, seed=0, height=20.0):

@@ -106,10 +106,12 @@ def test_two_keyframes_make_a_film_that_the_slider_moves_through(tab):
     tab.at(1.0)
     assert tab.weather.flood.level == pytest.approx(0.3)
     assert tab.film.weather() is tab.film.film and tab.film.now == 1.0
-    tab.weather = flooded(0.7)  # a control was moved: not the film any more
+    tab.weather, tab.film.edited = flooded(0.7), True  # a control was moved
     assert tab.film.weather() == flooded(0.7)
     assert "0, 4 s" in tab.gui.made["text"].content and tab.changes == 2
     tab.at(3.6)
+    assert tab.told[-1] == "what was changed without a keyframe is gone"
+    assert tab.film.weather() is tab.film.film
     tab.film.drop()
     assert sorted(tab.film.moments) == [0.0] and not tab.film.film.keyframes
     tab.film.drop()
@@ -134,7 +136,7 @@ def test_a_value_that_stays_for_a_movie_is_told(tab):
     tab.at(2.0)
     tab.weather = flooded(0.2, wind=3.0)
     tab.film.keep()
-    assert tab.told[-1] == "flood.wind-speed keeps one value for the whole movie"
+    assert "flood.wind-speed: one value for the whole movie" in tab.gui.made["text"].content
 
 
 def test_a_film_that_is_given_plays_from_its_beginning_again():

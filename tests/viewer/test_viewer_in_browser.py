@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -180,11 +181,15 @@ def test_pictures_and_paths_are_saved_into_the_run_alone(browser, app, tmp_path)
     assert np.array_equal(np.asarray(Image.open(first)), tab.shown.picture)
     sidecar = json.loads(first.with_suffix(".json").read_text())
     assert sidecar["simulated"] and sidecar["weather"]["flood"]["level"] == "0.3 m"
-    path = tab.add_keyframe()
+    assert sidecar["time_s"] == 0.0
+    path = tab.add_key_pose()
+    assert path.name == "path-0001.json"
     drawn = read_drawn_path(path, app.place.scene)
     np.testing.assert_allclose(drawn.c2w[0], tab.wanted().c2w, atol=1e-6)
-    tab.add_keyframe()
+    assert tab.add_key_pose() == path
     assert read_drawn_path(path, app.place.scene).c2w.shape == (25, 4, 4)
+    tab.remove_key_pose()
+    assert read_drawn_path(path, app.place.scene).c2w.shape == (1, 4, 4)
     assert {each.parent for each in (tmp_path / "run").rglob("*.*")} == {tmp_path / "run" / "views"}
     page.context.close()
 
@@ -282,7 +287,7 @@ def test_the_path_is_rendered_as_a_movie_in_the_weather_that_is_shown(browser, t
     tab.controls.set("smog.visibility", 50.0)
     with pytest.raises(UserError, match="add key poses"):
         tab.render_path()
-    tab.add_keyframe()
+    tab.add_key_pose()
     movie = tab.render_path()
     assert movie == folder / "views" / "movie-0001" / "movie.mp4" and movie.stat().st_size > 500
     sidecar = json.loads((movie.parent / "movie.json").read_text())
@@ -290,6 +295,10 @@ def test_the_path_is_rendered_as_a_movie_in_the_weather_that_is_shown(browser, t
     settled(page, tab)
     frame = np.asarray(Image.open(movie.parent / "frames" / "0000.png"))
     assert np.abs(frame.astype(int) - tab.shown.picture).max() <= 1, "as the viewer shows it"
+    tab.files._closed = True  # as of a tab that has gone
+    with pytest.raises(UserError, match="the movie was stopped"):
+        tab.render_path()
+    assert not (folder / "views" / "movie-0002" / "movie.mp4").exists()
     page.context.close()
     app.close()
 
@@ -313,13 +322,21 @@ def test_keyframed_weather_is_moved_through_played_and_kept(browser, tmp_path):
     assert tab.shown.weather == tab.film.film and tab.shown.wanted.time == 1.0
     assert tab.controls.weather.flood.level == pytest.approx(0.3)
     shown = tab.shown.picture
+    tab._clicked(SimpleNamespace(ray_origin=(0.0, 0.0, 1.6), ray_direction=(0.0, 0.3, -1.0)))
+    assert "water 0.30" in tab._measured.content, "at the moment that is shown"
     tab.controls.set("flood.level", 0.8)
+    assert "--flood.level=0.8" in tab._command.value, "as shown, which no keyframe holds yet"
     tab.film.keep()
-    kept = tmp_path / "run" / "views" / "weather.toml"
+    kept = tmp_path / "run" / "views" / "weather-0001.toml"
     assert read_weather(kept).keyframes["flood.level"] == ((0.0, 0.0), (1.0, 0.8), (2.0, 0.6))
     assert f"--weather {kept}" in tab._command.value and "0.8 m" in tab._file.value
     settled(page, tab)
     assert not np.array_equal(tab.shown.picture, shown)
+    picture = tab.save_picture()
+    sidecar = json.loads(picture.with_suffix(".json").read_text())
+    assert sidecar["time_s"] == 1.0 and sidecar["weather"]["flood"]["level"] == "0.8 m"
+    pose = read_drawn_path(picture.with_name("view-0001-pose.json"), place.scene)
+    assert len(pose.c2w) == 49, "the film from this pose; its frame 24 is the picture"
     moments = set()
     page.get_by_text("play", exact=True).click()
 

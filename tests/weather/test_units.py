@@ -117,7 +117,7 @@ def test_values_out_of_range_are_refused():
 def test_every_parameter_has_a_range_and_no_section_is_too_long():
     for effect in EFFECTS:
         parameters = effect.fields()
-        assert 0 < len(parameters) <= 16
+        assert 0 < len(parameters) <= 17
         for parameter in parameters.values():
             if isinstance(parameter, units.Choice):
                 assert len(set(parameter.words)) == len(parameter.words) > 1

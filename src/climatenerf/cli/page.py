@@ -92,7 +92,9 @@ def run(options: Page) -> int:
     for note in written.notes:
         progress.say(note)
     size = out.stat().st_size / 1e6
-    progress.result(f"page: {out} ({written.views} views, {size:.1f} MB)")
+    progress.result(
+        f"page: {out} ({written.views} view{'s' * (written.views != 1)}, {size:.1f} MB)"
+    )
     return 0
 
 

@@ -92,11 +92,14 @@ def sample_colour(
     colour = torch.empty(keep.shape[0], 3, device=x.device)
     for index, matter in enumerate(world.matters, start=1):
         mine = kind[keep] == index
-        colour[mine] = matter.colour(x[mine])
-        glints: Callable[[Tensor, Tensor, Tensor], Tensor] | None = getattr(matter, "glints", None)
-        if glints is not None:
+        towards: Callable[[Tensor, Tensor, Tensor], Tensor] | None
+        towards = getattr(matter, "colour_towards", None)
+        if towards is None:
+            colour[mine] = matter.colour(x[mine])
+        else:
             own = ray[keep[mine]]
-            colour[mine] += glints(x[mine], rays_d[own], pixel_angle[own] * samples.t[keep[mine]])
+            width = pixel_angle[own] * samples.t[keep[mine]]
+            colour[mine] = towards(x[mine], rays_d[own], width)
     own = kind[keep] == 0
     ids = None if ids is None else ids[own]
     colour[own] = world.field.colour(

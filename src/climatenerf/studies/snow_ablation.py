@@ -45,11 +45,11 @@ class WhiteSnow(BakedSnow):
         """Linear radiance: 1."""
         return torch.ones_like(x)
 
-    def glints(
+    def colour_towards(
         self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """None."""
-        return torch.zeros_like(x)
+        """Linear radiance: 1."""
+        return torch.ones_like(x)
 
 
 @dataclass(frozen=True)

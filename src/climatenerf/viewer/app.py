@@ -3,7 +3,6 @@
 import contextlib
 import html
 import io
-import re
 import threading
 import time
 from collections.abc import Callable
@@ -11,20 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image, PngImagePlugin
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.errors import UserError
 from climatenerf.core.rotations import quaternions, rotation_matrices
-from climatenerf.core.storage import make_folder, read_json, write_bytes, write_json
+from climatenerf.core.storage import read_json
 from climatenerf.paths.camera_path import still
-from climatenerf.paths.key_poses import through
-from climatenerf.paths.nerfstudio import DrawnPath, write_drawn_path
 from climatenerf.render.session import RenderSession
 from climatenerf.studies.shot import Place
 from climatenerf.training.run import METRICS
 from climatenerf.viewer import guarded_server
-from climatenerf.viewer.controls import FPS, WeatherControls, render_command
+from climatenerf.viewer.controls import WeatherControls
+from climatenerf.viewer.files import SavedFiles, weather_at
 from climatenerf.viewer.film import TimeControls
 from climatenerf.viewer.live import LiveView, Shown, Wanted
 from climatenerf.viewer.measure import measure
@@ -32,7 +29,6 @@ from climatenerf.viewer.overlays import LAYERS, legend
 from climatenerf.weather.description import (
     KeyframedWeather,
     read_weather,
-    weather_to_table,
     weather_to_toml,
 )
 from climatenerf.weather.registry import installed_effects
@@ -43,10 +39,8 @@ if TYPE_CHECKING:
 
 MAX_SIDE = 960  # pixels of a full picture
 JPEG_QUALITY = {"warped": 70, "coarse": 75, "half": 80, "full": 90}
+STATES = {"warped": "moving", "coarse": "coarse", "half": "half", "full": "full"}
 HANDLE_DISTANCE = 5.0  # m, of the arrow for the water level from the first camera
-WEATHER_FILE = "weather.toml"
-VIEWS = "views"
-"""Folder in the run that pictures and paths are written into."""
 
 
 class ViewerApp:
@@ -131,15 +125,13 @@ class Tab:
         self.app, self.client = app, client
         eye = still(app.place.scene, None, 1, None)
         self.shown: Shown | None = None
-        self.keyframes: list[tuple[np.ndarray, float]] = []
         self._asking = threading.Lock()
-        self._weather_file = app.weather_file
-        self._saved_pose: tuple[np.ndarray, Path] | None = None
+        self.files = SavedFiles(app.run, installed_effects(), app.weather_file)
         client.camera.position = tuple(eye.c2w[0, :3, 3])
         client.camera.wxyz = tuple(quaternions(eye.c2w[0, :3, :3]))
         client.camera.fov = float(2 * np.arctan(0.5 * eye.cameras[0].height / eye.cameras[0].fy))
-        self.live = LiveView(self._new_session(), self._show, self._tell)
-        self._ends = [self.live.close]
+        self.live = LiveView(self._new_session(), self._show, self._tell_state)
+        self._ends = [self.files.close, self.live.close]
         try:
             self._build(client.gui)
             self._add_level_handle(eye.c2w[0])
@@ -175,6 +167,7 @@ class Tab:
         scene = self.app.place.scene
         name = html.escape(scene.root.resolve().name)
         gui.add_markdown(f"**{name}**: simulated weather, no forecast")
+        self._state = gui.add_markdown("picture: none yet")
         self._message = gui.add_markdown(" ")
         self._measured = gui.add_markdown("Click the picture to measure.")
         low = scene.lowest_ground_z - scene.ground_z - 0.5
@@ -183,7 +176,7 @@ class Tab:
         levels = float(np.floor(10 * low) / 10), float(np.floor(10 * high) / 10)
         effects, begun = self.live.session.effects, self.app.weather
         self.controls = WeatherControls(
-            gui, effects, begun.at(0.0), levels, lambda _: self._ask(), self._tell
+            gui, effects, begun.at(0.0), levels, lambda _: self._edited(), self._tell
         )
         self.film = TimeControls(
             gui,
@@ -191,7 +184,7 @@ class Tab:
             begun,
             lambda: self.controls.weather,
             self._put,
-            lambda: self._saved(self.save_keyframes),
+            self._keyframes_changed,
             self._tell,
         )
         self._ends.insert(0, self.film.close)
@@ -215,12 +208,16 @@ class Tab:
         with gui.add_folder("save", expand_by_default=False):
             picture = gui.add_button("save the picture")
             key = gui.add_button("add a key pose to the path")
+            back = gui.add_button("remove the last key pose")
             movie = gui.add_button("render the path")
+            stop = gui.add_button("stop the movie")
             self._command = gui.add_text("command", "", multiline=True)
             self._file = gui.add_text("weather file", "", multiline=True)
         picture.on_click(lambda _: self._saved(self.save_picture))
-        key.on_click(lambda _: self._saved(self.add_keyframe))
+        key.on_click(lambda _: self._saved(self.add_key_pose))
+        back.on_click(lambda _: self._saved(self.remove_key_pose))
         movie.on_click(lambda _: self._saved(self.render_path))
+        stop.on_click(lambda _: self.files.stop())
 
     def _add_level_handle(self, c2w: np.ndarray) -> None:
         """Put an arrow into the scene, by which the water level is drawn up and down."""
@@ -246,6 +243,20 @@ class Tab:
             if level != self.controls.weather.flood.level:
                 self.controls.set("flood.level", level)
 
+    def _edited(self) -> None:
+        """Show the weather of the controls, which is that of no keyframe."""
+        self.film.edited = True
+        self._ask()
+
+    def _keyframes_changed(self) -> None:
+        film = self.film.film
+        if film is not None:
+            self._saved(lambda: self.files.save_weather(film))
+            if self.files.key_poses:
+                camera = self.wanted().camera
+                self._saved(lambda: self.files.write_path(camera, self.app.place, film))
+        self._ask()
+
     def _put(self, weather: Weather | None) -> None:
         if weather is not None:
             self.controls.put(weather)
@@ -254,8 +265,13 @@ class Tab:
     def _tell(self, sentence: str) -> None:
         self._message.content = f"**{html.escape(sentence)}**" if sentence else " "
 
-    def _preparing(self, what: str, fraction: float) -> None:
-        self._tell(f"preparing {what}: {100 * fraction:.0f} %")
+    def _tell_state(self, sentence: str) -> None:
+        """Say what is prepared, or what is wrong with the weather."""
+        state = "none yet" if self.shown is None else STATES[self.shown.state]
+        self._state.content = f"**{html.escape(sentence)}**" if sentence else f"picture: {state}"
+
+    def _rendering(self, what: str, fraction: float) -> None:
+        self._tell(f"movie, {what}: {100 * fraction:.0f} %")
 
     def _saved(self, save: Callable[[], Path]) -> None:
         try:
@@ -294,140 +310,61 @@ class Tab:
         with self._asking:  # a callback of an older pose must not overtake a newer one
             wanted = self.wanted()
             self.live.ask(wanted)
-        effects, film = self.live.session.effects, self.film.film
-        size, path = (wanted.camera.width, wanted.camera.height), self._path_of(wanted)
-        file = weather_to_toml(film or self.controls.weather, effects)
+        film = self._shown_film()
+        file = weather_to_toml(film or weather_at(wanted), self.live.session.effects)
         if self._file.value != file:
             self._file.value = file
-        if film is None:
-            command = render_command(self.app.run, self.controls.weather, effects, path, size)
-        else:
-            seconds = film.duration if path == "still" else 0.0
-            kept = self._weather_file or self.app.run / VIEWS / WEATHER_FILE
-            command = render_command(self.app.run, kept, effects, path, size, seconds)
+        command = self.files.command(wanted, film)
         if self._command.value != command:
             self._command.value = command
 
-    def _path_of(self, wanted: Wanted) -> str:
-        """Return the --path that shows a pose: that of a saved picture, or of the key poses."""
-        saved = self._saved_pose
-        if saved is not None and np.array_equal(saved[0], wanted.c2w):
-            return str(saved[1])
-        return str(self.app.run / VIEWS / "camera_path.json") if self.keyframes else "still"
-
     def _show(self, shown: Shown) -> None:
+        finer = self.shown is None or self.shown.state != shown.state
         self.shown = shown
+        if finer:
+            self._tell_state("")
         self.client.scene.set_background_image(
             shown.picture, format="jpeg", jpeg_quality=JPEG_QUALITY[shown.state]
         )
 
     def _clicked(self, event: Any) -> None:
-        found = measure(
-            self.live.session, np.array(event.ray_origin), np.array(event.ray_direction)
-        )
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        found = measure(self.live.session, *ray, self.film.now, self.app.depth_error)
         self._measured.content = found.sentence
 
     # --- files ----------------------------------------------------------------------------------
 
     def save_picture(self) -> Path:
-        """Write the picture that is shown, with a sidecar, and return its path.
-
-        Raises:
-            UserError: it is not full yet, or cannot be written.
-        """
-        shown = self.shown
-        if shown is None or shown.state != "full":
-            raise UserError("the picture is not finished yet; wait until it is, and save again")
-        folder = make_folder(self.app.run / VIEWS)
-        path = folder / f"view-{_next_number(folder, 'view')}.png"
-        picture = io.BytesIO()
-        Image.fromarray(shown.picture).save(picture, "PNG", pnginfo=_simulated())
-        write_bytes(path, picture.getvalue())
-        wanted = shown.wanted
-        size = wanted.camera.width, wanted.camera.height
-        fov = np.array([_vertical_fov(wanted.camera)])
-        drawn = DrawnPath(wanted.c2w[None], fov, size, FPS, "")
-        pose = path.with_name(f"{path.stem}-pose.json")
-        write_drawn_path(pose, self.app.place.scene, drawn)
-        self._saved_pose = wanted.c2w, pose
-        sidecar = {
-            "simulated": True,
-            "note": "weather is simulated",
-            "weather": weather_to_table(shown.weather, self.live.session.effects),
-            "layer": shown.wanted.layer or "picture",
-            "c2w_world": shown.wanted.c2w.tolist(),
-            "vertical_fov_deg": _vertical_fov(shown.wanted.camera),
-            "scale_error": self.app.place.scene.scale_error,
-        }
-        write_json(path.with_suffix(".json"), sidecar)
+        """Write the picture that is shown; see `SavedFiles`."""
+        path = self.files.save_picture(self.shown, self.app.place)
         self._ask()
         return path
 
-    def save_keyframes(self) -> Path:
-        """Write the weather file of the keyframes, and return its path.
-
-        Raises:
-            UserError: it cannot be written.
-        """
-        path = make_folder(self.app.run / VIEWS) / WEATHER_FILE
-        weather = self.film.film or self.controls.weather
-        write_bytes(path, weather_to_toml(weather, self.live.session.effects).encode())
-        self._weather_file = path
+    def add_key_pose(self) -> Path:
+        """Add the pose that is shown to the camera path; see `SavedFiles`."""
+        path = self.files.add_key_pose(self.wanted(), self.app.place, self._shown_film())
         self._ask()
         return path
 
-    def add_keyframe(self) -> Path:
-        """Add the pose to the camera path, and write it as nerfstudio's `camera_path.json`.
-
-        Raises:
-            UserError: it cannot be written.
-        """
-        wanted = self.wanted()
-        self.keyframes.append((wanted.c2w, _vertical_fov(wanted.camera)))
-        keys, angles = zip(*self.keyframes, strict=True)
-        path = self._write_path(*through(keys, angles), wanted.camera)
+    def remove_key_pose(self) -> Path:
+        """Take the last pose out of the camera path; see `SavedFiles`."""
+        path = self.files.remove_key_pose(self.wanted(), self.app.place, self._shown_film())
         self._ask()
         return path
-
-    def _write_path(self, poses: np.ndarray, fovs: np.ndarray, camera: Camera) -> Path:
-        drawn = DrawnPath(poses, fovs, (camera.width, camera.height), FPS, "")
-        path = make_folder(self.app.run / VIEWS) / "camera_path.json"
-        return write_drawn_path(path, self.app.place.scene, drawn)
 
     def render_path(self) -> Path:
-        """Render the camera path in the weather that is shown, and return the movie.
-
-        With keyframes of the weather and without key poses it stands still.
-
-        Raises:
-            UserError: there is no path, or one is being rendered.
-        """
-        from climatenerf.api import Run, render_movie
-
-        film = self.film.film
-        if not self.keyframes and film is None:
-            raise UserError("add key poses to the path first")
-        place, run = self.app.place, self.app.run
-        if not self.app.rendering.acquire(blocking=False):
-            raise UserError("a movie is being rendered; wait until it is finished")
+        """Render the camera path in the weather that is shown; see `SavedFiles`."""
+        app = self.app
+        if not app.rendering.acquire(blocking=False):
+            raise UserError("a movie is being rendered; wait until it is finished, or stop it")
         try:
-            folder = make_folder(run / VIEWS)
-            if not self.keyframes and film is not None:
-                frames, here = round(film.duration * FPS) + 1, self.wanted()
-                fovs = np.full(frames, _vertical_fov(here.camera))
-                self._write_path(np.repeat(here.c2w[None], frames, axis=0), fovs, here.camera)
-            out = folder / f"movie-{_next_number(folder, 'movie')}"
-            fitted = Run(run, place.field, place.scene, self.app.digest, style=place.style)  # pyright: ignore[reportArgumentType]
-            return render_movie(
-                fitted,
-                out,
-                film or self.controls.weather,
-                path=str(folder / "camera_path.json"),
-                complete_ground=False,
-                progress=self._preparing,
-            )
+            given = self.wanted(), self._shown_film(), app.place, app.digest
+            return self.files.render_path(*given, self._rendering)
         finally:
-            self.app.rendering.release()
+            app.rendering.release()
+
+    def _shown_film(self) -> KeyframedWeather | None:
+        return None if self.film.edited else self.film.film
 
 
 def _depth_error(run: Path) -> float:
@@ -435,28 +372,6 @@ def _depth_error(run: Path) -> float:
     path = run / METRICS
     found = read_json(path).get("points.abs_rel") if path.is_file() else None
     return 0.0 if found is None else float(found)
-
-
-def _vertical_fov(camera: Camera) -> float:
-    """Vertical field of view, degrees."""
-    return float(np.degrees(2 * np.arctan(0.5 * camera.height / camera.fy)))
-
-
-def _next_number(folder: Path, kind: str) -> str:
-    """Return the number after the greatest of the folder's files of a kind, four digits."""
-    numbers = [
-        int(found[1])
-        for each in folder.iterdir()
-        if (found := re.match(rf"{kind}-(\d+)", each.name)) is not None
-    ]
-    return f"{max(numbers, default=0) + 1:04d}"
-
-
-def _simulated() -> PngImagePlugin.PngInfo:
-    """Text chunk that marks a picture as simulated."""
-    info = PngImagePlugin.PngInfo()
-    info.add_text("simulated", "weather simulated by climatenerf")
-    return info
 
 
 def tunnel_line(port: int) -> str:

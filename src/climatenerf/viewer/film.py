@@ -21,6 +21,7 @@ class TimeControls:
 
     Attributes:
         moments: weather at the keyframes, by time in s.
+        edited: whether a control was moved since the film was shown, so that it is not.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class TimeControls:
         times = sorted({t for frames in film.keyframes.values() for t, _ in frames})
         self.moments = {t: film.at(t) for t in times}
         self._film = film if times else None
+        self.edited = False
         self._ended = threading.Event()
         self._player: threading.Thread | None = None
         with gui.add_folder("time", expand_by_default=bool(times)):
@@ -75,9 +77,9 @@ class TimeControls:
         return self._film
 
     def weather(self) -> KeyframedWeather | Weather:
-        """What is to be rendered now: the film unless a control has been moved since."""
-        current, film = self._current(), self._film
-        return film if film is not None and film.at(self.now) == current else current
+        """What is to be rendered now: the film, unless a control has been moved since."""
+        film = self._film
+        return self._current() if film is None or self.edited else film
 
     def keep(self) -> None:
         """Set a keyframe: the weather that the controls show, at this moment."""
@@ -105,19 +107,26 @@ class TimeControls:
         except UserError as error:
             self._tell(str(error))
             return
-        self.moments, self._film = moments, film
-        frozen = [] if film is None else film.frozen(self._effects)
-        sentence = f"{', '.join(frozen)} keeps one value for the whole movie" if frozen else ""
-        self._tell(sentence.replace("_", "-"))
+        self.moments, self._film, self.edited = moments, film, False
+        self._tell("")
         self._describe()
         self._changed()
 
     def _describe(self) -> None:
         times = ", ".join(f"{t:g}" for t in sorted(self.moments))
-        self._list.content = f"keyframes at {times} s" if times else "no keyframes"
+        sentence = f"keyframes at {times} s" if times else "no keyframes"
+        frozen = [] if self._film is None else self._film.frozen(self._effects)
+        if frozen:
+            names = ", ".join(frozen).replace("_", "-")
+            sentence += f"; {names}: one value for the whole movie, the first"
+        self._list.content = sentence
 
     def _moved(self) -> None:
-        self._put(None if self._film is None else self._film.at(self.now))
+        film = self._film
+        if film is not None and self.edited:
+            self._tell("what was changed without a keyframe is gone")
+        self.edited = False
+        self._put(None if film is None else film.at(self.now))
 
     def _toggled(self) -> None:
         if self._play.value and (self._player is None or not self._player.is_alive()):
@@ -126,8 +135,10 @@ class TimeControls:
 
     def _run(self) -> None:
         """Move the slider through the time, from here on and again from the beginning."""
-        begun = time.monotonic() - self.now
+        last = time.monotonic()
         with contextlib.suppress(Exception):  # the tab may be gone
             while self._play.value and not self._ended.wait(PLAYED):
                 length = LENGTH if self._film is None else max(self._film.duration, STEP)
-                self._slider.value = round((time.monotonic() - begun) % length, 1)
+                now = time.monotonic()
+                moment, last = self.now + now - last, now  # of the slider, which a user may move
+                self._slider.value = round(moment % length if moment > length else moment, 2)

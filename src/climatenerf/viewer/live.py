@@ -220,16 +220,18 @@ class LiveView:
             self._preparing = wanted.weather
             problem = ""
             try:
-                session = session.changed(wanted.weather, _moments(wanted.weather), self._report)
-                session.world(wanted.time)  # prepares what is put off until it is seen
+                made = session.changed(wanted.weather, _moments(wanted.weather), self._report)
+                made.world(wanted.time)  # prepares what is put off until it is seen
             except RenderCancelled:
                 continue
-            except Exception as error:  # the weather of before stays in
-                problem = _sentence(error)
+            except Exception as error:  # what was shown before stays
+                problem, made = _sentence(error), self.session
             with self._changed:
                 if following is not None and self._next is following:
-                    self._next, self._finished = None, None
-                self.session, self._ready = session, _Ready(session, wanted.weather)
+                    self._next = None
+                if made is not self.session and following is not None:
+                    self._finished = None
+                self.session, self._ready = made, _Ready(made, wanted.weather)
                 self._changed.notify_all()
             with contextlib.suppress(Exception):  # the tab may be gone
                 self._tell(problem)
@@ -281,8 +283,11 @@ class LiveView:
             return False
         if done is not None and done[0] is wanted and done[1] is ready:
             return False
-        waits = ready.asked != wanted.weather  # for its weather, in a pose that is shown
-        return not (waits and last is not None and np.array_equal(last.c2w, wanted.c2w))
+        if ready.asked == wanted.weather or last is None:
+            return True
+        # Waits for its weather, if that of before is shown in the same way.
+        same = _content(wanted)[1:] == last.content[1:]
+        return not (same and np.array_equal(last.c2w, wanted.c2w))
 
     def _render(self, wanted: Wanted, ready: _Ready) -> bool:
         """Render a coarse picture while moving or preparing, else all passes.

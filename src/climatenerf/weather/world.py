@@ -66,7 +66,7 @@ class Matter(Protocol):
 
     Its method `covers`, if it has one, says at which positions (m, [n, 3]) upward surfaces of the
     field belong below it: a fitted surface is rough, and would reach out of thin matter. Its method
-    `glints`, if it has one, gives radiance that depends on the eye; see `snow.layer`.
+    `colour_towards`, if it has one, gives what an eye sees in place of `colour`; see `snow.layer`.
     """
 
     @property

@@ -27,6 +27,7 @@ from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Deposits, SnowGrid, choose_grid, grow
 from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.snow.relief import slopes, tilted
 from climatenerf.weather.snow.shadow_masks import ShadowMasks
 from climatenerf.weather.snow.sparkle import glints
 from climatenerf.weather.weather import Weather
@@ -132,10 +133,30 @@ class BakedSnow:
         through. The paper's way (`Snow.light`) lights all snow as in the open, darkens it in the
         sun's shadow, and shades it by wrap lighting (n.l + gamma)/(1 + gamma).
         """
+        return self._shaded(x, None)
+
+    def colour_towards(
+        self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n 3"]:
+        """As `colour`, with the relief that a pixel resolves, and sparkles in a hard sun.
+
+        Args:
+            x: positions, m.
+            d: unit directions from the eye to these.
+            width: of a pixel there, m.
+        """
+        relief = None if self.snow.relief == 0 else slopes(x, d, width, self.snow.relief)
+        return self._shaded(x, relief) + self.glints(x, d, width)
+
+    def _shaded(
+        self, x: Float[Tensor, "n 3"], relief: Float[Tensor, "n 2"] | None
+    ) -> Float[Tensor, "n 3"]:
         _, _, rest = metaballs.evaluate(_array(x), self.lattice)
         normal = self.normal(x)
         if self.snow.light == "scene":
             height, shade = to_device(rest[:, :2], x.device).unbind(-1)
+            if relief is not None:
+                normal = tilted(normal, relief, height)
             return self._in_light_of_place(x, normal, height, shade / SHADE_UNIT)
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
@@ -311,6 +332,7 @@ class SnowEntity:
             soot=asked.soot,
             albedo=asked.albedo,
             sparkle=asked.sparkle,
+            relief=asked.relief,
         )
         floor = max((surface.level for surface in world.surfaces), default=None)
         snow = replace(

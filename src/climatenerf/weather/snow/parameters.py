@@ -37,6 +37,8 @@ class Snow:
     """Reflectance of deep snow. none: that of grain and soot."""
     sparkle: Annotated[float, number(0.0, 1.0)] = 0.3
     """Area of crystal faces that sparkle in a hard sun, over that of the snow. 0: none."""
+    relief: Annotated[float, quantity(LENGTH, 0.0, 0.05)] = 0.003
+    """Standard deviation of the fine bumps that tilt the surface towards the light. 0: smooth."""
     albedo_offset: Annotated[float, number(0.0, 100.0)] = 4.0
     """c0 of the paper's snow colour (g + c0)/(1 + c0); larger is whiter."""
     wrap: Annotated[float, number(0.0, 100.0)] = 8.0
