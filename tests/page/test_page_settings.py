@@ -30,6 +30,13 @@ def test_defaults_of_the_flags_are_those_of_the_settings():
     assert settings_of(page_options()) == PageSettings()
 
 
+def test_an_unknown_photo_is_told_with_some_that_there_are(tmp_path):
+    scene = yard_place(tmp_path).scene
+    name = scene.views[0].name
+    with pytest.raises(UserError, match=rf"no photo 'nope.jpg'; give --views .* {name}"):
+        page_views(scene, ["nope.jpg"], 1, None)
+
+
 def test_lengths_take_any_unit():
     found = settings_of(
         page_options(levels="20 in, 1.2 m", snow="", smog="0.1 km", views="a,b.jpg")

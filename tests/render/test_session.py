@@ -347,3 +347,20 @@ def test_a_changed_session_leaves_the_first_as_it_was(session_of):
         first.changed(weather_from_table({"flood": {"level": "900 m"}}))
     back = other.changed(first.weather)
     assert np.array_equal(back.frame(CAMERA, C2W).picture, before)
+
+
+def test_what_a_cancelled_preparation_has_found_is_kept(session_of, monkeypatch):
+    counts = []
+    light = torch.full((3,), 2.0)
+    monkeypatch.setattr(module, "scene_irradiance", lambda *_: counts.append(1) or light)
+    first = session_of({}, [0.0])
+    snowy = weather_from_table({"snow": {"depth": "10 cm"}})
+
+    def cancel(what, fraction):
+        if what == "snowfall":
+            raise RenderCancelled
+
+    for _ in range(2):
+        with pytest.raises(RenderCancelled):
+            first.changed(snowy, progress=cancel)
+    assert len(counts) == 1

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import GROUND
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.core.errors import UserError
+from climatenerf.core.errors import UserError, one_line
 from climatenerf.field.protocol import RadianceField, device_of, ground_height
 from climatenerf.paths.camera_path import still
 from climatenerf.paths.framing import train_views
@@ -73,6 +73,14 @@ def page_views(
         names = [view.name for view in spread(scene, count)]
     views = []
     for name in dict.fromkeys(names):
+        try:
+            still(scene, name, 1, None)
+        except UserError as error:
+            known = ", ".join(view.name for view in scene.views[:3])
+            raise UserError(
+                f"there is no photo {one_line(name, 60)!r}; give --views as a number of views, or as"
+                f" names of photos such as {known}"
+            ) from error
         path = still(scene, name, 1, size)
         camera = path.cameras[0]
         if size is None:

@@ -49,6 +49,19 @@ class Frame:
         return encoded_8bit(self.linear)
 
 
+@dataclass
+class _Found:
+    """What a session finds once, shared with the sessions that are made from it.
+
+    Attributes:
+        photos: rays of the photos with what they meet; None: not asked for yet.
+        light: irradiance of the photos on open level ground; None: not asked for yet.
+    """
+
+    photos: list[PhotoRays] | None = None
+    light: Float[Tensor, "3"] | None = None
+
+
 class RenderSession:
     """A field under weather that may change over time."""
 
@@ -99,8 +112,7 @@ class RenderSession:
         self._progress = progress or unreported
         self._kept = kept
         self._style = style
-        self._photos: list[PhotoRays] | None = None
-        self._light: Float[Tensor, 3] | None = None
+        self._found = _Found()
         self._keys: dict[str, Key] = {}
         self._entities: dict[str, Entity] = {}
         self.change(weather)
@@ -245,15 +257,15 @@ class RenderSession:
         def report(fraction: float) -> None:
             self._progress("photos", fraction)
 
-        if self._photos is None:
-            self._photos = trace_photos(observed(self.field), self.scene, report)
-        return self._photos
+        if self._found.photos is None:
+            self._found.photos = trace_photos(observed(self.field), self.scene, report)
+        return self._found.photos
 
     def _irradiance(self) -> Float[Tensor, "3"]:
-        if self._light is None:
+        if self._found.light is None:
             self._progress("light", 0.0)
-            self._light = self._open_irradiance()
-        return self._light
+            self._found.light = self._open_irradiance()
+        return self._found.light
 
     def _open_irradiance(self) -> Float[Tensor, "3"]:
         """Irradiance of the photos on open level ground.
