@@ -78,8 +78,8 @@ def page_views(
         except UserError as error:
             known = ", ".join(view.name for view in scene.views[:3])
             raise UserError(
-                f"there is no photo {one_line(name, 60)!r}; give --views as a number of views, or as"
-                f" names of photos such as {known}"
+                f"there is no photo {one_line(name, 60)!r}; give --views as a number of views,"
+                f" or as names of photos such as {known}"
             ) from error
         path = still(scene, name, 1, size)
         camera = path.cameras[0]
