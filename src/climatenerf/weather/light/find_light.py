@@ -62,7 +62,7 @@ SKY_ERROR = 0.08  # of log radiance, by clouds
 GROUND_ALBEDO = 0.18  # a grey card
 ALBEDO_SPREAD = 0.5  # of its log: asphalt and grass .1, concrete .3
 RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
-LOBE_RATIO, LOBE_RATIO_SPREAD = -0.2, 0.15  # of a sky with a bright lobe, see `fit_sky`
+LOBE_RATIO, LOBE_RATIO_SPREAD = -0.2, 0.1  # of a sky with a bright lobe, see `fit_sky`
 TYPICAL_WIDTH, WIDTH_SPREAD = np.radians(20.0), 0.5  # of a sun behind thin cloud; of its log
 WHITE = np.ones(3)
 
