@@ -9,7 +9,7 @@ from climatenerf.field.analytic import AnalyticField, HalfSpace
 from climatenerf.render.integrator import trace
 from climatenerf.weather.flood import optics
 from climatenerf.weather.flood.parameters import Flood
-from climatenerf.weather.flood.surface import PARTS, Water
+from climatenerf.weather.flood.surface import Water
 from climatenerf.weather.flood.waves import at_time, make_waves
 from climatenerf.weather.world import World
 
@@ -91,28 +91,3 @@ def test_clear_water_is_dark_and_blue_green_and_mud_is_brown():
     between = optics.deep_colour(Flood(clarity=1.3))
     assert all(min(a, b) < c < max(a, b) for a, b, c in zip(mud, lake, between, strict=True))
     assert optics.deep_colour(Flood(colour=(1.0, 0.0, 0.0))) == (1.0, 0.0, 0.0)
-
-
-def test_pixels_that_reflect_little_trace_fewer_reflected_rays(monkeypatch):
-    """Steep views of rough water under a sky that changes with the elevation."""
-    flood = Flood(level=0.0, wind_speed=4.0)
-    water = Water(flood, 0.0, at_time(make_waves(flood, 0), 0.0), torch.ones(3))
-    angles = torch.linspace(5, 85, 64) * math.pi / 180  # of incidence
-    d = torch.stack([torch.zeros_like(angles), angles.sin(), -angles.cos()], dim=-1)
-    o, angle = torch.tensor([0.0, 0.0, 1.5]).expand(64, 3).contiguous(), torch.full((64,), 2e-3)
-    bottom = [HalfSpace(offset=-2.0)]
-    sky = AnalyticField(bottom, zenith=(0.2, 0.4, 1.0), horizon=(1.0, 1.0, 1.0))
-    counts = []
-    facets = optics.facets
-    monkeypatch.setattr(
-        optics, "facets", lambda parts, *rest: (counts.append(parts.shape), facets(parts, *rest))[1]
-    )
-    found = trace(World(sky, surfaces=(water,)), o, d, angle).rgb
-    assert sum(shape[0] for shape in counts) == 64
-    assert {shape[1] for shape in counts} == {8, 4, 2}
-    assert sum(shape[0] * shape[1] for shape in counts) < 0.6 * 64 * PARTS
-    monkeypatch.setattr("climatenerf.weather.flood.surface.PARTS_BY_REFLECTANCE", ((0.0, PARTS),))
-    whole = trace(World(sky, surfaces=(water,)), o, d, angle).rgb
-    assert (found - whole).abs().max() < 0.01
-    grazing = angles > math.radians(70)
-    assert torch.equal(found[grazing], whole[grazing])

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.errors import UserError
@@ -22,7 +22,6 @@ from climatenerf.ops.wave_tracing import WaveMaps, first_hits
 from climatenerf.ops.wave_tracing import surface as wave_surface
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.flood import optics, shore
-from climatenerf.weather.flood.fresnel import reflectance as fresnel_reflectance
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.waves import Waves, at_time, make_waves
 from climatenerf.weather.weather import Weather
@@ -37,9 +36,6 @@ from climatenerf.weather.world import (
 
 SKIN = 2e-3  # secondary rays begin this far from the water, m
 PARTS = 8  # of a pixel, with a reflected ray each
-PARTS_BY_REFLECTANCE = ((0.12, PARTS), (0.04, 4), (0.0, 2))
-"""Least reflectance of the level surface, and parts of such a pixel: an error of the reflected
-light counts by the reflectance."""
 SHARP = 1e8  # gloss from which on still water is a mirror
 ENTRIES = 12  # places at which light enters the water that leaves it at one
 MAX_REACH = 1.0  # m; clear water scatters too little to matter
@@ -158,28 +154,59 @@ class Water:
         self, world: World, hits: SurfaceHits, trace: TraceRadiance
     ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], dict[str, Float[Tensor, "n"]]]:
         """Reflection of the world, and the bottom seen through the water (Fresnel; Snell)."""
-        rays_d = hits.rays_d
+        n, rays_d = hits.t.shape[0], hits.rays_d
         below = self.inside(hits.rays_o)
         vertical = (hits.t_bottom - hits.t).clamp_min(0) * rays_d[:, 2].abs()
         x = self._on_mean_surface(hits.rays_o + hits.t[:, None] * rays_d)
         depth = torch.where(vertical > 0, vertical, self._terrain_depth(world, x))
         depth = torch.where(torch.isfinite(depth) & ~below, depth, torch.zeros_like(depth))
-        normal = self._normal(hits)
+        footprint = optics.footprint(hits.t, rays_d, hits.pixel_angle)
+        _, slope, _ = wave_surface(self.waves, x[:, :2], footprint)
+        normal = optics.normal_of(slope)
 
+        # --- Reflected rays, traced like any other: one from each part of the pixel ---------------
+        count = self.reflected_rays()
+        parts = optics.subpixels(rays_d, hits.pixel_angle, count)
+        origins = hits.rays_o[:, None].expand_as(parts).reshape(-1, 3)
+        found = first_hits(
+            self.waves,
+            self.level,
+            origins,
+            parts.reshape(-1, 3),
+            below.repeat_interleave(count),
+            hits.pixel_angle.repeat_interleave(count) * optics.part_width(count),
+        )
+        # Parts that miss the water, beside its horizon, show what the centre does.
+        t = torch.where(found.t < torch.inf, found.t, hits.t.repeat_interleave(count))
+        met = self._on_mean_surface(origins + t[:, None] * parts.reshape(-1, 3))
+        directions, share = optics.facets(
+            parts,
+            found.slope.view(n, count, 2),
+            found.variance.view(n, count),
+            self.flood,
+            below,
+        )
+        if self.mirror_only:
+            directions, share = optics.mirror(rays_d, normal)[:, None], torch.ones_like(share)
         # A lump of fitted ground that the terrain puts under water stands over the surface still.
         lump = (hits.t - hits.t_bottom).clamp_min(0) * rays_d[:, 2].abs() * (hits.t_bottom > 0)
         side = torch.where(below, -SKIN, SKIN + 1.5 * lump)
-        reflected, reflectance = torch.zeros_like(rays_d), torch.zeros_like(hits.t)
-        for count, rays in self._parted(rays_d, below):
-            reflected[rays], reflectance[rays] = self._reflection(
-                world, hits, rays, count, below[rays], side[rays], trace
-            )
+        lift = torch.stack([torch.zeros_like(side), torch.zeros_like(side), side], dim=-1)
+        radiance = trace(
+            met + lift.repeat_interleave(count, 0),
+            directions.reshape(-1, 3),
+            hits.pixel_angle.repeat_interleave(count, 0) * 2,
+        )
+        reflectance = share.sum(1)
+        # 1e-6: a surface that reflects nothing.
+        share = share / reflectance.clamp_min(1e-6)[:, None]
+        reflected = (radiance.view(n, count, 3) * share[..., None]).sum(1)
 
         # --- What is on the other side ------------------------------------------------------------
         direction, total = optics.refract(rays_d, normal, self.flood.ior, below)
         total |= below & (direction[:, 2] <= 0)  # behind the next crest it would meet water again
         direction = direction * ~total[:, None]  # total reflection: no ray goes on
-        start = x - torch.where(below, -SKIN, SKIN)[:, None] * x.new_tensor([0.0, 0.0, 1.0])
+        start = x - lift.clamp(-SKIN, SKIN)
         background, passed = self._other_side(
             world, start, direction, below, hits.pixel_angle, depth, trace
         )
@@ -191,82 +218,9 @@ class Water:
         return shaded, normal, {"water_depth": depth}
 
     def reflected_rays(self) -> int:
-        """Most reflected rays of a pixel: one for still water, else one for each part."""
+        """Number of reflected rays for a pixel: one for still water, else one for each part."""
         still = not self.waves.start.numel() and self.waves.unresolved == 0
         return 1 if self.mirror_only or (still and self.flood.gloss >= SHARP) else PARTS
-
-    def _parted(
-        self, rays_d: Float[Tensor, "n 3"], below: Bool[Tensor, "n"]
-    ) -> list[tuple[int, Int[Tensor, "m"]]]:
-        """Numbers of parts, and the rays whose pixels have so many."""
-        most = self.reflected_rays()
-        if most == 1:
-            return [(1, torch.arange(rays_d.shape[0], device=rays_d.device))]
-        mirrored = fresnel_reflectance(rays_d[:, 2].abs(), self.flood.ior, below)
-        groups, upper = [], math.inf
-        for least, count in PARTS_BY_REFLECTANCE:
-            rays = ((mirrored >= least) & (mirrored < upper)).nonzero()[:, 0]
-            groups.append((count, rays))
-            upper = least
-        return [(count, rays) for count, rays in groups if rays.numel()]
-
-    def _reflection(
-        self,
-        world: World,
-        hits: SurfaceHits,
-        rays: Int[Tensor, "m"],
-        count: int,
-        below: Bool[Tensor, "m"],
-        side: Float[Tensor, "m"],
-        trace: TraceRadiance,
-    ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-        """Reflected light and reflectance of some hits, by a traced ray from each part of a pixel.
-
-        Args:
-            world: what the rays meet.
-            hits: all hits.
-            rays: which of them.
-            count: parts of each pixel.
-            below: whether they come from under water.
-            side: height over the mean surface at which reflected rays begin, m.
-            trace: follows them.
-        """
-        n, rays_d, angle = rays.shape[0], hits.rays_d[rays], hits.pixel_angle[rays]
-        parts = optics.subpixels(rays_d, angle, count)
-        origins = hits.rays_o[rays, None].expand_as(parts).reshape(-1, 3)
-        found = first_hits(
-            self.waves,
-            self.level,
-            origins,
-            parts.reshape(-1, 3),
-            below.repeat_interleave(count),
-            angle.repeat_interleave(count) * optics.part_width(count),
-        )
-        # Parts that miss the water, beside its horizon, show what the centre does.
-        t = torch.where(found.t < torch.inf, found.t, hits.t[rays].repeat_interleave(count))
-        met = self._on_mean_surface(origins + t[:, None] * parts.reshape(-1, 3))
-        directions, share = optics.facets(
-            parts,
-            found.slope.view(n, count, 2),
-            found.variance.view(n, count),
-            self.flood,
-            below,
-        )
-        if self.mirror_only:
-            normal = self._normal(hits)[rays]
-            directions, share = optics.mirror(rays_d, normal)[:, None], torch.ones_like(share)
-        met[:, 2] += side.repeat_interleave(count)
-        radiance = trace(met, directions.reshape(-1, 3), angle.repeat_interleave(count) * 2)
-        reflectance = share.sum(1)
-        # 1e-6: a surface that reflects nothing.
-        share = share / reflectance.clamp_min(1e-6)[:, None]
-        return (radiance.view(n, count, 3) * share[..., None]).sum(1), reflectance
-
-    def _normal(self, hits: SurfaceHits) -> Float[Tensor, "n 3"]:
-        """Unit normals of the waves that a pixel resolves."""
-        x = hits.rays_o + hits.t[:, None] * hits.rays_d
-        footprint = optics.footprint(hits.t, hits.rays_d, hits.pixel_angle)
-        return optics.normal_of(wave_surface(self.waves, x[:, :2], footprint)[1])
 
     def _on_mean_surface(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """The same places on the surface without waves, where further rays begin."""
