@@ -7,13 +7,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from support.render_jobs import SCENE, make_job, noise_of
 
 from climatenerf.cluster import workers
 from climatenerf.cluster.frames import renderer
-from climatenerf.cluster.workers import connected, parse_workers
+from climatenerf.cluster.workers import connected, parse_workers, results
 from climatenerf.core.errors import UserError
 from climatenerf.output.job import missing_frames, render_movie
 
@@ -203,3 +204,40 @@ def test_without_the_package_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UserError, match=r"pip install \"climatenerf\[cluster\]\""):
         workers.check_installed()
+
+
+class Ending:
+    """A piece of work whose worker dies with the result, before another repeats it."""
+
+    status = "finished"
+
+    def __init__(self, error=None):
+        self.asked, self.error = 0, error
+
+    def result(self, timeout):
+        self.asked += 1
+        if self.error is not None:
+            self.status = "error"
+            raise self.error
+        if self.asked < 3:
+            raise TimeoutError
+        return "made"
+
+
+def test_a_result_that_is_lost_with_its_worker_is_asked_for_again(tmp_path, monkeypatch):
+    import distributed
+
+    done = SimpleNamespace
+    monkeypatch.setattr(distributed, "wait", lambda first, **_: done(done=set(first)))
+    client = SimpleNamespace(
+        status="running", nthreads=lambda: {"one": 1}, cancel=lambda *a, **k: 0
+    )
+    work = Ending()
+    assert list(results(client, {work: "frame 1"}, tmp_path)) == [(work, "made")]
+    assert work.asked == 3
+    with pytest.raises(UserError, match="frame 1"):  # of the work itself, not of waiting for it
+        list(results(client, {Ending(TimeoutError("slow disk")): "frame 1"}, tmp_path))
+    monkeypatch.setattr("climatenerf.cluster.workers.ALONE", -1.0)
+    client.nthreads = dict
+    with pytest.raises(UserError, match="no worker is left"):
+        list(results(client, {Ending(): "frame 1"}, tmp_path))

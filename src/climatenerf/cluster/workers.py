@@ -227,8 +227,12 @@ def results(
                 if future.status == "lost":  # with its worker; another repeats it
                     continue
                 try:
-                    result = future.result()
+                    result = future.result(timeout=POLL)
                 except Exception as error:
+                    if isinstance(error, TimeoutError) and future.status != "error":
+                        # Its worker died with it meanwhile; another repeats it.
+                        last_seen = _last_seen(client, last_seen)
+                        continue
                     if future.status in ("lost", "pending"):
                         continue
                     raise _failure(error, titles[future], folder / LOG) from error
