@@ -14,7 +14,7 @@ from climatenerf.field.analytic import AnalyticField, HalfSpace
 from climatenerf.field.compositing import RenderCancelled
 from climatenerf.render.session import RenderSession
 from climatenerf.verification.setting import protocol_of
-from climatenerf.viewer.live import LiveView, Wanted
+from climatenerf.viewer.live import MOMENTS, LiveView, Wanted, _moments
 from climatenerf.viewer.measure import measure
 from climatenerf.viewer.overlays import LAYERS, legend, picture_of
 from climatenerf.weather.description import KeyframedWeather
@@ -302,3 +302,13 @@ def test_a_film_is_shown_at_its_moment(viewer, place):
     session = RenderSession(place.field, place.scene, film, times=np.arange(49) / 24)
     assert np.array_equal(found, session.frame(CAMERA, HERE, 1.5).picture)
     assert not np.array_equal(found, session.frame(CAMERA, HERE, 0.0).picture)
+
+
+def test_a_long_film_is_prepared_for_a_bounded_number_of_moments():
+    dry = Weather()
+    short = KeyframedWeather(dry, {"flood.level": ((0.0, 0.1), (2.0, 0.5))})
+    assert np.array_equal(_moments(short), np.arange(49) / 24)
+    long = KeyframedWeather(dry, {"flood.level": ((0.0, 0.1), (3600.0, 0.5))})
+    found = _moments(long)
+    assert len(found) == MOMENTS + 1 and found[-1] == pytest.approx(3600.0)
+    assert np.array_equal(_moments(dry), [0.0])

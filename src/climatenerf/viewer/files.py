@@ -189,42 +189,38 @@ class SavedFiles:
             report: called with what is done and the fraction of it.
 
         Raises:
-            UserError: there is no path, one is being rendered, or it was stopped.
+            UserError: there is no path, or it was stopped.
         """
         from climatenerf.api import Run, render_movie
 
         if not self.key_poses and film is None:
             raise UserError("add key poses to the path first")
-        if not self._rendering.acquire(blocking=False):
-            raise UserError("a movie is being rendered; wait until it is finished, or stop it")
 
         def reported(what: str, fraction: float) -> None:
             if self._stop.is_set() or self._closed:
                 raise RenderCancelled
             report(what, fraction)
 
-        try:
-            self._stop.clear()
+        self._stop.clear()
+        with self._rendering:
             if self.key_poses:
                 path = self.write_path(wanted.camera, place, film)
             else:
                 path = self._numbered("path", ".json")
                 poses = np.repeat(wanted.c2w[None], _frames(film, 0.0), axis=0)
                 self._write(path, poses, wanted.camera, place)
-            out = self._numbered("movie", "")
             fitted = Run(self._run, place.field, place.scene, digest, style=place.style)  # pyright: ignore[reportArgumentType]
-            return render_movie(
-                fitted,
-                out,
-                film or wanted.weather,
-                path=str(path),
-                complete_ground=False,
-                progress=reported,
-            )
-        except RenderCancelled:
-            raise UserError("the movie was stopped") from None
-        finally:
-            self._rendering.release()
+            try:
+                return render_movie(
+                    fitted,
+                    self._numbered("movie", ""),
+                    film or wanted.weather,
+                    path=str(path),
+                    complete_ground=False,
+                    progress=reported,
+                )
+            except RenderCancelled:
+                raise UserError("the movie was stopped") from None
 
     def stop(self) -> None:
         """Stop the movie that is being rendered, after the frame at work."""

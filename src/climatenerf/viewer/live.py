@@ -34,6 +34,7 @@ FRAME = 1 / 30  # s between warped pictures
 MOVING_WIDTH = 480  # pixels of warped pictures
 COARSE = 4  # pixels along a side that share a ray while moving
 FIRST = 8  # of the first picture after a change of the weather
+MOMENTS = 1200  # most moments of a film, for which its weather is prepared
 PATIENCE = 0.08  # s of computing between two questions whether to stop
 State = Literal["warped", "coarse", "half", "full"]
 
@@ -121,11 +122,12 @@ class _Patient:
 def _moments(weather: KeyframedWeather | Weather) -> Float[np.ndarray, "f"]:
     """Moments of the frames of a movie, for which keyframed weather is prepared, s."""
     duration = weather.duration if isinstance(weather, KeyframedWeather) else 0.0
-    return np.arange(math.floor(duration * FPS + 1e-6) + 1) / FPS
+    rate = FPS if duration * FPS <= MOMENTS else MOMENTS / duration
+    return np.arange(math.floor(duration * rate + 1e-6) + 1) / rate
 
 
 def _sentence(error: Exception) -> str:
-    """What is wrong, as a tab is told."""
+    """Text that tells a user what is wrong."""
     known = isinstance(error, UserError)
     return f"{'' if known else f'internal error: {type(error).__name__}: '}{error}"
 

@@ -205,13 +205,7 @@ class BakedSnow:
     def glints(
         self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """Radiance that crystal faces add in a hard sun.
-
-        Args:
-            x: positions, m.
-            d: unit directions from the eye to these.
-            width: of a pixel there, m.
-        """
+        """Radiance that crystal faces add in a hard sun; arguments as of `colour_towards`."""
         added = torch.zeros_like(x)
         beam = None if self.place_light is None else self.place_light.beam()
         if beam is None or self.place_light is None or self.snow.sparkle == 0:
