@@ -10,6 +10,7 @@ import pytest
 from support.study_yard import BOX, patch_shot, pose, yard_place
 
 from climatenerf.core.cameras import Camera
+from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import AnalyticField, HalfSpace
 from climatenerf.field.compositing import RenderCancelled
 from climatenerf.render.session import RenderSession
@@ -312,3 +313,37 @@ def test_a_long_film_is_prepared_for_a_bounded_number_of_moments():
     found = _moments(long)
     assert len(found) == MOMENTS + 1 and found[-1] == pytest.approx(3600.0)
     assert np.array_equal(_moments(dry), [0.0])
+
+
+def test_a_layer_is_shown_while_weather_is_prepared(place):
+    slow = SlowSession(RenderSession(place.field, place.scene, Weather()))
+    viewer = Viewer(slow)
+    try:
+        dry = Wanted(CAMERA, HERE, Weather())
+        viewer.live.ask(dry)
+        viewer.full_of(dry)
+        viewer.live.ask(flooded(0.4))
+        viewer.until(lambda: any("preparing snow" in each for each in viewer.told))
+        viewer.live.ask(flooded(0.4, layer="depth"))
+        viewer.until(lambda: viewer.pictures[-1].wanted.layer == "depth")
+        assert viewer.pictures[-1].weather.at(0.0) == Weather()
+    finally:
+        viewer.live.close()
+
+
+def test_a_newer_fit_that_cannot_be_prepared_leaves_the_older_one(viewer, place):
+    class Broken(SlowSession):
+        def changed(self, weather, times, progress):
+            raise UserError("the newer fit has no ground")
+
+    good = flooded(0.4)
+    viewer.live.ask(good)
+    before = viewer.full_of(good).picture
+    session = viewer.live.session
+    newer = AnalyticField([HalfSpace(colour=(0.9, 0.1, 0.1))], box=BOX)
+    viewer.live.use(Broken(RenderSession(protocol_of(newer), place.scene, Weather())))
+    viewer.until(lambda: viewer.told[-1] == "the newer fit has no ground")
+    assert viewer.live.session is session
+    again = flooded(0.4)
+    viewer.live.ask(again)
+    assert np.array_equal(viewer.full_of(again).picture, before)

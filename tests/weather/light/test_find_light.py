@@ -142,6 +142,26 @@ def test_a_clipped_lobe_is_extrapolated_from_its_flank():
     assert again == pytest.approx(level, rel=0.15)
 
 
+def test_clouds_over_the_horizon_brighten_the_zenith_less_beside_a_sun(monkeypatch):
+    """The sky brightens by 12 % up to 20 degrees, and its zenith is as bright as its horizon."""
+
+    def cloudy(d):
+        rise = 0.12 * np.clip((d[:, 2:] - 0.05) / 0.3, 0, 1) * (d[:, 2:] < 0.5)
+        return lobe_sky(d) - 0.6 * (1 + 0.2 * d[:, 2:]) + 0.65 * (1 + rise)
+
+    d = sphere_directions(6000).double().numpy()
+    low = d[(d[:, 2] > 0.03) & (d[:, 2] < math.sin(math.radians(25)))]
+    up = d[d[:, 2] > 0]
+    level = float((cloudy(up)[:, 0] * up[:, 2]).sum() * 4 / 6000)
+    given = low, np.minimum(cloudy(low), 1.0), 0.18 * level
+    held = fit_sky(*given, lobe=True)
+    monkeypatch.setattr(finding, "LOBE_RATIO_SPREAD", 100.0)
+    carried_on = fit_sky(*given, lobe=True)
+    excess, before = (float(model.zenith[0]) - 0.65 for model in (held, carried_on))
+    assert 0 < excess < 0.8 * before
+    assert float(held.horizon[0]) == pytest.approx(0.65, rel=0.05)
+
+
 def test_photographed_sky_is_kept_where_it_is_shown_and_not_clipped():
     shown = np.ones((ROWS, COLUMNS))
     light = CapturedLight(

@@ -429,8 +429,8 @@ def fit_sky(
     agrees best with an albedo of `GROUND_ALBEDO`.
 
     Photos show the sky near the horizon, where clouds and hills can rise faster than the sky does.
-    A sky with a bright lobe is held to what the CIE's general skies with one have (ISO 15469, types
-    7 to 15): their zenith is as bright as their horizon or darker.
+    A sky with a bright lobe is drawn towards what the CIE's general skies with one have (ISO 15469,
+    types 7 to 15): their zenith is as bright as their horizon or darker.
 
     Args:
         d: directions of sky in the photos.
