@@ -347,3 +347,10 @@ def test_a_newer_fit_that_cannot_be_prepared_leaves_the_older_one(viewer, place)
     again = flooded(0.4)
     viewer.live.ask(again)
     assert np.array_equal(viewer.full_of(again).picture, before)
+
+
+def test_a_film_is_refused_for_what_it_becomes(viewer):
+    keyframes = {"flood.level": ((0.0, 0.1), (2.0, 900.0))}
+    film = KeyframedWeather(Weather(flood=Flood(level=0.1, wind_speed=0.0)), keyframes)
+    viewer.live.ask(Wanted(CAMERA, HERE, film))
+    viewer.until(lambda: any("above the whole scene" in sentence for sentence in viewer.told), 20)
