@@ -9,13 +9,16 @@ from PIL import Image
 from support.scene_builders import look_at, names_of, ring, write_colmap, write_images
 
 from climatenerf.perception.heuristic import (
+    BUILDING,
     GROUND,
     SKY,
+    VEGETATION,
     heuristic_labels,
     is_outdoors,
     segment_sky,
 )
 from climatenerf.perception.heuristic_ground import classify_ground_points
+from climatenerf.perception.heuristic_standing import segment_vegetation, standing_points
 from climatenerf.scene import Camera, Scene, View, read_scene
 from climatenerf.scene.images import load_labels
 
@@ -262,6 +265,81 @@ def test_ground_precision_and_recall_on_the_reference_street():
         missed += (truth & ~found).sum()
     assert correct / (correct + wrong) > 0.995
     assert correct / (correct + missed) > 0.3
+
+
+@pytest.mark.parametrize(
+    ("base", "noise", "expected"),
+    [
+        ((60, 80, 40), 30, True),  # a hedge
+        ((18, 24, 12), 9, True),  # the same in shade
+        ((60, 80, 40), 0, False),  # green paint
+        ((20, 72, 68), 30, False),  # a teal door with reflections
+        ((100, 85, 65), 30, False),  # leaf litter
+        ((1, 3, 1), 1, False),  # the noise of black
+    ],
+)
+def test_leaves_are_green_and_rough(base, noise, expected):
+    bright = 1 + np.random.default_rng(0).uniform(-1, 1, (HEIGHT, WIDTH, 1)) * noise / base[1]
+    values = (np.asarray(base) * bright / 255).astype(np.float32)
+    found = segment_vegetation(values)
+    assert found.mean() > 0.9 if expected else not found.any()
+
+
+def test_moss_is_too_small_for_vegetation():
+    values = textured(base=(100, 80, 60)).astype(np.float32) / 255
+    values[40:44, 60:64] = values[40:44, 60:64] * (0.5, 1, 0.5)
+    values[10:40, 100:150] = values[10:40, 100:150] * (0.5, 1, 0.5)
+    found = segment_vegetation(values)
+    assert not found[:, :90].any() and found[10:40, 100:150].mean() > 0.8
+
+
+def test_points_stand_by_their_height_above_the_ground_near_them():
+    ground = np.array([[0.0, 0.0, 0.0], [0.0, 5.0, 1.0]])
+    others = np.array([[0.1, 0, 1.0], [0.1, 0, 0.1], [3.0, 0, 2.0], [0, 5.1, 1.2], [0, 5.1, 2.0]])
+    points = np.concatenate([ground, others, [[np.nan, 0, 9]]])
+    stands = standing_points(points, np.arange(8) < 2, camera_height=1.6)
+    assert stands.tolist() == [False, False, True, False, False, False, True, False]
+    assert not standing_points(points, np.zeros(8, bool), 1.6).any()
+    assert not standing_points(ground, np.ones(2, bool), 1.6).any()
+
+
+def test_a_box_stands_and_a_green_one_is_vegetation(yard):
+    scene, truths, _ = yard
+    ground = classify_ground_points(scene)
+    for view, truth in zip(scene.views, truths, strict=True):
+        grey = heuristic_labels(view, scene, ground)
+        assert not (grey == VEGETATION).any()
+        assert (grey == BUILDING)[truth == 1].mean() > 0.3
+        assert (grey == BUILDING)[truth != 1].mean() < 0.03
+        green = np.random.default_rng(1).uniform(0.6, 1.4, (120, 160, 1)) * (50, 80, 40)
+        picture = np.where((truth == 1)[..., None], green, np.asarray(Image.open(view.path)))
+        Image.fromarray(np.clip(picture, 0, 255).astype(np.uint8)).save(view.path)
+        found = heuristic_labels(view, scene, ground)
+        assert (found == VEGETATION)[truth == 1].mean() > 0.3
+        assert not (found == VEGETATION)[truth != 1].mean() > 0.03
+
+
+@pytest.mark.skipif(not STREET.is_dir(), reason="the reference street is not in this checkout")
+def test_precision_of_what_stands_on_the_reference_street():
+    scene = read_scene(STREET, holdout="0")
+    ground = classify_ground_points(scene)
+    pairs = [(heuristic_labels(v, scene, ground), load_labels(v, scene)) for v in scene.views[::7]]
+    found, truth = (np.concatenate([each[i].ravel() for each in pairs]) for i in (0, 1))
+    leaves, solid = truth == 8, ~np.isin(truth, (0, 1, 8, 9, 10))
+    assert leaves[found == VEGETATION].mean() > 0.85  # the rest is mostly lawn
+    assert (found == VEGETATION)[leaves].mean() > 0.5
+    assert solid[found == BUILDING].mean() > 0.9
+    assert (found == BUILDING)[solid].mean() > 0.03
+
+
+@pytest.mark.slow
+def test_a_cairn_among_trees_is_solid(captures):
+    """The network that labelled this capture takes the cairn for a person or for leaves."""
+    scene = read_scene(captures / "stone_sign", holdout="0")
+    ground = classify_ground_points(scene)
+    labels = [heuristic_labels(view, scene, ground) for view in scene.views[::12]]
+    found = np.concatenate([each[320:400, 190:260].ravel() for each in labels])
+    assert (found == BUILDING).mean() > 0.6 and (found == VEGETATION).mean() < 0.1
 
 
 @pytest.mark.slow

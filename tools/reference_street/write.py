@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from climatenerf.scene import Scene
 
 JPEG_QUALITY = 92
-SKY, UNKNOWN = 10, 255  # Cityscapes train ids
 HOLDOUT_EVERY = 8  # in the demo: the first, ninth, ... view by name is held out
 POINTS_PER_VIEW = 48
 MAX_POINT_DISTANCE = 120.0  # m
@@ -28,13 +27,12 @@ Poses = list[tuple[str, Float[np.ndarray, "4 4"]]]
 
 
 def write_demo(store: Path, out: Path, width: int, height: int) -> None:
-    """Write the 64 views of the walk and the arc, with labels of the sky alone."""
+    """Write the 64 views of the walk and the arc, with labels."""
     poses = camera_poses()
     write_pictures(store / "clean", out / "images", poses)
     known = truths(store, poses, width, height)
     for name, truth in known.items():
-        label = np.where(truth["label"] == SKY, SKY, UNKNOWN).astype(np.uint8)
-        save_png(label, out / "labels" / f"{Path(name).stem}.png")
+        save_png(truth["label"], out / "labels" / f"{Path(name).stem}.png")
     heldout = {name for name, _ in poses[::HOLDOUT_EVERY]}
     write_scene(out, poses, heldout, known, width, height)
 

@@ -75,7 +75,7 @@ class Fit:
     """Meaning of the numbers in label files: cityscapes-train-ids, cityscapes-ids or seven.
     Default: what the capture states."""
     labels: Annotated[str | None, optional("STR")] = None
-    """Class labels: none, heuristic (sky and ground without a network), or a network's name or
+    """Class labels: none, heuristic (without a network), or a network's name or
     folder. Default: the capture's label files, else heuristic if the photos clearly show sky."""
     mono_depth: Annotated[str | None, optional("STR")] = None
     """Relative depth: none, depth-anything, or a Depth Anything's name or folder. Default: the

@@ -4,7 +4,10 @@ scipy is imported on first use, so that a command that needs none of this starts
 """
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
+
+SWEEPS = 4
+"""Of the approximate distance transform."""
 
 
 def dilated(mask: Bool[np.ndarray, "h w"], pixels: int) -> Bool[np.ndarray, "h w"]:
@@ -45,3 +48,28 @@ def connected_to(
     reached = np.zeros(int(components.max(initial=0)) + 1, bool)
     reached[components[seeds & allowed]] = True
     return reached[components]
+
+
+def geodesic_distance(
+    seeds: Int[np.ndarray, "n 2"], costs: list[Float[np.ndarray, "_ _"]]
+) -> Float[np.ndarray, "h w"]:
+    """Approximate the length of the cheapest path along rows and columns to the nearest seed.
+
+    The distance is 1e6 where there is no seed.
+
+    Args:
+        seeds: Pixels (x, y).
+        costs: Of the steps down, (h-1) w, and of those across, h (w-1).
+    """
+    down, across = (np.cumsum(cost, axis=i, dtype=np.float64) for i, cost in enumerate(costs))
+    down = np.pad(down, ((1, 0), (0, 0)))
+    across = np.pad(across, ((0, 0), (1, 0)))
+    distance = np.full(down.shape, 1e6)
+    distance[seeds[:, 1], seeds[:, 0]] = 0
+    for _ in range(SWEEPS):
+        for axis, along in ((1, across), (0, down)):
+            forward = along + np.minimum.accumulate(distance - along, axis=axis)
+            flipped = np.flip(distance + along, axis)
+            backward = np.flip(np.minimum.accumulate(flipped, axis=axis), axis) - along
+            distance = np.minimum(forward, backward)
+    return distance

@@ -1,10 +1,10 @@
-"""Heuristic class labels without a network: sky by colour and smoothness, ground by sparse points.
+"""Heuristic class labels without a network: sky and leaves by colour, the rest by sparse points.
 
 The fall-back for captures without class labels. Sky is bright or blue, smooth, above the horizon,
 and connected to the top of the photo. A false positive makes a hole in the scene, while missed sky
 costs little, so every doubtful pixel becomes 255, the unknown class, and a room should get no sky
 at all. Ground cannot be segmented by colour, because paving, moss and walls look alike; see
-`heuristic_ground`.
+`heuristic_ground`. What stands on it is vegetation or solid; see `heuristic_standing`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,21 @@ from PIL import Image
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.morphology import connected_to, dilated
-from climatenerf.perception.heuristic_ground import GroundPoints, segment_ground
+from climatenerf.perception.heuristic_ground import (
+    GroundPoints,
+    observed_pixels,
+    segment_ground,
+)
+from climatenerf.perception.heuristic_standing import (
+    is_solid,
+    segment_standing,
+    segment_vegetation,
+)
 from climatenerf.scene.images import load_image
 from climatenerf.scene.label_spaces import UNKNOWN
 from climatenerf.scene.scene import Scene, View
 
-SKY, GROUND = 10, 9
+BUILDING, VEGETATION, GROUND, SKY = 2, 8, 9, 10
 """Cityscapes train ids. Ground is labelled terrain, because paving is not recognised."""
 WORKING_SIZE = 800
 """Photos are processed with at most this many pixels on the longer side."""
@@ -46,12 +55,15 @@ _POINT_MARGIN = 0.02  # of the photo's longer side, around a sparse point, that 
 def heuristic_labels(
     view: View, scene: Scene, ground: GroundPoints | None
 ) -> UInt8[np.ndarray, "h w"]:
-    """Return class ids of a photo: 10 where it certainly shows sky, 9 for ground, 255 elsewhere.
+    """Return class ids of a photo, and 255 where it is in doubt.
+
+    Sky is 10, ground 9, vegetation 8, and what else stands on the ground 2.
 
     Args:
         view: The photo.
         scene: The capture with z up; its horizon and sparse points bound the sky.
-        ground: From `classify_ground_points`; None to label sky only.
+        ground: From `classify_ground_points`; None to label sky only, for without ground a green
+            surface may be anything.
 
     Raises:
         UserError: The photo cannot be read.
@@ -69,7 +81,17 @@ def heuristic_labels(
     labels = np.where(sky, np.uint8(SKY), np.uint8(UNKNOWN))
     if ground is not None:
         values = picture.astype(np.float32) / 255
-        labels[segment_ground(view, scene, small, ground, rays, values) & ~sky] = GROUND
+        pixels, seen = observed_pixels(view, scene, small, ground.points)
+        stands = ground.stands[seen]
+        standing = segment_standing(values, pixels[stands], pixels[~stands])
+        # Below the horizon what is green and does not stand is a lawn, or in doubt.
+        leaves = segment_vegetation(values) & (standing | (rays[..., 2] > 0))
+        for label, region in (
+            (BUILDING, standing & is_solid(values)),
+            (VEGETATION, leaves),
+            (GROUND, segment_ground(view, scene, small, ground, rays, values)),
+        ):
+            labels[region & ~sky] = label
     full = Image.fromarray(labels).resize(photo.size, Image.Resampling.NEAREST)
     return np.asarray(full)
 
@@ -230,11 +252,8 @@ def _is_blue_or_brightest(values: Float[np.ndarray, "h w 3"], sky: Bool[np.ndarr
 def _near_points(scene: Scene, view: View, camera: Camera) -> Bool[np.ndarray, "h w"]:
     """Return the pixels around the sparse points that a view observes: matter, not sky."""
     marked = np.zeros((camera.height, camera.width), bool)
-    if scene.points is None or view.seen is None or not len(view.seen):
-        return marked
-    w2c = np.linalg.inv(view.c2w)
-    pixels = camera.project(scene.points[view.seen] @ w2c[:3, :3].T + w2c[:3, 3])
-    pixels = pixels[np.isfinite(pixels).all(axis=-1)].astype(np.int64)
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
-    marked[pixels[inside, 1], pixels[inside, 0]] = True
+    points = scene.points_world()
+    if points is not None:
+        pixels, _ = observed_pixels(view, scene, camera, points)
+        marked[pixels[:, 1], pixels[:, 0]] = True
     return dilated(marked, round(_POINT_MARGIN * max(camera.width, camera.height) / 2))

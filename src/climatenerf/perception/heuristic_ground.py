@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from climatenerf.core.cameras import Camera
+from climatenerf.core.morphology import geodesic_distance
+from climatenerf.perception.heuristic_standing import standing_points
 from climatenerf.scene.alignment.ground_plane import find_ground
 from climatenerf.scene.scene import Scene, View
 
@@ -38,7 +40,6 @@ _MAX_SINE = -0.05  # of a ray's elevation: the farthest ground is 20 camera heig
 _EDGE_LENGTH = 25.0  # extra length of a step, times its colour change, display values in [0,1]
 _EDGE_THRESHOLD, _EDGE_COST = 0.15, 5.0  # colour change of a border; its cost per change beyond
 _MAX_PART = 0.4  # of the way to a point that is not ground
-_SWEEPS = 4  # of the distance transform
 _MAX_SIZE = 500  # px of the longer side at which the label is grown
 
 
@@ -49,11 +50,13 @@ class GroundPoints:
     Attributes:
         points: All sparse points, world metres.
         is_ground: Which of them lie on the ground.
+        stands: Which of them certainly lie above it.
         camera_height: Median height of the cameras above the ground, metres.
     """
 
     points: Float[np.ndarray, "n 3"]
     is_ground: Bool[np.ndarray, " n"]
+    stands: Bool[np.ndarray, " n"]
     camera_height: float
 
 
@@ -68,7 +71,29 @@ def classify_ground_points(scene: Scene) -> GroundPoints | None:
         return None
     height = ground.camera_height
     is_ground = _on_ground(points / height, ground.cells / height, cameras / height)
-    return GroundPoints(points, is_ground, height) if is_ground.any() else None
+    if not is_ground.any():
+        return None
+    return GroundPoints(points, is_ground, standing_points(points, is_ground, height), height)
+
+
+def observed_pixels(
+    view: View, scene: Scene, camera: Camera, points: Float[np.ndarray, "n 3"]
+) -> tuple[Int[np.ndarray, "m 2"], Int[np.ndarray, " m"]]:
+    """Return the pixels (x, y) of the sparse points that a photo observes, and their indices.
+
+    Args:
+        view: The photo.
+        scene: The capture with z up.
+        camera: The photo's camera at the working size.
+        points: All sparse points, world metres.
+    """
+    if view.seen is None or not len(view.seen):
+        return np.zeros((0, 2), np.int64), np.zeros(0, np.int64)
+    pose = scene.c2w_world(view)
+    pixels = camera.project((points[view.seen] - pose[:3, 3]) @ pose[:3, :3])
+    pixels = np.floor(np.where(np.isfinite(pixels), pixels, -1).clip(-1, 1e6)).astype(np.int64)
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
+    return pixels[inside], np.asarray(view.seen)[inside]
 
 
 def segment_ground(
@@ -97,14 +122,12 @@ def segment_ground(
     step = -(-max(height, width) // _MAX_SIZE)
     rays, values = rays[::step, ::step], values[::step, ::step]
     pose = scene.c2w_world(view)
-    points, is_ground = ground.points[view.seen], ground.is_ground[view.seen]
-    pixels = camera.project((points - pose[:3, 3]) @ pose[:3, :3])
-    pixels = np.floor(np.where(np.isfinite(pixels), pixels, -1).clip(-1, 1e6)).astype(np.int64)
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
+    pixels, seen = observed_pixels(view, scene, camera, ground.points)
     pixels //= step
-    if (is_ground & inside).sum() < _MIN_POINTS:
+    points, is_ground = ground.points[seen], ground.is_ground[seen]
+    if is_ground.sum() < _MIN_POINTS:
         return nothing
-    eye_height = float(np.median(pose[2, 3] - points[is_ground & inside, 2]))
+    eye_height = float(np.median(pose[2, 3] - points[is_ground, 2]))
     below = rays[..., 2] < _MAX_SINE
     if eye_height <= 0.1 * ground.camera_height or not below.any():
         return nothing
@@ -119,33 +142,10 @@ def segment_ground(
         # Texture lengthens a step in proportion; a border costs the same at any distance.
         border = _EDGE_COST * np.maximum(change - _EDGE_THRESHOLD, 0)
         costs.append(length * (1 + _EDGE_LENGTH * change) + border)
-    to_ground = _geodesic_distance(pixels[is_ground & inside], costs)
-    to_other = _geodesic_distance(pixels[~is_ground & inside], costs)
+    to_ground = geodesic_distance(pixels[is_ground], costs)
+    to_other = geodesic_distance(pixels[~is_ground], costs)
     found = below & (to_ground < 1) & (to_ground < _MAX_PART / (1 - _MAX_PART) * to_other)
     return found.repeat(step, axis=0).repeat(step, axis=1)[:height, :width]
-
-
-def _geodesic_distance(
-    seeds: Int[np.ndarray, "n 2"], costs: list[Float[np.ndarray, "_ _"]]
-) -> Float[np.ndarray, "h w"]:
-    """Approximate the length of the cheapest path along rows and columns to the nearest seed.
-
-    Args:
-        seeds: Pixels (x, y).
-        costs: Of the steps down, (h-1) w, and of those across, h (w-1).
-    """
-    down, across = (np.cumsum(cost, axis=i, dtype=np.float64) for i, cost in enumerate(costs))
-    down = np.pad(down, ((1, 0), (0, 0)))
-    across = np.pad(across, ((0, 0), (1, 0)))
-    distance = np.full(down.shape, 1e6)
-    distance[seeds[:, 1], seeds[:, 0]] = 0
-    for _ in range(_SWEEPS):
-        for axis, along in ((1, across), (0, down)):
-            forward = along + np.minimum.accumulate(distance - along, axis=axis)
-            flipped = np.flip(distance + along, axis)
-            backward = np.flip(np.minimum.accumulate(flipped, axis=axis), axis) - along
-            distance = np.minimum(forward, backward)
-    return distance
 
 
 def _on_ground(

@@ -71,7 +71,7 @@ def prepare_labels(
 
     Args:
         scene: The capture with z up.
-        model: A network's name or folder; "heuristic" for sky and ground without a network; "none"
+        model: A network's name or folder; "heuristic" for labels without a network; "none"
             for no labels; None for the capture's label files, or "heuristic" if it has none and its
             photos certainly show sky.
         run_folder: Takes the files of "heuristic" if it was not asked for, or if the capture's
@@ -99,9 +99,9 @@ def prepare_labels(
             say("The capture has no class labels and does not certainly show sky: no labels used.")
             return scene
         say(
-            "The capture has no class labels: using heuristic labels, sky by colour and ground by"
-            " sparse points. A network's labels are better: use --labels MODEL, or put files into"
-            " labels/ (--labels none uses no labels)."
+            "The capture has no class labels: using heuristic labels, from colours and points. A"
+            " network's labels are better: use --labels MODEL, or put files into labels/"
+            " (--labels none uses no labels)."
         )
         model, by_default = HEURISTIC, not names
     if scene.label_space != TRAIN_IDS:
