@@ -106,13 +106,14 @@ def test_what_slides_passes_over_hollows_of_a_rough_roof():
     assert arrived[~roof].sum() == pytest.approx(0.5 * roof.sum(), rel=0.05)
 
 
-def test_settled_snow_is_nowhere_steeper_than_repose_and_never_thicker():
+def test_settled_snow_is_nowhere_steeper_than_repose_and_none_is_lost():
     rng = np.random.default_rng(1)
     base = 0.3 * rng.random((50, 50)) * (rng.random((50, 50)) < 0.2)
     base[:, 40:] = np.nan
     thickness = np.where(np.isnan(base), 0.0, 0.8)
     found = settled(base, thickness, REPOSE * H)
-    assert np.all(found[:, :40] <= 0.8 + 1e-9) and np.all(found[:, :40] >= 0)
+    assert np.all(found[:, :40] >= 0)
+    assert found[:, :40].sum() == pytest.approx(0.8 * 50 * 40)
     top = base + found
     for axis in (0, 1):
         step = np.diff(top[:, :40], axis=axis)
@@ -120,6 +121,16 @@ def test_settled_snow_is_nowhere_steeper_than_repose_and_never_thicker():
         lower = np.minimum(np.delete(top[:, :40], 0, axis), np.delete(top[:, :40], -1, axis))
         steepest = np.maximum(higher - lower, 0) + REPOSE * H + 1e-4
         assert np.all(np.abs(step) <= steepest)
+
+
+def test_snow_of_a_narrow_table_slides_to_its_foot():
+    base = np.zeros((40, 40))
+    base[15:25, 18:22] = 1.0
+    found = settled(base, np.full(base.shape, 0.3), REPOSE * H)
+    table = base > 0
+    assert found[table].max() == pytest.approx(2 * REPOSE * H, abs=1e-3)
+    assert found[~table].max() > 0.33 and found[:10].max() == pytest.approx(0.3)
+    assert found.sum() == pytest.approx(0.3 * base.size)
 
 
 def test_gaps_in_the_ground_are_bridged_up_to_some_metres():

@@ -38,13 +38,17 @@ class Hollow(AnalyticField):
         return -(RADIUS**2 - xy.square().sum(-1)).clamp_min(0).sqrt()
 
 
-def test_contact_shade_at_a_dark_wall():
-    """Next to a tall wall half of the sky is hidden. The factor is what probes do not see of it."""
-    wall = Box((1.0, -8.0, -1.0), (1.2, 8.0, 3.0), (0.05, 0.05, 0.05))
+@pytest.mark.parametrize(("top", "least", "most"), [(3.0, 0.85, 0.97), (0.6, 0.6, 0.8)])
+def test_contact_shade_at_a_dark_wall(top, least, most):
+    """Next to a wall half of the sky is hidden. The factor is what probes do not see of it.
+
+    Probes stand higher than a low wall, and miss it; a tall one darkens them as well.
+    """
+    wall = Box((1.0, -8.0, -1.0), (1.2, 8.0, top), (0.05, 0.05, 0.05))
     field = AnalyticField([ground(), wall], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5)))
     x = np.array([[0.92, 0.0, 0.1], [0.7, 0.0, 0.1], [0.0, 0.0, 0.1], [-7.0, 0.0, 0.1]])
     openness, hidden = openness_of(field, x.astype(np.float32))
-    assert 0.4 < openness[0] < 0.65
+    assert 0.4 < openness[0] < 0.7
     assert np.all(np.diff(openness) >= 0)
     assert openness[3] == pytest.approx(1)
     assert not hidden.any(), "a wall is no ground"
@@ -53,7 +57,7 @@ def test_contact_shade_at_a_dark_wall():
     assert snow is not None
     near = snow.colour(torch.tensor([[0.85, y, 0.1] for y in (-0.5, 0.0, 0.5)]))
     far = snow.colour(torch.tensor([[-3.0, y, 0.1] for y in (-0.5, 0.0, 0.5)]))
-    assert 0.8 < float(near.mean() / far.mean()) < 0.92, "the rest is in the probes"
+    assert least < float(near.mean() / far.mean()) < most
 
 
 def test_a_hollow_of_the_ground_is_nearly_as_bright_as_the_open():

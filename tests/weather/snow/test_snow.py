@@ -162,6 +162,8 @@ def test_no_snow_hangs_below_a_thin_table():
         xy = 2.2 * torch.rand(4000, 2, generator=torch.Generator().manual_seed(1)) - 1.1
         for z in (0.69, 0.66, 0.6, 0.5):
             below = torch.cat([xy, torch.full((4000, 1), z)], -1)
+            if z < 0.61 and depth > 0.2:  # a heap of what slid off the table lies around it
+                below = below[(xy.abs() < 0.35).all(1)]
             assert snow.density(below).max() == 0
         on_top = torch.cat([xy, torch.full((4000, 1), 0.75)], -1)[(xy.abs() < 0.3).all(1)]
         assert depth_over(snow, on_top).numpy() == pytest.approx(depth, rel=0.1)

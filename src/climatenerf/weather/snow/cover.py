@@ -195,7 +195,7 @@ def settled(
 
     The surface over a node is at most `rise` for each cell above that over any neighbour, or above
     the node's own base where that is higher: snow on a roof ends in a slope at its eaves. What
-    slides off is lost.
+    slides off goes to that neighbour, and makes a heap at the foot of a wall or a car.
 
     Args:
         base: height of what the snow lies on, m; NaN where nothing is.
@@ -213,7 +213,7 @@ def settled(
                 own = top[j, i]
                 if not own - base[j, i] > 1e-6:  # NaN compares False
                     continue
-                limit = own
+                limit, lower, to_j, to_i = own, own, -1, -1
                 for dj in range(-1, 2):
                     for di in range(-1, 2):
                         jj, ii = j + dj, i + di
@@ -223,9 +223,14 @@ def settled(
                         if math.isnan(other):
                             continue
                         length = math.sqrt(dj * dj + di * di)
-                        limit = min(limit, max(other, base[j, i]) + rise * length)
+                        highest = max(other, base[j, i]) + rise * length
+                        if highest < limit or (highest == limit and other < lower):
+                            limit, lower, to_j, to_i = highest, other, jj, ii
                 if limit < own - 1e-5:
-                    top[j, i] = limit
+                    # The neighbour rises by as much as this falls; below an edge it may.
+                    moved = (own - limit) * (0.5 if lower >= base[j, i] else 1.0)
+                    top[j, i] = own - moved
+                    top[to_j, to_i] += moved
                     changed = True
         if not changed:
             break

@@ -18,12 +18,15 @@ from climatenerf.weather.snow.surface_fit import depth_crossings
 RAYS = 12  # from each node
 REACH = 3.0  # m
 NODE = 0.18  # m between nodes
-PROBES = 1.0  # m, standard deviation of how probes 2 m apart blur the light
-REFLECTED = 0.25  # reflectance of what stands around
+PROBES = 0.8  # m, standard deviation of how probes 2 m apart blur the light
+PROBE_HEIGHT = 1.0  # m above the ground, at which they find it on average
+COARSER = 2  # nodes from one place to the next, at which light is looked for up there
+REFLECTED = 0.35  # reflectance of what stands around
 SNOWY = 0.9  # that of ground, which carries the same snow
-ON_GROUND = 0.3  # m above the terrain, up to which a ray ends on the ground
+ON_GROUND = 0.12  # m above the terrain, up to which a ray ends on the ground
 DARKEST = 0.05  # openness; less is inside of matter
-LEAST = 0.6  # of that ratio; less comes from rays that start inside of matter
+INSIDE = 0.15  # light; less is found inside of matter alone
+LEAST = 0.2  # of that ratio; less comes from rays that start inside of matter
 CHUNK = 1 << 16
 
 
@@ -54,16 +57,21 @@ def contact_shade(
     found = np.full(used.shape, np.nan, np.float32)
     if not len(points):
         return found
-    openness, ground = openness_of(field, points + np.array([0, 0, lift], np.float32))
-    returned = SNOWY * ground + REFLECTED * np.maximum(1 - openness - ground, 0)
-    light = openness / (1 - returned)
-    raster = np.zeros(coarse.shape)
-    raster[coarse] = light
+    light = _light(field, points + np.array([0, 0, lift], np.float32))
+    # As the probes have it, which stand higher and in the open.
+    above = np.zeros(coarse.shape, bool)
+    above[::COARSER, ::COARSER] = coarse[::COARSER, ::COARSER]
+    higher = position[::step, ::step][above] + np.array([0, 0, PROBE_HEIGHT], np.float32)
+    raster, weight = np.zeros(coarse.shape), np.zeros(coarse.shape)
+    raster[above] = _light(field, higher)
+    weight[above] = raster[above] > INSIDE
     sigma = PROBES / (spacing * step)
-    weight = ndimage.gaussian_filter(coarse.astype(np.float64), sigma)
-    around = ndimage.gaussian_filter(raster, sigma) / np.maximum(weight, 1e-6)
+    weight_near = ndimage.gaussian_filter(weight, sigma)
+    around = ndimage.gaussian_filter(raster * weight, sigma) / np.maximum(weight_near, 1e-9)
+    own = np.zeros(coarse.shape)
+    own[coarse] = light
     # Where no node is near nothing is used.
-    ratio = np.where(coarse, np.clip(raster / np.maximum(around, DARKEST), LEAST, 1), 1.0)
+    ratio = np.where(coarse, np.clip(own / np.maximum(around, INSIDE), LEAST, 1), 1.0)
     # Between nodes: linear, over nodes with snow alone.
     at = np.mgrid[:rows, :columns] / step
     held = coarse.astype(np.float64)
@@ -72,6 +80,13 @@ def contact_shade(
     known = used & (kernel > 1e-3)
     found[known] = full[known] / kernel[known]
     return found
+
+
+def _light(field: RadianceField, x: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """Light that reaches level surfaces of snow among matter, over that in the open."""
+    openness, ground = openness_of(field, x)
+    returned = SNOWY * ground + REFLECTED * np.maximum(1 - openness - ground, 0)
+    return openness / (1 - returned)
 
 
 @torch.no_grad()
