@@ -1,18 +1,27 @@
 """Light probes: kernel and twin, closed forms, and the light that surfaces send back."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from climatenerf.core.colour import luma
 from climatenerf.field.analytic import AnalyticField, Box, HalfSpace
 from climatenerf.field.spherical_harmonics import harmonics
 from climatenerf.ops import probes
 from climatenerf.ops.probes import ProbeGrid
 from climatenerf.weather.light import scene_light
 from climatenerf.weather.light.probes import gather, nearest_valid
-from climatenerf.weather.light.scene_light import SceneLight, Surfaces, light_of_photos, relit
+from climatenerf.weather.light.scene_light import (
+    SceneLight,
+    Surfaces,
+    balanced,
+    believable,
+    light_of_photos,
+    relit,
+)
 from climatenerf.weather.light.spherical import project, sphere_directions
 
 UP = torch.tensor([[0.0, 0.0, 1.0]])
@@ -155,6 +164,40 @@ def test_twice_the_sky_is_twice_the_light(gathered):
     above[: old.grid.shape[0] * old.grid.shape[1]] = False  # the lowest are in the ground
     torch.testing.assert_close(
         new.coefficients[above], 2 * old.coefficients[above], rtol=0.02, atol=0.06
+    )
+
+
+def test_surfaces_keep_half_their_tint_and_are_no_whiter_than_usual(gathered):
+    white = torch.full((3,), math.pi)
+    assert torch.allclose(believable(gathered, white).radiance, gathered.radiance, atol=1e-6)
+    orange = replace(gathered, radiance=gathered.radiance * torch.tensor([1.5, 1.0, 0.5]))
+    found = believable(orange, white).radiance
+    met = found[..., 1] > 0.1
+    torch.testing.assert_close(luma(found), luma(orange.radiance), rtol=1e-4, atol=1e-5)
+    tint = found[met] / luma(found[met])[:, None]
+    before = orange.radiance[met] / luma(orange.radiance[met])[:, None]
+    torch.testing.assert_close(tint - 1, 0.5 * (before - 1), rtol=1e-3, atol=1e-3)
+    # Albedo .2 and light that is found three times too weak: .6, where .3 is believed.
+    weak = believable(gathered, white / 3).radiance
+    torch.testing.assert_close(weak, 0.5 * gathered.radiance, rtol=0.02, atol=1e-4)
+    # Under a blue light grey surfaces are blue, and stay so.
+    blue = torch.tensor([0.5, 1.0, 1.5])
+    grey = replace(gathered, radiance=gathered.radiance * blue)
+    torch.testing.assert_close(believable(grey, white * blue).radiance, grey.radiance)
+
+
+def test_a_new_light_is_balanced_among_red_walls(gathered):
+    warm = torch.tensor([1.2, 1.0, 0.9])
+    light = light_of_photos(gathered, even(1.0), no_sun(), None)
+    light = replace(light, coefficients=light.coefficients * warm)
+    eyes = torch.tensor([[0.3, 0.2, 1.7], [-0.5, 0.4, 1.6]])
+    found = balanced(light, eyes)
+    sheet = found.irradiance(eyes, UP.expand(2, 3)).mean(0)
+    sky = found.open_irradiance()
+    assert torch.allclose(sheet / luma(sheet), torch.ones(3), atol=0.01), "as in the open before"
+    assert float(sky[0] / sky[2]) == pytest.approx(0.9 / 1.2, rel=0.02)
+    assert luma(sheet) == pytest.approx(
+        float(luma(light.irradiance(eyes, UP.expand(2, 3)).mean(0)))
     )
 
 

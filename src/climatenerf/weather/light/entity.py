@@ -34,8 +34,11 @@ from climatenerf.weather.light.scene_light import (
     Radiance,
     SceneLight,
     Surfaces,
+    balanced,
+    believable,
     light_of_photos,
     relit,
+    scaled,
 )
 from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.light.sun_map import SunMap, sun_map
@@ -62,6 +65,7 @@ class LightEntity:
         self._maps: list[SunMap] = []
         self._last: tuple[object, SceneLight, float] | None = None
         self._lights: dict[tuple[float, ...], SceneLight] = {}
+        self._surfaces: GatheredLight  # as senders of light; known with the light of the photos
 
     # --- what the scene gives -----------------------------------------------------------------
 
@@ -122,6 +126,8 @@ class LightEntity:
                 shadow = self._sun_map(captured.sun)
                 strength = to_device(captured.lobe.astype(np.float32), device)
             light = light_of_photos(self._gathered, radiance, strength, shadow)
+            self._surfaces = believable(self._gathered, light.open_irradiance())
+            light = light_of_photos(self._surfaces, radiance, strength, shadow)
             self._lights = {key: replace(light, captured=captured)}
         return self._lights[key]
 
@@ -206,7 +212,7 @@ class LightEntity:
         surfaces = Surfaces(hidden, albedo) if cover else None
         if weather.sky.kind == "captured":
             changed = under_season(weather.season, self._given.style, old)
-            return relit(self._gathered, old, below_smog(weather, changed), surfaces)
+            return relit(self._surfaces, old, below_smog(weather, changed), surfaces)
         sky = self._sky(weather)
         direct = torch.tensor(sky.sun_irradiance, device=device_of(self._given.field))
         shadow = self._sun_map(np.array(sky.sun)) if bool((direct > 0).any()) else None
@@ -215,7 +221,7 @@ class LightEntity:
             """The new sky and sun, klx times a gain."""
             return replace(
                 old,
-                radiance=functools.partial(_brighter, gain, sky.radiance),
+                radiance=functools.partial(scaled, gain, sky.radiance),
                 sun_irradiance=gain * direct,
                 sun=shadow,
                 captured=None,
@@ -224,13 +230,18 @@ class LightEntity:
         # First as bright as the old light in the open, since changes of light are bounded.
         level = float(luma(under(1.0).open_irradiance()))
         first = float(luma(old.open_irradiance())) / level
-        bare = relit(self._gathered, old, under(first))
+        bare = relit(self._surfaces, old, under(first))
         gain = self._gain(weather, old, bare, first) * 2.0**weather.sky.ev
-        scaled = replace(under(gain), coefficients=gain / first * bare.coefficients)
-        hazy = below_smog(weather, scaled)
-        if surfaces is None and hazy is scaled:
-            return scaled
-        return relit(self._gathered, old, hazy, surfaces)
+        lit = replace(under(gain), coefficients=gain / first * bare.coefficients)
+        hazy = below_smog(weather, lit)
+        if surfaces is None and hazy is lit:
+            return self._balanced(lit)
+        return self._balanced(relit(self._surfaces, old, hazy, surfaces))
+
+    def _balanced(self, light: SceneLight) -> SceneLight:
+        views = self._given.scene.of_split("train")
+        eyes = np.stack([self._given.scene.c2w_world(view)[:3, 3] for view in views])
+        return balanced(light, to_device(eyes.astype(np.float32), device_of(self._given.field)))
 
     def _sky(self, weather: Weather) -> skies.NewSky:
         elevation, azimuth = weather.sun.elevation, weather.sun.azimuth
@@ -348,10 +359,6 @@ def _photographed_sky(
     d: Float[Tensor, "n 3"],
 ) -> Float[Tensor, "n 3"]:
     return captured.sky(d, field.sky(d, appearance))
-
-
-def _brighter(gain: float, sky: Radiance, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    return gain * sky(d)
 
 
 def _lighter(

@@ -1,5 +1,6 @@
 """The light of a place under one sky: irradiance of any surface, from probes and the sun's map."""
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -18,6 +19,8 @@ from climatenerf.weather.light.spherical import TERMS, sphere_directions
 from climatenerf.weather.light.sun_map import SunMap
 
 BOUNCES = 2  # repetitions in which surfaces are lit anew by the surfaces around them
+USUAL_ALBEDO = 0.3  # of most surfaces together, at most
+TINT = 0.5  # of the colour of surfaces that their light on others has
 OFF_SURFACE = 0.15  # m; where the light of a surface is looked up, clear of its own density
 DARKEST = 1e-4  # irradiance over pi; nothing real is darker, and ratios stay finite
 MOST = 16.0  # factor by which light may change at one place
@@ -190,6 +193,57 @@ def relit(
         arriving = sky + bounced.view(gathered.radiance.shape)
         light = replace(new, coefficients=gathered.coefficients(arriving))
     return light
+
+
+def believable(gathered: GatheredLight, irradiance: Float[Tensor, "3"]) -> GatheredLight:
+    """Surfaces with believable albedos, as senders of light to others.
+
+    Where a sun hides behind trees the light of the photos is found too weak, and the surfaces that
+    it lights look whiter than any are. Crowns above the photos have no colour of their own. So
+    surfaces together are no brighter than `USUAL_ALBEDO`, and keep `TINT` of their colour.
+
+    Args:
+        gathered: what the probes' rays meet in the photos.
+        irradiance: of level ground in the open, in the photos.
+    """
+    white = irradiance / math.pi
+    opacity = (1 - gathered.through)[..., None]
+    albedo = luma(gathered.radiance / white) / opacity[..., 0].clamp_min(0.5)
+    met = opacity[..., 0] > 0.5
+    middle = float(albedo[met].median()) if bool(met.any()) else 0.0
+    level = min(1.0, USUAL_ALBEDO / middle) if middle > 0 else 1.0
+    grey = luma(gathered.radiance / white)[..., None] * white
+    return replace(gathered, radiance=level * (TINT * gathered.radiance + (1 - TINT) * grey))
+
+
+def balanced(light: SceneLight, eyes: Float[Tensor, "n 3"]) -> SceneLight:
+    """A new light with the white balance of a camera among the surfaces of the place.
+
+    A level white sheet at the cameras has the colour of one in the open: what surfaces add to it
+    is balanced away, as a camera would, and the sky's own tint stays.
+
+    Args:
+        light: a new sky, complete with the light of surfaces.
+        eyes: positions of the cameras, world m.
+    """
+    up = torch.zeros_like(eyes)
+    up[:, 2] = 1.0
+    (sheets,) = SceneLight.shaded((light,), eyes, up)
+    sheet, sky = sheets.mean(0), light.open_irradiance() - light.full_sun(up[:1])[0]
+    balance = (sky / luma(sky)) / (sheet / luma(sheet))
+    return replace(
+        light,
+        radiance=functools.partial(scaled, balance, light.radiance),
+        sun_irradiance=balance * light.sun_irradiance,
+        coefficients=balance * light.coefficients,
+    )
+
+
+def scaled(
+    factor: float | Float[Tensor, "3"], sky: Radiance, d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Radiance of a sky times a factor; for `functools.partial`, which can be sent to workers."""
+    return factor * sky(d)
 
 
 def _sky_in(gathered: GatheredLight, radiance: Radiance) -> Float[Tensor, "k 3"]:
