@@ -28,7 +28,8 @@ from climatenerf.scene.terrain import Terrain, nearest_known
 from climatenerf.scene.terrain_fit import Heights, fit_heights
 
 MIN_GROUND = 200  # ends on the ground, for a terrain
-MAX_NODES = 512  # along the raster's longer side
+MAX_NODES = 700  # along the raster's longer side
+STRAY = 0.002  # of the ends, on each side of the ground, that may lie outside of the raster
 MIN_CELL = 0.05  # m
 MARGIN = 6.0  # m around the cameras and around what they show
 FAR = 30.0  # camera heights; ground further away is known too badly
@@ -144,7 +145,7 @@ def _raster(
     x: Float[np.ndarray, "n 3"], eyes: Float[np.ndarray, "m 3"]
 ) -> tuple[tuple[float, float], float, tuple[int, int]]:
     """Return origin, cell (m) and shape of a raster around ground and cameras."""
-    low, high = np.quantile(x[:, :2], (0.02, 0.98), axis=0)
+    low, high = np.quantile(x[:, :2], (STRAY, 1 - STRAY), axis=0)
     low = np.minimum(low, eyes[:, :2].min(0)) - MARGIN
     high = np.maximum(high, eyes[:, :2].max(0)) + MARGIN
     cell = max(float((high - low).max()) / (MAX_NODES - 1), MIN_CELL)
