@@ -20,7 +20,7 @@ from climatenerf.weather.light.sun_map import SunMap
 
 BOUNCES = 2  # repetitions in which surfaces are lit anew by the surfaces around them
 USUAL_ALBEDO = 0.3  # of most surfaces together, at most
-TINT = 0.5  # of the colour of surfaces that their light on others has
+TINT = 0.3  # of the colour of surfaces that their light on others has
 OFF_SURFACE = 0.15  # m; where the light of a surface is looked up, clear of its own density
 DARKEST = 1e-4  # irradiance over pi; nothing real is darker, and ratios stay finite
 MOST = 16.0  # factor by which light may change at one place
