@@ -20,7 +20,7 @@ REFERENCE = Path(__file__).parents[2] / "reference" / "street"
 
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory):
-    """A short fit of a few photos with labels of all classes, unlike those of the demo."""
+    """A short fit of a few photos."""
     if not REFERENCE.is_dir():
         pytest.skip("the reference street is not in this checkout")
     folder = tmp_path_factory.mktemp("street") / "run"
