@@ -70,6 +70,15 @@ def test_flags_of_an_absent_effect_give_a_warning(run_folder, tmp_path, capsys):
     err = capsys.readouterr().err
     assert "--flood.wind-speed changes nothing without --flood.level" in err
     assert "--smog" not in err
+    lost = ("--sky.ev", "1", "--sky.cover", "0.5", "--flood.level=-500 m")
+    assert cli.main([*args[:-1], str(tmp_path / "lost"), *lost]) == 0
+    err = capsys.readouterr().err
+    assert "--sky.cover changes nothing without --sky.kind clear" in err
+    assert "--sky.ev changes nothing without --sky.kind overcast or" in err
+    assert "--flood.level -500 m lies below the ground near the cameras" in err
+    both = ("--flood.level", "1 cm", "--flood.clarity", "1 m", "--flood.attenuation", "1", "1", "1")
+    message = error_message(capsys, *args[:-1], str(tmp_path / "both"), *both)
+    assert "--flood.clarity and --flood.attenuation say the same thing" in message
     film = tmp_path / "film.toml"
     film.write_text('[flood]\nlevel = { "0 s" = "1 cm", "1 s" = "2 cm" }\n')
     given = ["--weather", str(film), "--flood.wind-speed", "4 m/s"]

@@ -16,7 +16,13 @@ from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.input_limits import MAX_FRAMES
 from climatenerf.core.storage import read_json
 from climatenerf.scene.scene import Scene
-from climatenerf.weather.description import combine, given_flags, read_weather, without_effect
+from climatenerf.weather.description import (
+    KeyframedWeather,
+    combine,
+    given_flags,
+    read_weather,
+    without_effect,
+)
 from climatenerf.weather.effect import Effect
 from climatenerf.weather.registry import check_effects, installed_effects
 from climatenerf.weather.weather import Weather
@@ -125,6 +131,7 @@ def run(
 
     run = load_run(options.run, device=options.device)
     check_out(options.out, options.run, run.scene)
+    warn_of_low_water(weather, run.scene)
     with progress.StageBars() as bars:
         made = render_movie(
             run,
@@ -153,15 +160,36 @@ def run(
     return 0
 
 
+def warn_of_low_water(film: KeyframedWeather, scene: Scene) -> None:
+    """Warn of water that stays below all ground near the cameras."""
+    frames = film.keyframes.get("flood.level")
+    level = film.base.flood.level if frames is None else max(value for _, value in frames)
+    lowest = scene.lowest_ground_z - scene.ground_z
+    if level is not None and level < lowest:
+        progress.warn(
+            f"--flood.level {level:g} m lies below the ground near the cameras, whose lowest is at"
+            f" {lowest:.1f} m; no water may be seen"
+        )
+
+
 def say_light(sidecar: dict[str, Any]) -> None:
     """Print where the sun of the photos was found, if the weather needed their light."""
+    if sidecar.get("photos_light_known") == 0:
+        progress.warn(
+            "the photos do not tell their light: snow, water and smog are lit as in the open"
+        )
+    hard = sidecar.get("photos_sun_width_deg") == 0
+    sky = sidecar.get("weather", {}).get("sky", {}).get("kind", "captured")
+    if sky != "captured" and not hard:
+        progress.say("no sun was found by shadows; if the photos show shadows, these stay")
     if "photos_sun_elevation_deg" not in sidecar:
         return
     elevation, azimuth, error = (
         sidecar[f"photos_sun_{name}_deg"] for name in ("elevation", "azimuth", "error")
     )
     place = f"{elevation:.0f} deg high at azimuth {azimuth:.0f} deg"
-    text = f"sun of the photos: {place} (+-{error:.0f} deg)"
+    what = "sun of the photos" if hard else "brightest part of the photos' sky"
+    text = f"{what}: {place} (+-{error:.0f} deg)"
     difference = sidecar.get("photos_sun_from_almanac_deg")
     if difference is not None:
         text += f"; {difference:.1f} deg from the sun of their date, time and place"

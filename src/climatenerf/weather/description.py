@@ -216,6 +216,13 @@ def combine(
     Raises:
         UserError: file and flags contradict each other.
     """
+    for effect in effects:
+        for one, other in effect.alternatives:
+            if {f"{effect.name}.{one}", f"{effect.name}.{other}"} <= given:
+                raise UserError(
+                    f"--{effect.name}.{one} and --{effect.name}.{other} say the same thing: give"
+                    " only one"
+                )
     if film is None:
         return KeyframedWeather(check(flags, effects), {})
     weather = film.base
@@ -237,11 +244,15 @@ def combine(
 def without_effect(
     film: KeyframedWeather, given: frozenset[str], effects: Sequence[Effect] = EFFECTS
 ) -> dict[str, str]:
-    """Flags of effects that are absent from the whole movie, with the flags that enable them."""
+    """Flags that change nothing in the whole movie, with the flags that they would need."""
     found = {}
     for effect in effects:
         keyframed = any(key.startswith(f"{effect.name}.") for key in film.keyframes)
         section = film.base.sections[effect.name]
+        for name, other, values in effect.only_with:
+            if f"{effect.name}.{name}" in given and getattr(section, other) not in values:
+                needed = " or ".join(f"--{effect.name}.{other} {value}" for value in values)
+                found[f"{effect.name}.{name}".replace("_", "-")] = needed
         if not effect.enabled_by or keyframed or effect.present(section):
             continue
         enabling = " or ".join(f"--{effect.name}.{name}" for name in effect.enabled_by)

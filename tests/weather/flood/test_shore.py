@@ -200,6 +200,10 @@ def test_cameras_under_murky_water_are_refused():
     entity = FloodEntity(make_waves(flood, 0), E, 0.0, 9.0, 1.6)
     with pytest.raises(UserError, match="all cameras are under water"):
         entity.check((Weather(flood=flood),))
+    thick = Flood(level=5.0, attenuation=(8.0, 8.0, 8.0))
+    with pytest.raises(UserError, match=r"deeper than its clarity of 0.24 m"):
+        entity.check((Weather(flood=thick),))
+    entity.check((Weather(flood=replace(thick, attenuation=(0.3, 0.06, 0.01))),))
     for changed in (replace(flood, clarity=6.0), replace(flood, level=1.0)):
         entity.check((Weather(flood=flood), Weather(flood=changed)))
 

@@ -91,3 +91,8 @@ def test_clear_water_is_dark_and_blue_green_and_mud_is_brown():
     between = optics.deep_colour(Flood(clarity=1.3))
     assert all(min(a, b) < c < max(a, b) for a, b, c in zip(mud, lake, between, strict=True))
     assert optics.deep_colour(Flood(colour=(1.0, 0.0, 0.0))) == (1.0, 0.0, 0.0)
+    pure = Flood(attenuation=(0.3, 0.06, 0.01))
+    assert optics.deep_colour(pure) == lake, "the default clarity says nothing about it"
+    muddy = optics.deep_colour(Flood(attenuation=optics.attenuation(Flood(clarity=0.3))))
+    assert muddy == pytest.approx(mud, rel=0.05)
+    assert optics.deep_colour(Flood(attenuation=(0.0, 0.0, 0.0))) == lake

@@ -18,9 +18,11 @@ from climatenerf.weather.light.captured import (
 )
 from climatenerf.weather.light.file import load_light, save_light
 from climatenerf.weather.light.find_light import (
+    LEAST_SUN,
     Pairs,
     fit_sky,
     gather_light,
+    glow_share,
     hard_sun,
     sun_strength,
 )
@@ -195,3 +197,12 @@ def test_the_file_gives_back_the_same_light(tmp_path, width):
         (tmp_path / "light.json").write_text(damaged)
         with pytest.raises(UserError, match=r"light\.json is damaged"):
             load_light(tmp_path / "light.json")
+
+
+@pytest.mark.parametrize(("elevation", "peak", "strong"), [(40.0, 4.0, True), (5.0, 0.2, False)])
+def test_a_faint_lobe_is_no_sun(elevation, peak, strong):
+    light = CapturedLight(
+        np.full(3, 0.8), np.full(3, 0.7), direction(elevation, 20.0), np.radians(22.0),
+        np.full(3, peak), np.ones((18, 36)), 0.1,
+    )  # fmt: skip
+    assert (glow_share(light) >= LEAST_SUN) is strong

@@ -93,7 +93,16 @@ def test_the_sun_of_a_capture(tmp_path):
 
 
 def test_the_difference_is_printed(capsys):
-    facts = {"elevation": 40.0, "azimuth": 218.0, "error": 1.0, "from_almanac": 2.34}
-    say_light({f"photos_sun_{name}_deg": value for name, value in facts.items()})
+    facts = {"elevation": 40.0, "azimuth": 218.0, "error": 1.0, "from_almanac": 2.34, "width": 0.0}
+    sidecar = {f"photos_sun_{name}_deg": value for name, value in facts.items()}
+    say_light(sidecar)
     printed = " ".join("".join(capsys.readouterr()).split())
+    assert printed.startswith("sun of the photos") and "shadows" not in printed
     assert "40 deg high at azimuth 218 deg (+-1 deg); 2.3 deg from the sun of their date" in printed
+    say_light(sidecar | {"photos_sun_width_deg": 20.0, "weather": {"sky": {"kind": "overcast"}}})
+    printed = " ".join("".join(capsys.readouterr()).split())
+    assert (
+        "no sun was found by shadows" in printed and "brightest part of the photos' sky" in printed
+    )
+    say_light({"photos_light_known": 0.0})
+    assert "do not tell their light" in "".join(capsys.readouterr())

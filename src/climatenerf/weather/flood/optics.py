@@ -269,6 +269,14 @@ def attenuation(flood: Flood) -> tuple[float, float, float]:
     return red, green, blue
 
 
+def clarity_of(flood: Flood) -> float:
+    """Return the depth in m at which a white disc keeps 2 % of its contrast in green light."""
+    if flood.attenuation is None:
+        return flood.clarity
+    # 1e-6: water without attenuation shows a disc at any depth.
+    return _CLARITY / max(flood.attenuation[1], 1e-6)
+
+
 def light_cosine(flood: Flood, sun_elevation: float | None) -> float:
     """Return the cosine of the light's angle to the vertical under water.
 
@@ -371,7 +379,7 @@ def deep_colour(flood: Flood) -> tuple[float, float, float]:
         return linear_colour(flood.colour)
     low, high = (math.log(clarity) for clarity, _ in DEEP)
     mud, clear = (linear_colour(colour) for _, colour in DEEP)
-    part = min(max((math.log(flood.clarity) - low) / (high - low), 0.0), 1.0)
+    part = min(max((math.log(clarity_of(flood)) - low) / (high - low), 0.0), 1.0)
     red, green, blue = (m + part * (c - m) for m, c in zip(mud, clear, strict=True))
     return red, green, blue
 

@@ -353,9 +353,10 @@ class FloodEntity:
         eye = self.highest_eye - self.ground_z
         if moments and all(_blind(moment.flood, eye) for moment in moments):
             flood = moments[0].flood
+            clarity = optics.clarity_of(flood)
             raise UserError(
                 f"all cameras are under water at --flood.level {flood.level:g} m (the highest is"
-                f" at {eye:.1f} m), deeper than its clarity of {flood.clarity:g} m lets them see;"
+                f" at {eye:.1f} m), deeper than its clarity of {clarity:.2g} m lets them see;"
                 " give a lower level, or clearer water"
             )
 
@@ -382,7 +383,7 @@ def prepare(preparation: Preparation) -> FloodEntity:
 def _blind(flood: Flood, eye: float) -> bool:
     """Whether a camera so high above the ground datum (m) sees nothing but water."""
     level = -math.inf if flood.level is None else flood.level
-    return flood.attenuation is None and level - eye > flood.clarity
+    return level - eye > optics.clarity_of(flood)
 
 
 def scene_top(scene: Scene) -> float:

@@ -104,10 +104,14 @@ class LightEntity:
             if np.allclose(kept.direction, direction, atol=1e-9):
                 return kept
         given = self._given
-        given.progress("shadows", 0.0)
         views = given.scene.of_split("train")
         eyes = np.stack([given.scene.c2w_world(view)[:3, 3] for view in views])
-        made = sun_map(observed(given.field), direction, np.median(eyes, axis=0))
+        made = sun_map(
+            observed(given.field),
+            direction,
+            np.median(eyes, axis=0),
+            lambda fraction: given.progress("shadows", fraction),
+        )
         self._maps = [*self._maps, made][-2:]
         return made
 
@@ -310,19 +314,22 @@ class LightEntity:
                 )
 
     def facts(self) -> dict[str, float]:
-        """Where the sun of the photos stands."""
-        if "_found" not in self.__dict__ or self.captured is None:
+        """Whether the light of the photos is known, and where their sun stands."""
+        if "_found" not in self.__dict__:
             return {}
         captured = self.captured
-        found: dict[str, float] = {}
+        found = {"photos_light_known": float(captured is not None)}
+        if captured is None:
+            return found
         if captured.sun is not None:
             elevation, azimuth = elevation_azimuth(captured.sun)
             found |= {
                 "photos_sun_elevation_deg": math.degrees(elevation),
                 "photos_sun_azimuth_deg": math.degrees(azimuth),
                 "photos_sun_error_deg": math.degrees(captured.sun_error),
+                "photos_sun_width_deg": math.degrees(captured.width),
             }
-            if captured.almanac_difference:
+            if captured.almanac_difference is not None:
                 difference = math.degrees(captured.almanac_difference)
                 found |= {"photos_sun_from_almanac_deg": difference}
         return found

@@ -24,7 +24,8 @@ from climatenerf.weather.light.solar_position import almanac_sun
 from climatenerf.weather.world import Kept
 
 FILE_NAME = "light.json"
-SCHEMA_VERSION = 3  # 1 knew no sun of the calendar; 2 let the zenith rise beside a sun's lobe
+SCHEMA_VERSION = 4
+"""1 knew no sun of the calendar, 2 let the zenith rise beside a sun's lobe, 3 kept faint lobes."""
 NO_REASON = "the photos show too little of it"  # of files that were written without one
 
 

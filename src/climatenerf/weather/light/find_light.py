@@ -54,7 +54,7 @@ MAX_ERROR = np.radians(8.0)
 MIN_HALF = 60  # pairs of each half of the photos
 TWO_SUNS, CLEAR_GAIN = np.radians(30.0), 0.03  # of suns that contradict each other
 ALMANAC_ERROR = np.radians(3.0)  # of the sun by date, time and place: north is that of GPS
-LEAST_SUN = 0.15  # light of a sun without sure shadows over that of the sky, on level ground
+LEAST_SUN = 0.15  # light of a sun without sure shadows, or of a lobe, over that of the sky
 MIN_SKY, MAX_SKY = 50, 1500  # pixels of the reduced photos that show sky
 MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
 CLOUDS = 60  # independent patches of the sky that photos show
@@ -551,8 +551,18 @@ def find_light(
         enough = flat.sum() >= 2 * MIN_PAIRS // 3
         ground = float((pairs.radiance[flat] @ LUMA).mean()) if enough else 0.0
         model = fit_sky(sky_d, seen, ground, lobe=True)
-        return _assembled(model, shown, model.width / 3, almanac)
+        glowing = _assembled(model, shown, model.width / 3, almanac)
+        if glow_share(glowing) >= LEAST_SUN:
+            return glowing
     return light
+
+
+def glow_share(light: CapturedLight) -> float:
+    """Light of the lobe on level ground over that of the sky's base."""
+    d = torch.tensor(gathering_directions(), dtype=torch.float32, device="cpu")
+    d = d[d[:, 2] > 0]
+    glow, base = ((part @ d.new_tensor(LUMA)) @ d[:, 2] for part in (light.glow(d), light.base(d)))
+    return float(glow / base)
 
 
 def _by_name(photos: list[PhotoRays]) -> list[str]:

@@ -8,6 +8,7 @@ from climatenerf.weather.effect import Effect
 from climatenerf.weather.units import ANGLE, choice, number, quantity
 
 _TURN = 2 * math.pi
+_NEW = ("overcast", "clear", "storm", "dusk")
 
 
 @dataclass(frozen=True)
@@ -45,5 +46,6 @@ SKY = Effect(
     enabled_by=(),
     prepare="climatenerf.weather.light.entity:prepare",
     always=True,
+    only_with=(("cover", "kind", ("clear",)), ("exposure", "kind", _NEW), ("ev", "kind", _NEW)),
 )
 SUN = Effect(name="sun", parameters=Sun, enabled_by=(), prepare=None)

@@ -6,6 +6,7 @@ quarters and one quarter of the light pass: half of it is left behind the first,
 partial shade. Between texels visibility is bilinear.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,9 +57,19 @@ class SunMap:
 
 @torch.no_grad()
 def sun_map(
-    field: RadianceField, direction: Float[np.ndarray, "3"], centre: Float[np.ndarray, "3"]
+    field: RadianceField,
+    direction: Float[np.ndarray, "3"],
+    centre: Float[np.ndarray, "3"],
+    progress: Callable[[float], None] | None = None,
 ) -> SunMap:
-    """Trace the maps of a field without unobserved density, around `centre` (world m)."""
+    """Trace the maps of a field without unobserved density.
+
+    Args:
+        field: without unobserved density.
+        direction: unit vector towards the sun.
+        centre: middle of the maps, world m.
+        progress: called with the fraction that is done.
+    """
     device = device_of(field)
     light = -np.asarray(direction, np.float64)
     side = np.cross([0.0, 0.0, 1.0], light)
@@ -74,7 +85,10 @@ def sun_map(
         u, v = np.meshgrid(grid, grid)
         o = centre + u[..., None] * axes[0] + v[..., None] * axes[1] - start * light
         rays_o = to_device(o.reshape(-1, 3).astype(np.float32), device)
-        found = _depths(field, rays_o, to_device(light.astype(np.float32), device), start + half)
+        done = len(maps) / 2
+        report = None if progress is None else lambda part, done=done: progress(done + part / 2)
+        towards = to_device(light.astype(np.float32), device)
+        found = _depths(field, rays_o, towards, start + half, report)
         maps.append((found - start).reshape(TEXELS, TEXELS, 2))
     return SunMap(
         np.asarray(direction, np.float64),
@@ -86,7 +100,11 @@ def sun_map(
 
 
 def _depths(
-    field: RadianceField, rays_o: Float[Tensor, "n 3"], light: Float[Tensor, "3"], length: float
+    field: RadianceField,
+    rays_o: Float[Tensor, "n 3"],
+    light: Float[Tensor, "3"],
+    length: float,
+    progress: Callable[[float], None] | None = None,
 ) -> Float[Tensor, "n 2"]:
     """Ray lengths at which 3/4 and 1/4 of the light pass; +inf where more passes."""
     found = torch.full((rays_o.shape[0], 2), torch.inf, device=rays_o.device)
@@ -113,4 +131,6 @@ def _depths(
             alive = (tau < OPAQUE).nonzero()[:, 0]
             o, rows, tau = o[alive], rows[alive], tau[alive]
             begin += PIECE
+        if progress is not None:
+            progress(min(chunk.stop / len(rays_o), 1.0))
     return found
