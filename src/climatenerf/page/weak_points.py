@@ -191,7 +191,7 @@ def _light(given: Evidence) -> list[WeakPoint]:
             WeakPoint(
                 "Unknown light",
                 "the light of the photos could not be found",
-                "snow, mud and smog are lit as in the open; another sky changes nothing",
+                "snow, mud and smog are lit as in the open; another sky is refused",
                 "take photos that show more sky and sunlit ground",
             )
         )

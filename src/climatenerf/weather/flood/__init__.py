@@ -1,1 +1,1 @@
-"""Flood water: a horizontal surface with waves, a body of water and a bottom."""
+"""Flood water: waves about one level, a body of water, and a shore."""

@@ -1,1 +1,1 @@
-"""The light of the place: today the sun's position, which other effects read."""
+"""The light of the place: that of its photos, other skies, and what it does to surfaces."""

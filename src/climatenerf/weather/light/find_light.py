@@ -2,7 +2,8 @@
 
 Surfaces of one class have one albedo on average, so how their radiance varies tells where light
 comes from: each surface point sees a part of the sky, and what stands around it. Candidates for the
-sky are compared by the median deviation of log radiance from log irradiance within each class.
+sky are compared by the mean deviation, over pairs of neighbouring points of one class, of log
+radiance from log irradiance.
 """
 
 from dataclasses import dataclass
