@@ -5,7 +5,7 @@ ever coarser texels (a mip pyramid), so a lookup at the size of a pixel costs th
 distance. It also says which variance of slopes the filter has removed.
 
 Rays are followed through the layer that holds all crests and troughs, in steps of half a pixel, or
-of a sixteenth of the way if that is more. The first crossing is refined by regula falsi.
+of a sixty-fourth of the way if that is more. The first crossing is refined by regula falsi.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from climatenerf.ops import dispatch
 
-STEPS = 16  # along a ray's way through the layer, at most
+STEPS = 64  # along a ray's way through the layer, at most
 STEP = 0.5  # pixels
 REFINED = 4  # iterations of regula falsi (Illinois)
 REACH = 50.0  # m through the layer of the waves; beyond, rays meet the mean surface

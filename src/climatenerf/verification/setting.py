@@ -76,7 +76,8 @@ def session_in(field: AnalyticField, weather: Weather, viewpoint: Viewpoint) -> 
     pose = looking(tuple(viewpoint.eye.tolist()), (0.0, 1.0, -0.3))
     view = View("view.png", Path("view.png"), 0, pose)
     scene = Scene(Path("."), "analytic", (camera,), (view,))
-    return RenderSession(protocol_of(field), scene, weather, np.zeros((1, 3)), effects=EFFECTS)
+    eye = np.array([[0.0, 0.0, viewpoint.eye[2]]])
+    return RenderSession(protocol_of(field), scene, weather, eye, effects=EFFECTS)
 
 
 def frame_in(field: AnalyticField, weather: Weather, viewpoint: Viewpoint) -> Frame:
