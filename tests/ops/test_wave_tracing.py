@@ -48,8 +48,9 @@ def test_kernel_and_twin_agree(sea):
     a, b = (find(sea, LEVEL, o, d, above(4000), angle) for find in (first_hits, _twin))
     same = (a.t - b.t).abs() < 1e-3 * a.t
     assert same.float().mean() > 0.995, "but rays that graze a crest"
-    alike = (a.slope[same] - b.slope[same]).abs() < 5e-3
-    assert alike.float().mean() > 0.999, "but on ripples within the tolerance of t"
+    close = (a.t - b.t).abs() < 2e-4 * a.t  # ripples change their slope within the tolerance of t
+    assert close.float().mean() > 0.995
+    torch.testing.assert_close(a.slope[close], b.slope[close], atol=5e-3, rtol=0)
     torch.testing.assert_close(a.variance, b.variance, atol=1e-7, rtol=1e-4)
 
 

@@ -15,13 +15,13 @@ from climatenerf.ops.probes import ProbeGrid
 from climatenerf.weather.light import scene_light
 from climatenerf.weather.light.probes import gather, nearest_valid
 from climatenerf.weather.light.scene_light import (
-    TINT,
+    SATURATION,
     SceneLight,
     Surfaces,
-    balanced,
-    believable,
     light_of_photos,
+    plausible_surfaces,
     relit,
+    white_balanced,
 )
 from climatenerf.weather.light.spherical import project, sphere_directions
 
@@ -170,21 +170,23 @@ def test_twice_the_sky_is_twice_the_light(gathered):
 
 def test_surfaces_keep_part_of_their_tint_and_are_no_whiter_than_usual(gathered):
     white = torch.full((3,), math.pi)
-    assert torch.allclose(believable(gathered, white).radiance, gathered.radiance, atol=1e-6)
+    assert torch.allclose(
+        plausible_surfaces(gathered, white).radiance, gathered.radiance, atol=1e-6
+    )
     orange = replace(gathered, radiance=gathered.radiance * torch.tensor([1.5, 1.0, 0.5]))
-    found = believable(orange, white).radiance
+    found = plausible_surfaces(orange, white).radiance
     met = found[..., 1] > 0.1
     torch.testing.assert_close(luma(found), luma(orange.radiance), rtol=1e-4, atol=1e-5)
     tint = found[met] / luma(found[met])[:, None]
     before = orange.radiance[met] / luma(orange.radiance[met])[:, None]
-    torch.testing.assert_close(tint - 1, TINT * (before - 1), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(tint - 1, SATURATION * (before - 1), rtol=1e-3, atol=1e-3)
     # Albedo .2 and light that is found three times too weak: .6, where .3 is believed.
-    weak = believable(gathered, white / 3).radiance
+    weak = plausible_surfaces(gathered, white / 3).radiance
     torch.testing.assert_close(weak, 0.5 * gathered.radiance, rtol=0.02, atol=1e-4)
     # Under a blue light grey surfaces are blue, and stay so.
     blue = torch.tensor([0.5, 1.0, 1.5])
     grey = replace(gathered, radiance=gathered.radiance * blue)
-    torch.testing.assert_close(believable(grey, white * blue).radiance, grey.radiance)
+    torch.testing.assert_close(plausible_surfaces(grey, white * blue).radiance, grey.radiance)
 
 
 def test_a_new_light_is_balanced_among_red_walls(gathered):
@@ -192,7 +194,7 @@ def test_a_new_light_is_balanced_among_red_walls(gathered):
     light = light_of_photos(gathered, even(1.0), no_sun(), None)
     light = replace(light, coefficients=light.coefficients * warm)
     eyes = torch.tensor([[0.3, 0.2, 1.7], [-0.5, 0.4, 1.6]])
-    found = balanced(light, eyes)
+    found = white_balanced(light, eyes)
     sheet = found.irradiance(eyes, UP.expand(2, 3)).mean(0)
     sky = found.open_irradiance()
     assert torch.allclose(sheet / luma(sheet), torch.ones(3), atol=0.01), "as in the open before"

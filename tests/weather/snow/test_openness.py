@@ -48,7 +48,7 @@ def test_contact_shade_at_a_dark_wall(top, least, most):
     field = AnalyticField([ground(), wall], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5)))
     x = np.array([[0.92, 0.0, 0.1], [0.7, 0.0, 0.1], [0.0, 0.0, 0.1], [-7.0, 0.0, 0.1]])
     openness, hidden = openness_of(field, x.astype(np.float32))
-    assert 0.4 < openness[0] < 0.7
+    assert 0.4 < openness[0] < (0.65 if top > 1 else 0.7)  # above a low wall more sky is free
     assert np.all(np.diff(openness) >= 0)
     assert openness[3] == pytest.approx(1)
     assert not hidden.any(), "a wall is no ground"

@@ -34,11 +34,11 @@ from climatenerf.weather.light.scene_light import (
     Radiance,
     SceneLight,
     Surfaces,
-    balanced,
-    believable,
     light_of_photos,
+    plausible_surfaces,
     relit,
     scaled,
+    white_balanced,
 )
 from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.light.sun_map import SunMap, sun_map
@@ -65,7 +65,7 @@ class LightEntity:
         self._maps: list[SunMap] = []
         self._last: tuple[object, SceneLight, float] | None = None
         self._lights: dict[tuple[float, ...], SceneLight] = {}
-        self._surfaces: GatheredLight  # as senders of light; known with the light of the photos
+        self._surfaces: GatheredLight  # what they reflect; known with the light of the photos
 
     # --- what the scene gives -----------------------------------------------------------------
 
@@ -130,7 +130,7 @@ class LightEntity:
                 shadow = self._sun_map(captured.sun)
                 strength = to_device(captured.lobe.astype(np.float32), device)
             light = light_of_photos(self._gathered, radiance, strength, shadow)
-            self._surfaces = believable(self._gathered, light.open_irradiance())
+            self._surfaces = plausible_surfaces(self._gathered, light.open_irradiance())
             light = light_of_photos(self._surfaces, radiance, strength, shadow)
             self._lights = {key: replace(light, captured=captured)}
         return self._lights[key]
@@ -243,9 +243,12 @@ class LightEntity:
         return self._balanced(relit(self._surfaces, old, hazy, surfaces))
 
     def _balanced(self, light: SceneLight) -> SceneLight:
+        """White balance at the cameras of the photos."""
         views = self._given.scene.of_split("train")
         eyes = np.stack([self._given.scene.c2w_world(view)[:3, 3] for view in views])
-        return balanced(light, to_device(eyes.astype(np.float32), device_of(self._given.field)))
+        return white_balanced(
+            light, to_device(eyes.astype(np.float32), device_of(self._given.field))
+        )
 
     def _sky(self, weather: Weather) -> skies.NewSky:
         elevation, azimuth = weather.sun.elevation, weather.sun.azimuth

@@ -19,8 +19,8 @@ from climatenerf.weather.light.spherical import TERMS, sphere_directions
 from climatenerf.weather.light.sun_map import SunMap
 
 BOUNCES = 2  # repetitions in which surfaces are lit anew by the surfaces around them
-USUAL_ALBEDO = 0.3  # of most surfaces together, at most
-TINT = 0.3  # of the colour of surfaces that their light on others has
+MAX_MEDIAN_ALBEDO = 0.3  # of the surfaces of a place
+SATURATION = 0.3  # of their colour that is kept in the light that they reflect onto others
 OFF_SURFACE = 0.15  # m; where the light of a surface is looked up, clear of its own density
 DARKEST = 1e-4  # irradiance over pi; nothing real is darker, and ratios stay finite
 MOST = 16.0  # factor by which light may change at one place
@@ -195,12 +195,12 @@ def relit(
     return light
 
 
-def believable(gathered: GatheredLight, irradiance: Float[Tensor, "3"]) -> GatheredLight:
-    """Surfaces with believable albedos, as senders of light to others.
+def plausible_surfaces(gathered: GatheredLight, irradiance: Float[Tensor, "3"]) -> GatheredLight:
+    """Limit the albedo and the saturation of surfaces in the light that they reflect onto others.
 
-    Where a sun hides behind trees the light of the photos is found too weak, and the surfaces that
-    it lights look whiter than any are. Crowns above the photos have no colour of their own. So
-    surfaces together are no brighter than `USUAL_ALBEDO`, and keep `TINT` of their colour.
+    Where trees hide the sun, the light of the photos is estimated too low, and the albedo of sunlit
+    surfaces too high. The colour of crowns that no photo shows is arbitrary. So the median albedo
+    is limited to `MAX_MEDIAN_ALBEDO`, and a fraction `SATURATION` of the colour is kept.
 
     Args:
         gathered: what the probes' rays meet in the photos.
@@ -211,16 +211,18 @@ def believable(gathered: GatheredLight, irradiance: Float[Tensor, "3"]) -> Gathe
     albedo = luma(gathered.radiance / white) / opacity[..., 0].clamp_min(0.5)
     met = opacity[..., 0] > 0.5
     middle = float(albedo[met].median()) if bool(met.any()) else 0.0
-    level = min(1.0, USUAL_ALBEDO / middle) if middle > 0 else 1.0
+    level = min(1.0, MAX_MEDIAN_ALBEDO / middle) if middle > 0 else 1.0
     grey = luma(gathered.radiance / white)[..., None] * white
-    return replace(gathered, radiance=level * (TINT * gathered.radiance + (1 - TINT) * grey))
+    return replace(
+        gathered, radiance=level * (SATURATION * gathered.radiance + (1 - SATURATION) * grey)
+    )
 
 
-def balanced(light: SceneLight, eyes: Float[Tensor, "n 3"]) -> SceneLight:
-    """A new light with the white balance of a camera among the surfaces of the place.
+def white_balanced(light: SceneLight, eyes: Float[Tensor, "n 3"]) -> SceneLight:
+    """Return a new light with the white balance of a camera among the surfaces of the place.
 
-    A level white sheet at the cameras has the colour of one in the open: what surfaces add to it
-    is balanced away, as a camera would, and the sky's own tint stays.
+    A level white sheet at the cameras gets the chromaticity of one in the open. So the tint that
+    surfaces add is removed, as a camera does, and that of the sky stays.
 
     Args:
         light: a new sky, complete with the light of surfaces.
