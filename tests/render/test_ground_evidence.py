@@ -376,3 +376,16 @@ def test_a_damaged_terrain_is_refused_in_one_sentence(tmp_path, counted):
         terrain_of_run(tmp_path, field(), scene(), "one")
     (tmp_path / FILE_NAME).unlink()
     assert terrain_of_run(tmp_path, field(), scene(), "one") is not None
+
+
+def test_the_raster_reaches_far_ground_but_no_stray_end():
+    rng = np.random.default_rng(0)
+    near = rng.uniform(-10, 10, (9900, 3))
+    far = rng.uniform((-5, 38, 0), (5, 42, 0.1), (95, 3))  # one in a hundred
+    stray = np.array([[0.0, 900.0, 0.0], [-700.0, 0.0, 0.0]])
+    origin, cell, (rows, columns) = ground_evidence._raster(
+        np.concatenate([near, far, stray]), np.array([[0.0, 0.0, 1.6]])
+    )
+    assert 40 < origin[1] + cell * (rows - 1) < 60
+    assert origin[0] > -20 and origin[0] + cell * (columns - 1) < 20
+    assert max(rows, columns) <= ground_evidence.MAX_NODES + 1
