@@ -9,6 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from support.command_line import run_cli
+from support.random_run import random_run, small
 from support.toy_device import TOY, kernels_for_toys
 from support.toy_photos import DISTORTED, pattern, photos
 from support.toy_scene import CAMERA, TINY, make_scene
@@ -32,6 +35,7 @@ from climatenerf.training.run import fit_scene
 from climatenerf.training.settings import FitSettings, Losses
 from climatenerf.training.setup import make_trainer
 from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.weather import Weather
 
 WEATHER = {
     "smog": {"visibility": "20 m"},
@@ -156,9 +160,44 @@ def test_frames_with_all_weather_are_equal_on_both_devices(runs):
         assert np.array_equal(values, toy_layers[name], equal_nan=True), name
 
 
+def test_styles_are_equal_on_both_devices(tmp_path, monkeypatch):
+    """The operator, its colours in the field, and pictures as teachers; shapes stay to the bit."""
+    run, red = random_run(tmp_path, small("cpu")), tmp_path / "red"
+    red.mkdir()
+    for view in load_run(run).scene.views:
+        Image.new("RGB", (96, 72), (200, 30, 20)).save(red / view.name)
+    monkeypatch.setattr("climatenerf.styling.paper.fine_tune.RAYS", 256)
+    few = ("--steps", 6, "--views", 3, "--width", 24)
+    styles = {
+        "operator": ("--season", "winter"),
+        "baked": ("--bake", "--season", "winter", *few),
+        "pictures": ("--method", "paper", "--pictures", red, *few),
+    }
+    for name, flags in styles.items():
+        pictures = []
+        for kind, (device, kernels) in DEVICES.items():
+            out = tmp_path / f"{name}-{kind}"
+            with kernels(), monkeypatch.context() as patch:
+                patch.setattr("climatenerf.core.device.resolve_device", lambda _, to=device: to)
+                asked = "cpu" if kind == "cpu" else "cuda"
+                assert run_cli("stylize", run, "-o", out, *flags, "--device", asked) == 0
+                styled = load_run(out, device=asked)
+                assert styled.field.embeddings.device.type == device.type
+                pose = styled.scene.c2w_world(styled.scene.views[0])
+                session = RenderSession(styled.field, styled.scene, Weather(), style=styled.style)
+                pictures.append(session.frame(CAMERA.resized(16, 12), pose).picture)
+        assert np.array_equal(*pictures), name
+        plain, *both = (load_field(p).state_dict() for p in (run, out, tmp_path / f"{name}-cpu"))
+        for key, values in plain.items():
+            learned = key == "appearance_grid" and name != "operator"
+            assert torch.equal(both[0][key], values) != learned, (name, key)
+            torch.testing.assert_close(both[0][key], both[1][key], rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_device_cuda_without_a_gpu_is_an_error(tmp_path, capsys):
-    for args in (["fit", "capture", "-o", "run"], ["render", "run", "-o", "out"]):
+    fit, render = ["fit", "capture", "-o", "run"], ["render", "run", "-o", "out"]
+    for args in (fit, render, ["stylize", "run", "-o", "out", "--season", "winter"]):
         assert cli.main([*args, "--device", "cuda"]) == 2
         message = capsys.readouterr().err
         assert "NVIDIA GPU" in message and "Traceback" not in message

@@ -69,6 +69,9 @@ class Stylize:
     """The most views that teach."""
     width: int = 480
     """The most pixels across of the pictures that teach."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the present
+    GPU kernels were tested without a GPU."""
 
 
 def run(options: Stylize) -> int:
@@ -100,6 +103,10 @@ def run(options: Stylize) -> int:
         return measure(options, options.out)
     if options.run is None:
         raise UserError("name the run to stylize: climatenerf stylize RUN -o RUN2")
+    if options.device != "cpu":
+        from climatenerf.core.device import resolve_device
+
+        resolve_device(options.device)
     if paper:
         return fine_tune(options, options.run, options.out)
     return stylize(options, options.run, options.out)
@@ -149,7 +156,7 @@ def stylize(options: Stylize, folder: Path, out: Path) -> int:
     from climatenerf.api import load_run
     from climatenerf.styling.styled_run import write_styled_run
 
-    run = load_run(folder)
+    run = load_run(folder, device=options.device)
     check_colours(run)
     write_styled_run(folder, run.scene, make_style(run), out)
     progress.result(f"run: {out}")
@@ -169,7 +176,7 @@ def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
     from climatenerf.styling.paper.shots import choose_shots
     from climatenerf.styling.paper.teachers import operator_teacher
 
-    run = load_run(folder)
+    run = load_run(folder, device=options.device)
     check_colours(run)
     shots = choose_shots(run.scene, options.views, options.width, options.seed)
     if make_style is not None:
