@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from climatenerf.ops import wave_tracing
-from climatenerf.ops.wave_tracing import WaveMaps, first_hits, surface
+from climatenerf.ops.wave_tracing import WaveMaps, first_hits
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.flood.waves import at_time, make_waves
 
@@ -65,7 +65,7 @@ def test_hits_lie_on_the_surface(find, sea):
     found = find(sea, LEVEL, o, d, above(2000), angle)
     assert torch.isfinite(found.t).all()
     x = o + found.t[:, None] * d
-    height, slope, variance = surface(sea, x[:, :2], footprint(o, d, angle))
+    height, slope, variance = sea.at(x[:, :2], footprint(o, d, angle))
     off = (x[:, 2] - LEVEL - height).abs()
     assert off.max() < 1e-2 and off.quantile(0.99) < 1e-3
     torch.testing.assert_close(found.slope, slope, atol=1e-4, rtol=0)
@@ -85,7 +85,7 @@ def test_crests_hide_troughs(find, sea):
     t = begin[:, None] + share * (end - begin)[:, None]
     x = o[:, None] + t[..., None] * d[:, None]
     width = footprint(o, d, angle)[:, None].expand_as(t).reshape(-1)
-    height = surface(sea, x[..., :2].reshape(-1, 2), width)[0].view_as(t)
+    height = sea.at(x[..., :2].reshape(-1, 2), width)[0].view_as(t)
     under = x[..., 2] - LEVEL - height <= 0
     expected = t.gather(1, under.int().argmax(1)[:, None])[:, 0]
     assert under.any(1).all()
@@ -114,7 +114,7 @@ def test_from_below_the_same_surface_is_met(find, sea):
     found = find(sea, LEVEL, o, d, ~above(500), angle)
     x = o + found.t[:, None] * d
     width = (LEVEL - o[:, 2]) / d[:, 2] * angle / d[:, 2].abs().sqrt()
-    off = (x[:, 2] - LEVEL - surface(sea, x[:, :2], width)[0]).abs()
+    off = (x[:, 2] - LEVEL - sea.at(x[:, :2], width)[0]).abs()
     assert off.max() < 1e-2 and off.quantile(0.99) < 1e-3
 
 
@@ -174,3 +174,48 @@ def test_descending_rays_reach_the_sea_whatever_its_waves(find):
     found = find(gale, LEVEL, o, d, above(500), torch.full((500,), 1e-3))
     assert torch.isfinite(found.t).all() and (found.t > 0).all()
     assert (found.t > wave_tracing.REACH).any()
+
+
+@dataclasses.dataclass(frozen=True)
+class Hump:
+    """A mound of water h = a exp(-r^2 / 2 s^2), as a modelled surface might have: no waves."""
+
+    a: float = 0.3
+    s: float = 1.0
+    still = False
+
+    def crest(self):
+        return self.a
+
+    def crest_of(self, footprint):
+        return torch.full_like(footprint, self.a)
+
+    def at(self, x, footprint):
+        h = self.a * torch.exp(-x.square().sum(-1) / (2 * self.s**2))
+        return h, -h[:, None] * x / self.s**2, torch.zeros_like(h)
+
+
+def test_any_surface_is_met_where_finely_marched_rays_meet_it():
+    """Also by rays that climb, and from beyond the mound, which hides the water behind it."""
+    o, d = rays(400, seed=5, height=0.9, steepest=0.2)
+    o = o + torch.tensor([-3.0, 0.0, 0.0])
+    d[:, 0] = d[:, 0].abs()
+    d[:100, 2] = 0.05
+    d = torch.nn.functional.normalize(d, dim=-1)
+    hump = Hump()
+    found = first_hits(hump, LEVEL, o, d, above(400), torch.full((400,), 1e-3))
+    t = torch.linspace(0, 40, 40001)
+    expected = torch.full((400,), torch.inf)
+    for r in range(400):
+        x = o[r] + t[:, None] * d[r]
+        under = (x[:, 2] - LEVEL - hump.at(x[:, :2], t)[0] <= 0).nonzero()
+        if len(under):
+            expected[r] = t[under[0, 0]]
+    met = torch.isfinite(expected)
+    plane = (LEVEL - o[:, 2]) / d[:, 2]
+    assert int((met & ((expected - plane).abs() > 0.5)).sum()) > 50, "the mound matters"
+    assert (found.t[met] - expected[met]).abs().max() < 0.02
+    torch.testing.assert_close(
+        found.slope[met], hump.at((o + found.t[:, None] * d)[met, :2], t)[1], atol=1e-5, rtol=0
+    )
+    assert torch.isinf(found.t[~met & (d[:, 2] > 0)]).all()

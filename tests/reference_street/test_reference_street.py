@@ -100,7 +100,6 @@ def test_snow_is_reproducible_by_its_seed(yard):
 
 
 def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path, monkeypatch):
-    from climatenerf.ops.wave_tracing import surface
     from climatenerf.weather.description import read_weather
     from climatenerf.weather.flood.waves import at_time, make_waves
 
@@ -124,7 +123,7 @@ def test_the_wave_mesh_has_the_waves_of_the_program(tmp_path, monkeypatch):
     positions = torch.from_numpy(np.stack([x.ravel(), y.ravel()], -1)).float()
     of_mesh = analytic[80:300, 80:300].reshape(-1, 2)
     for time, same in ((1.0, True), (1.5, False)):
-        found = surface(at_time(waves, time), positions, torch.zeros(len(positions)))[1].numpy()
+        found = at_time(waves, time).at(positions, torch.zeros(len(positions)))[1].numpy()
         error = ((found - of_mesh) ** 2).mean() / (of_mesh**2).mean()
         assert (error < 0.01) == same, (time, error)
     maps = at_time(waves, 1.0)

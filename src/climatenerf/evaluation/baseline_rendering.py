@@ -10,7 +10,6 @@ from jaxtyping import Float, UInt8
 from climatenerf.core.srgb import linear_colour, to_display
 from climatenerf.evaluation import baselines
 from climatenerf.evaluation.baselines import CleanView
-from climatenerf.ops.wave_tracing import surface as wave_surface
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.flood import optics, waves
 from climatenerf.weather.smog import medium as smog
@@ -157,6 +156,6 @@ def _reflection(
     rays_d = torch.from_numpy(view.rays_d.reshape(-1, 3)).float()
     pixel_angle = torch.full_like(length, 1.0 / view.camera.fx)
     footprint = optics.footprint(length, rays_d, pixel_angle)
-    slope = wave_surface(surface, torch.from_numpy(x).float(), footprint)[1]
+    slope = surface.at(torch.from_numpy(x).float(), footprint)[1]
     slope = slope.double().numpy().reshape(*t.shape, 2)
     return baselines.screen_reflection(view, level, weather.flood.ior, slope)

@@ -1,14 +1,16 @@
-"""Rays against a water surface that is a sum of periodic tiles of waves. No gradients.
+"""Rays against a water surface z = level + h(x, y). No gradients.
 
-The surface is z = level + h(x, y). Each tile has maps of its heights and slopes, each filtered to
-ever coarser texels (a mip pyramid), so a lookup at the size of a pixel costs the same at any
-distance. It also says which variance of slopes the filter has removed.
+h is anything that answers `Heights`. Wind waves are `WaveMaps`, a sum of periodic tiles: each has
+maps of its heights and slopes, each filtered to ever coarser texels (a mip pyramid), so a lookup at
+the size of a pixel costs the same at any distance. It also says which variance of slopes the filter
+has removed. Waves have a CPU kernel; any other h is met by tensor operations.
 
 Rays are followed through the layer that holds all crests and troughs, in steps of half a pixel, or
 of a sixty-fourth of the way if that is more. The first crossing is refined by regula falsi.
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -23,6 +25,34 @@ REACH = 50.0  # m through the layer of the waves; beyond, rays meet the mean sur
 NEAR = 3.0  # m; an eye among the waves sees those of this distance sharply
 FLAT = 1e-5  # m; lower waves do not move the surface
 GRAZING = 1e-4  # of a direction's z: pixels on the water stay finite
+
+
+class Heights(Protocol):
+    """Heights h of a water surface over its level, at one moment."""
+
+    @property
+    def still(self) -> bool:
+        """Whether h is 0 everywhere and no slope is filtered out."""
+        ...
+
+    def crest(self) -> float:
+        """No crest is higher and no trough deeper than this, m."""
+        ...
+
+    def crest_of(self, footprint: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Return the same for heights filtered to pixels of a size on the water, m."""
+        ...
+
+    def at(
+        self, x: Float[Tensor, "n 2"], footprint: Float[Tensor, "n"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+        """Return height over the level (m), slope (dz/dx, dz/dy), and removed slope variance.
+
+        Args:
+            x: horizontal world position, m.
+            footprint: size of a pixel on the water, m, >= 0, to which the surface is filtered.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -56,6 +86,42 @@ class WaveMaps:
         """No crest is higher and no trough deeper than this, m."""
         return float(self.highest[:, 0].sum()) if self.start.numel() else 0.0
 
+    @property
+    def still(self) -> bool:
+        """Whether there are no waves."""
+        return not self.start.numel() and self.unresolved == 0
+
+    def crest_of(self, footprint: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Largest height of waves filtered to pixels of a size on the water (m), m."""
+        total = torch.zeros_like(footprint)
+        for k in range(self.start.numel()):
+            level, mix = _level(self, k, footprint)
+            total = total + torch.lerp(self.highest[k][level], self.highest[k][level + 1], mix)
+        return total
+
+    def at(
+        self, x: Float[Tensor, "n 2"], footprint: Float[Tensor, "n"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
+        """Return height over the level (m), slope, and the slope variance the filter removed.
+
+        Args:
+            x: horizontal world position, m.
+            footprint: size of a pixel on the water, m, >= 0.
+        """
+        found = torch.zeros(*footprint.shape, 3, device=x.device, dtype=x.dtype)
+        removed = torch.full_like(footprint, self.unresolved)
+        for k in range(self.start.numel()):
+            level, mix = _level(self, k, footprint)
+            u = x / self.side[k]
+            fine = _bilinear(self, k, u, level)
+            coarse = _bilinear(self, k, u, level + 1)
+            found = found + torch.lerp(fine, coarse, mix[:, None])
+            variance, covariance = self.level_variance[k], self.level_covariance[k]
+            filtered = (1 - mix) ** 2 * variance[level] + mix**2 * variance[level + 1]
+            filtered = filtered + 2 * mix * (1 - mix) * covariance[level]
+            removed = removed + (self.slope_variance[k] - filtered).clamp(min=0)
+        return found[:, 0], found[:, 1:], removed
+
 
 @dataclass(frozen=True)
 class WaveHits:
@@ -70,7 +136,7 @@ class WaveHits:
 
 
 def first_hits(
-    maps: WaveMaps,
+    heights: Heights,
     level: float,
     rays_o: Float[Tensor, "n 3"],
     rays_d: Float[Tensor, "n 3"],
@@ -80,13 +146,16 @@ def first_hits(
     """Find where rays first meet the water.
 
     Args:
-        maps: the waves.
+        heights: of the surface over its level.
         level: height of the mean surface, m.
         rays_o: origins, m.
         rays_d: unit directions.
         below: whether the origins are under water.
         pixel_angle: angle that a pixel spans, rad; waves shorter than the pixel are filtered out.
     """
+    if not isinstance(heights, WaveMaps):
+        return _first_hits(heights, level, rays_o, rays_d, below, pixel_angle)
+    maps = heights
     if dispatch.backend(maps.texels, rays_o, rays_d, pixel_angle) == "cpu":
         from climatenerf.ops.cpu import wave_tracing as kernels
 
@@ -107,7 +176,7 @@ def first_hits(
 
 
 def _first_hits(
-    maps: WaveMaps,
+    heights: Heights,
     level: float,
     rays_o: Tensor,
     rays_d: Tensor,
@@ -119,10 +188,10 @@ def _first_hits(
     over, climb = side * (rays_o[:, 2] - level), side * rays_d[:, 2]
     falls = climb < 0
     flat = torch.where(falls, -over / torch.where(falls, climb, -torch.ones_like(climb)), REACH)
-    among = over.abs() < maps.crest()
+    among = over.abs() < heights.crest()
     distance = torch.where(among, flat.clamp(0, NEAR), flat.clamp_min(0))
     footprint = distance * pixel_angle / rays_d[:, 2].abs().clamp_min(GRAZING).sqrt()
-    crest = _blended(maps, maps.highest, footprint)
+    crest = heights.crest_of(footprint)
     # 1e-9: a level ray leaves the layer nowhere, x/0.
     safe = torch.where(climb.abs() < 1e-9, torch.full_like(climb, 1e-9), climb)
     first, last = (crest - over) / safe, (-crest - over) / safe
@@ -137,7 +206,7 @@ def _first_hits(
 
     def above(t: Tensor) -> Tensor:
         x = rays_o[:, :2] + t[:, None] * rays_d[:, :2]
-        return over + climb * t - side * surface(maps, x, footprint)[0]
+        return over + climb * t - side * heights.at(x, footprint)[0]
 
     low, high = begin.clone(), end.clone()
     f_low = above(begin)
@@ -171,35 +240,10 @@ def _first_hits(
     t = torch.where(level_surface | far, flat, high)
     missed = none | (~level_surface & ~met & ~far)
     x = rays_o[:, :2] + t[:, None] * rays_d[:, :2]
-    _, slope, variance = surface(maps, torch.where(missed[:, None], 0.0, x), footprint)
+    _, slope, variance = heights.at(torch.where(missed[:, None], 0.0, x), footprint)
     return WaveHits(
         torch.where(missed, torch.inf, t), torch.where(missed[:, None], 0.0, slope), variance
     )
-
-
-def surface(
-    maps: WaveMaps, x: Float[Tensor, "n 2"], footprint: Float[Tensor, "n"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return height over the level (m), slope, and the slope variance that the filter removed.
-
-    Args:
-        maps: the waves.
-        x: horizontal world position, m.
-        footprint: size of a pixel on the water, m, >= 0.
-    """
-    found = torch.zeros(*footprint.shape, 3, device=x.device, dtype=x.dtype)
-    removed = torch.full_like(footprint, maps.unresolved)
-    for k in range(maps.start.numel()):
-        level, mix = _level(maps, k, footprint)
-        u = x / maps.side[k]
-        fine = _bilinear(maps, k, u, level)
-        coarse = _bilinear(maps, k, u, level + 1)
-        found = found + torch.lerp(fine, coarse, mix[:, None])
-        variance, covariance = maps.level_variance[k], maps.level_covariance[k]
-        filtered = (1 - mix) ** 2 * variance[level] + mix**2 * variance[level + 1]
-        filtered = filtered + 2 * mix * (1 - mix) * covariance[level]
-        removed = removed + (maps.slope_variance[k] - filtered).clamp(min=0)
-    return found[:, 0], found[:, 1:], removed
 
 
 def _level(
@@ -210,17 +254,6 @@ def _level(
     exact = torch.log2((footprint / texel).clamp(1, 1 << maps.top))
     level = exact.floor().long().clamp(max=maps.top - 1)
     return level, exact - level
-
-
-def _blended(
-    maps: WaveMaps, table: Float[Tensor, "k l"], footprint: Float[Tensor, "n"]
-) -> Float[Tensor, "n"]:
-    """The sum over tiles of a table, between its levels."""
-    total = torch.zeros_like(footprint)
-    for k in range(maps.start.numel()):
-        level, mix = _level(maps, k, footprint)
-        total = total + torch.lerp(table[k][level], table[k][level + 1], mix)
-    return total
 
 
 def _bilinear(

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops.wave_tracing import surface
 from climatenerf.verification.closed_forms import returned_light
 from climatenerf.weather.flood import fresnel, waves
 from climatenerf.weather.flood import optics as water
@@ -288,7 +287,7 @@ def test_white_furnace(below):
     under = torch.full((2000,), below)
     frame = waves.at_time(waves.make_waves(PUDDLE, 0, 64), 0.4)
     x = 10 * torch.rand(2000, 2)
-    _, slope, removed = surface(frame, x, torch.rand(2000))
+    _, slope, removed = frame.at(x, torch.rand(2000))
     _, share = spread_over(d, slope, removed, PUDDLE, under)
     reflectance, reflected = share.sum(1), torch.ones(2000, 3)
     white = torch.tensor([math.pi] * 3)

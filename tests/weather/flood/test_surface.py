@@ -96,3 +96,35 @@ def test_clear_water_is_dark_and_blue_green_and_mud_is_brown():
     muddy = optics.deep_colour(Flood(attenuation=optics.attenuation(Flood(clarity=0.3))))
     assert muddy == pytest.approx(mud, rel=0.05)
     assert optics.deep_colour(Flood(attenuation=(0.0, 0.0, 0.0))) == lake
+
+
+class Hump:
+    """A mound of water h = .3 exp(-r^2 / 2), m, over the level."""
+
+    still = False
+
+    def crest(self):
+        return 0.3
+
+    def crest_of(self, footprint):
+        return torch.full_like(footprint, 0.3)
+
+    def at(self, x, footprint):
+        h = 0.3 * torch.exp(-x.square().sum(-1) / 2)
+        return h, -h[:, None] * x, torch.zeros_like(h)
+
+
+def test_any_water_surface_covers_the_ground_that_it_rises_over():
+    """A mound over a level 10 cm below level ground: a disc of water, its radius in closed form."""
+    flood = Flood(level=-0.1, wind_speed=0.0)
+    water = Water(flood, -0.1, Hump(), torch.full((3,), math.pi))
+    x = torch.linspace(-3, 3, 601)
+    o = torch.stack([x, torch.zeros_like(x), torch.full_like(x, 2.0)], dim=-1)
+    d = torch.tensor([[0.0, 0.0, -1.0]]).expand(len(x), 3).contiguous()
+    ground = AnalyticField([HalfSpace(colour=(0.2,) * 3)])
+    seen = trace(World(ground, surfaces=(water,)), o, d, torch.full((len(x),), 1e-3))
+    radius = math.sqrt(2 * math.log(3))  # .3 exp(-r^2 / 2) = .1
+    wet = seen.layers["mask_water"] > 0.5
+    assert wet.any() and float(x[wet].abs().max()) == pytest.approx(radius, abs=0.02)
+    assert wet[x.abs() < radius - 0.02].all()
+    assert float(seen.depth[300]) == pytest.approx(1.8, abs=0.02), "the eye meets its top"

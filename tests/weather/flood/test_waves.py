@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from climatenerf.ops.wave_tracing import surface
 from climatenerf.weather.flood import spectrum, waves
 from climatenerf.weather.flood.parameters import Flood
 
@@ -231,7 +230,7 @@ def test_seed_reproduces_and_time_animates():
     narrow = torch.full((500,), 0.01)
 
     def slope(seed, time):
-        return surface(waves.at_time(waves.make_waves(STREET, seed, 64), time), x, narrow)[1]
+        return waves.at_time(waves.make_waves(STREET, seed, 64), time).at(x, narrow)[1]
 
     assert torch.equal(slope(5, 1.0), slope(5, 1.0))
     between_seeds = (slope(5, 1.0) - slope(6, 1.0)).pow(2).mean()
@@ -242,7 +241,7 @@ def test_seed_reproduces_and_time_animates():
 
 def test_no_wind_is_perfectly_flat():
     sea = waves.make_waves(Flood(wind_speed=0.0), 0)
-    _, slope, removed = surface(waves.at_time(sea, 3.0), torch.rand(9, 2), torch.full((9,), 0.1))
+    _, slope, removed = waves.at_time(sea, 3.0).at(torch.rand(9, 2), torch.full((9,), 0.1))
     assert not slope.any() and not removed.any()
     assert sea.significant_height == 0
 
@@ -252,8 +251,8 @@ def test_wave_scale_keeps_the_slope():
     large = waves.make_waves(Flood(wave_scale=3.0), 0, 64)
     assert large.significant_height == pytest.approx(3 * small.significant_height)
     x = torch.rand(200, 2)
-    low, a, va = surface(waves.at_time(small, 1.0), x, torch.full((200,), 0.02))
-    high, b, vb = surface(waves.at_time(large, math.sqrt(3)), 3 * x, torch.full((200,), 0.06))
+    low, a, va = waves.at_time(small, 1.0).at(x, torch.full((200,), 0.02))
+    high, b, vb = waves.at_time(large, math.sqrt(3)).at(3 * x, torch.full((200,), 0.06))
     torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
     torch.testing.assert_close(3 * low, high, atol=1e-5, rtol=1e-3)
     torch.testing.assert_close(va, vb, atol=1e-7, rtol=1e-3)
@@ -269,13 +268,13 @@ def test_lookup_is_periodic_and_exact_at_texels():
     rows, columns = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
     x = torch.stack([columns, rows], dim=-1).reshape(-1, 2) * tile.length / 64
     zero = torch.zeros(len(x))
-    height, slope, _ = surface(frame, x, zero)
+    height, slope, _ = frame.at(x, zero)
     torch.testing.assert_close(slope, maps[:, 1:], atol=1e-4, rtol=0)
     torch.testing.assert_close(height, maps[:, 0], atol=1e-6, rtol=0)
     shifted = x + 0.3 + torch.tensor([2.0, -3.0]) * tile.length
     torch.testing.assert_close(
-        surface(frame, x + 0.3, zero)[1],
-        surface(frame, shifted, zero)[1],
+        frame.at(x + 0.3, zero)[1],
+        frame.at(shifted, zero)[1],
         atol=1e-3,
         rtol=0,
     )
@@ -311,7 +310,7 @@ def test_filtering_conserves_slope_variance(flood):
         frame = waves.at_time(sea, 0.5)
         total += sea.unresolved + sum(t.slope_variance for t in sea.tiles)
         for width in sums:
-            _, slope, removed = surface(frame, x, torch.full((len(x),), width))
+            _, slope, removed = frame.at(x, torch.full((len(x),), width))
             assert (removed >= 0).all()
             sums[width] += slope.pow(2).mean().item() + removed.mean().item()
             last = removed.mean().item()
@@ -322,7 +321,7 @@ def test_filtering_conserves_slope_variance(flood):
 def test_removed_variance_grows_with_the_footprint():
     frame = waves.at_time(waves.make_waves(STREET, 0, 64), 0.0)
     width = torch.logspace(-4, 3, 200)
-    _, _, removed = surface(frame, torch.rand(200, 2), width)
+    _, _, removed = frame.at(torch.rand(200, 2), width)
     assert (removed.diff() >= -1e-7).all()
 
 
@@ -334,6 +333,6 @@ def test_slopes_are_finite_over_the_parameter_range(wind, fetch, depth):
     sea = waves.make_waves(flood, 0, 32)
     x = torch.tensor([[0.0, 0.0], [1e5, -1e5], [-1e-9, -0.0]])
     for width in (0.0, 1e-6, 1.0, 1e8):
-        _, slope, removed = surface(waves.at_time(sea, 1e4), x, torch.full((3,), width))
+        _, slope, removed = waves.at_time(sea, 1e4).at(x, torch.full((3,), width))
         assert torch.isfinite(slope).all() and torch.isfinite(removed).all()
         assert (removed >= 0).all()

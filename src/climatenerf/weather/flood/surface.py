@@ -18,8 +18,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.samples import MIN_TAU, MIN_WEIGHT
 from climatenerf.field.compositing import RENDER_STEP, composited
 from climatenerf.field.protocol import device_of, ground_height
-from climatenerf.ops.wave_tracing import WaveMaps, first_hits
-from climatenerf.ops.wave_tracing import surface as wave_surface
+from climatenerf.ops.wave_tracing import Heights, first_hits
 from climatenerf.scene.scene import Scene
 from climatenerf.weather.flood import optics, shore
 from climatenerf.weather.flood.parameters import Flood
@@ -49,7 +48,7 @@ class Water:
     Attributes:
         flood: its parameters.
         level: world height of the surface, m.
-        waves: their heights and slopes at this moment.
+        waves: heights and slopes of the surface over the level at this moment.
         irradiance: on level ground in the open, linear.
         sun_elevation: rad; None: light from an even sky.
         mirror_only: reflectance 1 and no gloss: a check against a mirrored camera.
@@ -58,7 +57,7 @@ class Water:
 
     flood: Flood
     level: float
-    waves: WaveMaps
+    waves: Heights
     irradiance: Float[Tensor, "3"]
     sun_elevation: float | None = None
     mirror_only: bool = False
@@ -88,7 +87,7 @@ class Water:
         over = rays_o[:, 2] - self.level
         if not self.displaced or bool((over.abs() > self.waves.crest()).all()):
             return over < 0
-        return over < wave_surface(self.waves, rays_o[:, :2], torch.zeros_like(over))[0]
+        return over < self.waves.at(rays_o[:, :2], torch.zeros_like(over))[0]
 
     def fraction_behind(
         self,
@@ -161,7 +160,7 @@ class Water:
         depth = torch.where(vertical > 0, vertical, self._terrain_depth(world, x))
         depth = torch.where(torch.isfinite(depth) & ~below, depth, torch.zeros_like(depth))
         footprint = optics.footprint(hits.t, rays_d, hits.pixel_angle)
-        _, slope, _ = wave_surface(self.waves, x[:, :2], footprint)
+        _, slope, _ = self.waves.at(x[:, :2], footprint)
         normal = optics.normal_of(slope)
 
         # --- Reflected rays, traced like any other: one from each part of the pixel ---------------
@@ -219,8 +218,8 @@ class Water:
 
     def reflected_rays(self) -> int:
         """Number of reflected rays for a pixel: one for still water, else one for each part."""
-        still = not self.waves.start.numel() and self.waves.unresolved == 0
-        return 1 if self.mirror_only or (still and self.flood.gloss >= SHARP) else PARTS
+        mirror = self.waves.still and self.flood.gloss >= SHARP
+        return 1 if self.mirror_only or mirror else PARTS
 
     def _on_mean_surface(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """The same places on the surface without waves, where further rays begin."""
