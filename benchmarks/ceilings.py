@@ -34,7 +34,7 @@ from climatenerf.scene import load_scene
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 BLURS = (2.0, 4.0)  # px
 EDGES = (1, 2)  # px from an edge
-LEAST_SNOW = 1e-3  # m of thickness
+MIN_SNOW = 1e-3  # m of thickness
 Picture = Float[np.ndarray, "h w 3"]
 
 
@@ -63,7 +63,7 @@ def snow_ceilings(
     true = [to_linear(case.picture(view.name) / 255.0) for view in reference.truths]
     dry = [np.clip(view.clean, 0, 1).astype(float) for view in reference.truths]
     leaves = [MERGED[view.label] == VEGETATION for view in reference.truths]
-    snowed = [case.layers(view.name)["thickness"] > LEAST_SNOW for view in reference.truths]
+    snowed = [case.layers(view.name)["thickness"] > MIN_SNOW for view in reference.truths]
     gained = gains(reference.truths, true, dry, snowed)
     white = mixture(true, dry, leaves)
 
@@ -99,7 +99,7 @@ def near_edges(view: Truth, case: WeatherTruth, reach: int) -> Bool[np.ndarray, 
     layers = case.layers(view.name)
     depth = np.where(np.isfinite(layers["depth"]), layers["depth"], 1e3)
     edge = ndimage.maximum_filter(depth, 3) > 1.1 * ndimage.minimum_filter(depth, 3) + 0.1
-    for kind in (MERGED[view.label], (layers["thickness"] > LEAST_SNOW).astype(np.uint8)):
+    for kind in (MERGED[view.label], (layers["thickness"] > MIN_SNOW).astype(np.uint8)):
         edge |= ndimage.maximum_filter(kind, 3) != ndimage.minimum_filter(kind, 3)
     return ndimage.binary_dilation(edge, iterations=reach)
 

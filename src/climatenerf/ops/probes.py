@@ -14,7 +14,7 @@ from torch import Tensor
 from climatenerf.ops import dispatch
 
 TERMS = 9
-LEAST = 1e-6  # sum of weights
+MIN_WEIGHT = 1e-6  # sum of weights
 BEHIND = 0.02  # weight of a probe straight behind the surface; one straight before it has 1.02
 
 
@@ -96,6 +96,6 @@ def interpolated(
         for every, counts in enumerate((grid.valid[index], torch.ones_like(grid.valid[index]))):
             total[every] += (counts * weight)[:, None, None] * coefficients[index]
             weights[every] += counts * weight
-    every = (weights[0] <= LEAST).long()  # no probe outside matter counts
+    every = (weights[0] <= MIN_WEIGHT).long()  # no probe outside matter counts
     rows = torch.arange(x.shape[0], device=x.device)
     return total[every, rows] / weights[every, rows][:, None, None]

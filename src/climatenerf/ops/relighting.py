@@ -11,7 +11,7 @@ from torch import Tensor
 
 from climatenerf.ops import dispatch
 
-LEAST_RECEIVED = 1e-9  # irradiance, whose logarithm is taken
+MIN_RECEIVED = 1e-9  # irradiance, whose logarithm is taken
 DARKEST_SENT = 3e-3  # radiosity; the tint of less is noise in a photo of eight bits
 
 
@@ -144,7 +144,7 @@ def expected_fractions(
     total, expected = torch.zeros_like(visibility), sent.new_zeros(len(sent), 2)
     for own, facing, in_shadow, in_sun in choices.tolist():
         prior = in_shadow + (in_sun - in_shadow) * visibility
-        received = brightness_and_tint(shaded + own * sun + facing * beam, LEAST_RECEIVED)
+        received = brightness_and_tint(shaded + own * sun + facing * beam, MIN_RECEIVED)
         off = ((mine - received) / spread).square().sum(-1)
         # 60: exp(-30) is still a number in float32, so that no total is 0.
         likely = prior * torch.exp(-0.5 * off.clamp_max(60.0))

@@ -18,7 +18,7 @@ from climatenerf.weather.light.captured import (
 )
 from climatenerf.weather.light.file import load_light, save_light
 from climatenerf.weather.light.find_light import (
-    LEAST_SUN,
+    MIN_SUN,
     Pairs,
     fit_sky,
     gather_light,
@@ -205,4 +205,4 @@ def test_a_faint_lobe_is_no_sun(elevation, peak, strong):
         np.full(3, 0.8), np.full(3, 0.7), direction(elevation, 20.0), np.radians(22.0),
         np.full(3, peak), np.ones((18, 36)), 0.1,
     )  # fmt: skip
-    assert (glow_share(light) >= LEAST_SUN) is strong
+    assert (glow_share(light) >= MIN_SUN) is strong

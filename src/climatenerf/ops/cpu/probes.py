@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 BEHIND = np.float32(0.02)
-LEAST = np.float32(1e-6)  # sum of weights
+MIN_WEIGHT = np.float32(1e-6)  # sum of weights
 BLOCK = 256  # samples of one thread in turn
 
 
@@ -27,7 +27,7 @@ def irradiance(x, normal, basis, origin, spacing, shape, valid, coefficients, fo
             f0, f1, f2 = np.float32(p0 - c0), np.float32(p1 - c1), np.float32(p2 - c2)
             weights = np.float32(0.0)
             for every in range(2):  # the second time with the probes inside matter
-                if weights > LEAST:
+                if weights > MIN_WEIGHT:
                     break
                 mixed[:] = 0.0
                 weights = np.float32(0.0)

@@ -11,7 +11,7 @@ from climatenerf.ops.recolouring import CONES, HUES, OKLAB, SATURATIONS
 RED, GREEN, BLUE = (np.float32(each) for each in LUMA)
 TO_CONES = np.array(CONES, np.float32)
 TO_OKLAB = np.array(OKLAB, np.float32)
-LEAST = np.float32(1e-6)  # lightness; black has no saturation, 0/0
+MIN_LIGHTNESS = np.float32(1e-6)  # lightness; black has no saturation, 0/0
 UNCHANGED = np.float32(1e-7)  # share of a class below which its colours are not looked up
 
 
@@ -31,7 +31,7 @@ def _green(red, green, blue):
         lightness += TO_OKLAB[0, k] * root
         a += TO_OKLAB[1, k] * root
         b += TO_OKLAB[2, k] * root
-    saturation = math.sqrt(a * a + b * b) / max(lightness, LEAST)
+    saturation = math.sqrt(a * a + b * b) / max(lightness, MIN_LIGHTNESS)
     coloured = _smoothstep(saturation, SATURATIONS[0], SATURATIONS[1])
     if coloured == 0:
         return coloured

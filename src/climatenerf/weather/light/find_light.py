@@ -55,7 +55,7 @@ MAX_ERROR = np.radians(8.0)
 MIN_HALF = 60  # pairs of each half of the photos
 TWO_SUNS, CLEAR_GAIN = np.radians(30.0), 0.03  # of suns that contradict each other
 ALMANAC_ERROR = np.radians(3.0)  # of the sun by date, time and place: north is that of GPS
-LEAST_SUN = 0.15  # light of a sun without sure shadows, or of a lobe, over that of the sky
+MIN_SUN = 0.15  # light of a sun without sure shadows, or of a lobe, over that of the sky
 MIN_SKY, MAX_SKY = 50, 1500  # pixels of the reduced photos that show sky
 MIN_CLIPPED = 0.02  # fraction of the sky that photos show as white, for a lobe
 CLOUDS = 60  # independent patches of the sky that photos show
@@ -541,7 +541,7 @@ def find_light(
     if sun.gain <= MIN_GAIN or sun.error >= MAX_ERROR:
         known = []
     if almanac is not None and almanac[2] > LOWEST_SUN:
-        known.append((almanac, ALMANAC_ERROR, LEAST_SUN * level / almanac[2]))
+        known.append((almanac, ALMANAC_ERROR, MIN_SUN * level / almanac[2]))
     for direction, error, least in known:
         strength = sun_strength(field, pairs, direction, sky)
         if strength.min() > 0 and strength @ LUMA > least:
@@ -553,7 +553,7 @@ def find_light(
         ground = float((pairs.radiance[flat] @ LUMA).mean()) if enough else 0.0
         model = fit_sky(sky_d, seen, ground, lobe=True)
         glowing = _assembled(model, shown, model.width / 3, almanac)
-        if glow_share(glowing) >= LEAST_SUN:
+        if glow_share(glowing) >= MIN_SUN:
             return glowing
     return light
 

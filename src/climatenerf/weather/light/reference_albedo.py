@@ -20,10 +20,10 @@ from climatenerf.core.device import to_numpy
 from climatenerf.ops import relighting
 
 CELL = 2.0  # m, of the grid of means
-MOST_CELLS = 96  # along a side
+MAX_CELLS = 96  # along a side
 BLUR = 2  # passes of a filter over three cells
 SPREAD = (0.45, 0.25)  # first standard deviations of the logs of albedo and of red over blue
-LEAST_SPREAD, MOST_SPREAD = 0.15, 1.0  # of what is measured then
+MIN_SPREAD, MAX_SPREAD = 0.15, 1.0  # of what is measured then
 TRUST = 0.93  # probability that geometry is right
 PARTIAL = 0.06  # probability of a partial shadow
 MISJUDGED = 0.03  # probability that a surface's normal is wrong, and it faces the sun
@@ -108,8 +108,8 @@ def estimate(
 ) -> ReferenceAlbedo:
     """Estimate mean albedos from surface points in photos; see `ReferenceAlbedo.sunlight`."""
     middle = x.median(0).values  # what is far from it gets the values of the grid's border
-    origin = torch.maximum(x.amin(0), middle - CELL * MOST_CELLS / 2)
-    count = ((x.amax(0) - origin) / CELL).ceil().long().clamp(1, MOST_CELLS) + 1
+    origin = torch.maximum(x.amin(0), middle - CELL * MAX_CELLS / 2)
+    count = ((x.amax(0) - origin) / CELL).ceil().long().clamp(1, MAX_CELLS) + 1
     nx, ny, nz = (int(n) for n in to_numpy(count))
     shape = nz, ny, nx
     node = ((x - origin) / CELL).round().long().clamp_min(0)
@@ -122,7 +122,7 @@ def estimate(
     direct, found = visibility[:, None] * sun, None
     for _ in range(ROUNDS):
         received = _luma_red_blue(shaded + direct)
-        albedo = sent - relighting.brightness_and_tint(received, relighting.LEAST_RECEIVED)
+        albedo = sent - relighting.brightness_and_tint(received, relighting.MIN_RECEIVED)
         albedo[:, 0].clamp_(math.log(DARKEST), 0.0)
         grids = [
             torch.stack(
@@ -137,7 +137,7 @@ def estimate(
             if bool((kind == k).any()):
                 # Of a normal distribution, from the median of absolute deviations.
                 measured = 1.4826 * off[kind == k].median(0).values
-                spread[k] = measured.clamp(LEAST_SPREAD, MOST_SPREAD)
+                spread[k] = measured.clamp(MIN_SPREAD, MAX_SPREAD)
     assert found is not None
     return found
 
