@@ -10,7 +10,7 @@ from support.scene_builders import look_at
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.classes import BUILDING, ROAD
-from climatenerf.evaluation.no_reference import no_reference_scores
+from climatenerf.evaluation.no_reference import NAMES, no_reference_scores, no_scores
 from climatenerf.field.analytic import Box, HalfSpace
 from climatenerf.render import ground_evidence
 from climatenerf.render.ground_evidence import terrain_below
@@ -93,6 +93,26 @@ def test_lumps_on_the_ground_worsen_ground_neighbours_and_points(capture, right)
     assert lumpy["neighbours.psnr"] < right["neighbours.psnr"] - 0.3
     assert lumpy["points.abs_rel"] > right["points.abs_rel"] + 0.01
     assert lumpy["floating.components"] == 0
+
+
+def test_missing_ground_worsens_ground_and_neighbours(capture, right):
+    """What no ray meets is taken to be far away, and does not drop out of the score."""
+    bare = scores(capture, LabelledField([WALL], classes=(BUILDING,), box=WIDE))
+    assert bare["neighbours.psnr"] < right["neighbours.psnr"] - 1.0
+    holes = [Box((x, y, -3.0), (x + 0.9, y + 0.9, 0.0)) for x in (-2, -1, 0, 1) for y in range(8)]
+    holed = scores(
+        capture, LabelledField([WALL, *holes], classes=(BUILDING, *[ROAD] * 32), box=WIDE)
+    )
+    assert holed["ground.present"] < 0.98 and right["ground.present"] > 0.99
+
+
+def test_fields_without_matter_say_so(capture):
+    photos = trace_photos(LabelledField([], box=WIDE), capture)
+    found = no_reference_scores(LabelledField([], box=WIDE), capture, photos, None)
+    assert "no ray" in found["score_reasons"]["neighbours.psnr"]
+    assert "hardly any near ground" in found["score_reasons"]["ground.roughness_cm"]
+    assert no_scores("why") == dict.fromkeys(NAMES) | {"score_reasons": dict.fromkeys(NAMES, "why")}
+    assert set(NAMES) | {"score_reasons"} == set(found)
 
 
 def test_matter_in_the_air_floats_unless_it_stands(capture):

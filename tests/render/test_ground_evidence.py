@@ -124,6 +124,16 @@ def test_without_ground_in_sight_there_is_no_terrain():
     assert find_terrain(crowd, scene()) is None
 
 
+def test_a_table_is_no_ground():
+    """A figure on a table: its top is level, but no larger than the cameras are high."""
+
+    def top(half):
+        return LabelledField([Box((-half, -1.0 - half, -9), (half, -1.0 + half, 0))], box=BOX)
+
+    assert find_terrain(top(0.7), scene()) is None
+    assert find_terrain(top(2.5), scene()) is not None
+
+
 @pytest.mark.filterwarnings("error")
 def test_rays_along_an_axis_warn_of_nothing():
     """A level camera has rays with a component of 0, and some of them end in the sky."""

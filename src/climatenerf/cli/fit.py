@@ -127,7 +127,7 @@ def run(options: Fit) -> int:
     if metrics["interrupted"]:
         progress.say(f"Stopped early; resume with: {resuming(options)}")
     progress.result(summary(metrics))
-    for line in (geometry_line(metrics), datum_line(metrics)):
+    for line in (geometry_line(metrics), ground_line(metrics), datum_line(metrics)):
         if line:
             progress.say(line)
     progress.result(f"run: {options.out}")
@@ -334,16 +334,29 @@ def parse_losses(given: tuple[str, ...]) -> dict[str, float]:
 def geometry_line(metrics: dict) -> str:
     """Return one line with the scores that need no reference; "" without any."""
     forms = {
-        "ground.present": "{:.0%} of the ground is there",
+        "ground.present": "the fit holds {:.0%} of the ground",
         "ground.roughness_cm": "its roughness is {:.1f} cm",
         "neighbours.psnr": "neighbouring photos agree to {:.1f} dB",
-        "floating.share": "{:.2%} of the pixels float",
+        "floating.share": "{:.2%} of the pixels show floating matter",
         "sky.empty": "{:.1%} of the sky is empty",
         "points.abs_rel": "depth errs by {:.1%} at points that were withheld",
     }
     known = {name: metrics[name] for name in forms if metrics.get(name) is not None}
     parts = [forms[name].format(value) for name, value in known.items()]
     return f"Geometry: {'; '.join(parts)}" if parts else ""
+
+
+def ground_line(metrics: dict) -> str:
+    """Return one line if no terrain was found; "" if one was, or none was looked for."""
+    from climatenerf.evaluation.no_reference import TOO_LITTLE_GROUND
+
+    reason = (metrics.get("score_reasons") or {}).get("ground.present")
+    if reason != TOO_LITTLE_GROUND:
+        return ""
+    return (
+        f"Ground: not found, since {reason}; water and snow will have holes. Add photos that look"
+        " down at the ground"
+    )
 
 
 def datum_line(metrics: dict) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from climatenerf.core.storage import write_bytes
@@ -118,12 +118,22 @@ def _ground_seen(terrain: Terrain | None, cameras: Float[np.ndarray, "n 2"]) -> 
     """Fraction of the ground near the cameras that photos show; None where there is none."""
     if terrain is None:
         return None
+    near = _near(terrain, cameras) & ~terrain.open
+    return float(terrain.seen[near].mean()) if near.any() else None
+
+
+def _open_ground(terrain: Terrain, cameras: Float[np.ndarray, "n 2"]) -> float:
+    """Fraction of the ground near the cameras that is neither held nor completed."""
+    return float(terrain.open[_near(terrain, cameras)].mean())
+
+
+def _near(terrain: Terrain, cameras: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "rows columns"]:
+    """Nodes within `NEAR` of a camera."""
     xy = terrain.nodes()[..., :2]
     near = np.zeros(xy.shape[:2], bool)
     for camera in cameras:
         near |= np.linalg.norm(xy - camera, axis=-1) < NEAR
-    near &= ~terrain.open
-    return float(terrain.seen[near].mean()) if near.any() else None
+    return near
 
 
 def _chosen(scene: Scene, metrics: Mapping[str, Any]) -> list[View]:
@@ -253,7 +263,7 @@ def _ground(scene: Scene, terrain: Terrain | None, given: Evidence) -> str:
         for colour, text in (
             (SEEN, "seen by photos"),
             (COMPLETED, "completed by the terrain"),
-            (OPEN, "no ground found: things stand there, or it is contradictory"),
+            (OPEN, "no ground found: things stand there, or the photos contradict each other"),
             ((20, 30, 40), "cameras"),
         )
     )
@@ -261,6 +271,10 @@ def _ground(scene: Scene, terrain: Terrain | None, given: Evidence) -> str:
     seen = "not measured" if given.ground_seen is None else percent(given.ground_seen)
     rows = [
         ("ground within 10 m of the cameras that photos show", seen),
+        (
+            "of all ground there, neither held nor completed",
+            percent(_open_ground(terrain, cameras)),
+        ),
         ("median error of its height", f"{100 * float(np.median(terrain.error)):.0f} cm"),
         ("height of the datum", f"{scene.ground_z:.2f} m in the world frame"),
         ("lowest ground near the path", f"{scene.lowest_ground_z - scene.ground_z:.2f} m"),
@@ -299,7 +313,7 @@ def _geometry(metrics: Mapping[str, Any]) -> str:
         value = metrics.get(name)
         shown = reasons.get(name, "not measured") if value is None else text.format(value)
         rows.append((title, shown))
-    return "<h2>Geometry, without a truth</h2>" + _table(rows)
+    return "<h2>Geometry, without ground truth</h2>" + _table(rows)
 
 
 def _light(light: object) -> str:

@@ -28,6 +28,7 @@ from climatenerf.scene.terrain import Terrain, nearest_known
 from climatenerf.scene.terrain_fit import Heights, fit_heights
 
 MIN_GROUND = 200  # ends on the ground, for a terrain
+MIN_HELD = 1.5  # area of ground that the field holds, over the squared height of the cameras
 MAX_NODES = 700  # along the raster's longer side
 STRAY = 0.002  # of the ends, on each side of the ground, that may lie outside of the raster
 MIN_CELL = 0.05  # m
@@ -99,6 +100,9 @@ def terrain_below(field: RadianceField, photos: list[PhotoRays]) -> Terrain | No
     unknown, nothing = np.full(shape, UNKNOWN, np.uint8), np.zeros(shape, bool)
     terrain = Terrain(origin, cell, height, spread, unknown, nothing, nothing)
     seen = _holds_ground(field, terrain)
+    above = float(np.median(eyes[:, 2] - terrain.sample(height, eyes[:, :2])))
+    if seen.sum() * cell**2 < MIN_HELD * above**2:  # what was taken for ground is something else
+        return None
     photographed = _photographed(terrain, photos)
     label = np.where(seen, _classes(terrain, x, label), UNKNOWN).astype(np.uint8)
     opened = ~seen & (photographed | (spread > MAX_ERROR))

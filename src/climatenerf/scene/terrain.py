@@ -21,7 +21,8 @@ from climatenerf.core.errors import UserError, one_line
 from climatenerf.core.storage import write_bytes
 
 FILE_NAME = "terrain.npz"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+REMADE = 1  # files up to this version are of another method, and are made again
 MAX_NODES = 2048  # along a side
 MAX_LENGTH = 1e7  # m from the world's origin
 
@@ -128,16 +129,21 @@ def save_terrain(terrain: Terrain | None, folder: Path, checkpoint: str = "") ->
 def load_terrain(path: Path) -> tuple[Terrain | None, str]:
     """Read a raster, and the identity of the field that it was made from.
 
-    The raster is None if photos showed too little ground for one.
+    The raster is None if photos showed too little ground for one. A file of an earlier method
+    names no field.
 
     Raises:
         UserError: the file is absent, damaged, or of a newer version.
     """
     try:
         found = arrays.read_npz(path)
-        if int(found["schema_version"]) > SCHEMA_VERSION:
-            raise ValueError("a newer version of climatenerf wrote it")
-        checkpoint = str(found["checkpoint"])
+        version = int(found["schema_version"])
+        if version > SCHEMA_VERSION:
+            raise UserError(
+                f"{path} was written by a newer version of climatenerf; update climatenerf, or"
+                " delete the file"
+            )
+        checkpoint = "" if version <= REMADE else str(found["checkpoint"])
         if "height" not in found:
             return None, checkpoint
         terrain = Terrain(

@@ -15,7 +15,7 @@ from climatenerf.core.device import CPU, to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.storage import atomic_path, make_folder, write_json
 from climatenerf.evaluation.heldout import evaluate
-from climatenerf.evaluation.no_reference import no_reference_scores
+from climatenerf.evaluation.no_reference import no_reference_scores, no_scores
 from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.hash_field import Field
 from climatenerf.field.normalisation import find_extent
@@ -197,6 +197,8 @@ def _fit(
     write_json(run / METRICS, metrics)
     if interrupted and heldout_pixels(scene, downscale) > MAX_PIXELS_AFTER_STOP:
         # The user waits for the end, and a resumed fit will be measured.
+        metrics |= no_scores("the fit was interrupted")
+        write_json(run / METRICS, metrics)
         return metrics | {"psnr": None, "ssim": None, "psnr_cc": None}
     metrics |= evaluate(trainer.field, scene, downscale, after_view)
     metrics |= _score_ground(trainer.field, scene, run, traced)
@@ -228,7 +230,7 @@ def _score_ground(
     identity = identity_of(run / FIELD) or ""
     if not field.capabilities & {NORMALS, CLASSES}:
         save_terrain(None, run, identity)
-        return {}
+        return no_scores("the field knows neither normals nor classes")
     photos, terrain = traced or _finish_geometry(field, scene, free_space=False)[1]
     save_terrain(terrain, run, identity)
     return no_reference_scores(field, scene, photos, terrain)

@@ -168,12 +168,32 @@ def labelled(scene, folder, numbers, change=lambda labels, view: labels):
         return change(np.where(z > 4.5, numbers["sky"], name).astype(np.uint8), view)
 
     low = scene.points[:, 2] < 4.4  # the sky has no points
-    views = [replace(v, seen=v.seen[low[v.seen]]) for v in scene.views]
-    return with_files(replace(scene, views=tuple(views)), folder, "label_path", labels, ".png")
+    if scene.views[0].seen is None:
+        scene = replace(scene, points=scene.points[low])
+    else:
+        views = [replace(v, seen=v.seen[low[v.seen]]) for v in scene.views]
+        scene = replace(scene, views=tuple(views))
+    return with_files(scene, folder, "label_path", labels, ".png")
 
 
 def test_right_labels_are_not_odd(scene, tmp_path):
     assert label_findings(labelled(scene, tmp_path, CLASSES)) == []
+
+
+def test_labels_that_are_wrong_in_every_second_photo_are_found(tmp_path):
+    """Walls and ground are exchanged there; a point is both."""
+    scene = textured_scene(tmp_path / "photos", 24, seen=False)
+    assert label_findings(labelled(scene, tmp_path, CLASSES)) == []
+    wrong = {view.name for view in scene.views[::2]}
+
+    def exchanged(labels, view):
+        numbers = np.arange(256, dtype=np.uint8)
+        numbers[[CLASSES["wall"], CLASSES["ground"]]] = CLASSES["ground"], CLASSES["wall"]
+        return numbers[labels] if view.name in wrong else labels
+
+    (finding,) = label_findings(labelled(scene, tmp_path, CLASSES, exchanged))
+    assert finding.code == "labels-disagree"
+    assert "differ from photo to photo" in finding.message
 
 
 def test_labels_upside_down_are_found(scene, tmp_path):

@@ -23,6 +23,7 @@ SEVEN_SKY_POINTS = 0.25  # points on it, over those of its area
 MAX_POINTS = 1000  # of a view whose labels are compared between views
 MIN_PAIRS = 500  # of labels of one point in two views
 MIN_AGREEMENT = 0.5  # beyond chance; right labels of noisy networks have that at least
+LOW_AGREEMENT = 0.35  # beyond chance; lower where labels contradict each other
 BETTER = 0.1  # agreement beyond chance that the labels of other photos must gain
 
 
@@ -93,8 +94,14 @@ def _contradictions(
                 f"The labels call {area:.0%} of the photos a fence, on which hardly any sparse"
                 " point lies, as if they had the numbering seven, in which it is the sky"
             )
-    if _of_other_photos(every, points):
+    agreement = _agreement_by_shift(every, points)
+    if agreement and max(agreement) > max(agreement[0] + BETTER, MIN_AGREEMENT):
         yield "The labels of other photos agree better with each other at the sparse points"
+    elif agreement and agreement[0] < LOW_AGREEMENT:
+        yield (
+            "The labels of one sparse point differ from photo to photo: they agree"
+            f" {max(agreement[0], 0.0):.0%} of the way from chance to always"
+        )
 
 
 def _sky_above_ground(scene: Scene, view: View, labels: UInt8[np.ndarray, "h w"]) -> float | None:
@@ -115,16 +122,17 @@ def _sky_above_ground(scene: Scene, view: View, labels: UInt8[np.ndarray, "h w"]
     return elevation(sky) - elevation(ground)
 
 
-def _of_other_photos(
+def _agreement_by_shift(
     every: Sequence[UInt8[np.ndarray, "h w"]], points: Sequence[Projected]
-) -> bool:
-    """Return whether labels moved by some photos agree better at points than the given ones.
+) -> list[float]:
+    """Return how well labels of one point agree between photos, for every cyclic shift of files.
 
-    Labels of a point in two photos mostly agree, but how much depends on what made them. So the
-    given order of the files is compared with every cyclic shift of it.
+    0 is what chance gives, and 1 agreement everywhere. The first value is that of the given order.
+    Labels of a point in two photos mostly agree, but how much depends on what made them: so the
+    given order is compared with the shifted ones. Empty if too few points are in several photos.
     """
     if len({labels.shape for labels in every}) != 1:
-        return False
+        return []
     most = max(len(each.z) for each in points)
     step = max(1, -(-most // MAX_POINTS))
     at = [_every(each, step) for each in points]
@@ -133,7 +141,7 @@ def _of_other_photos(
     by_point = np.argsort(point, kind="stable")
     pair = point[by_point][1:] == point[by_point][:-1]
     if pair.sum() < MIN_PAIRS:
-        return False
+        return []
     agreement = []
     for shift in range(len(every)):
         moved = [every[(i + shift) % len(every)] for i in range(len(every))]
@@ -142,11 +150,11 @@ def _of_other_photos(
         )[order][by_point]
         known = pair & (found[1:] != UNKNOWN) & (found[:-1] != UNKNOWN)
         if known.sum() < MIN_PAIRS:  # labels of few things alone tell nothing
-            return False
+            return []
         same = float((found[1:] == found[:-1])[known].mean())
         chance = float(((np.bincount(found[1:][known]) / known.sum()) ** 2).sum())
         agreement.append((same - chance) / max(1 - chance, 1e-3))
-    return max(agreement) > max(agreement[0] + BETTER, MIN_AGREEMENT)
+    return agreement
 
 
 def _every(at: Projected, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
