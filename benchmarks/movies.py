@@ -5,10 +5,11 @@ python benchmarks/movies.py RUN -o FOLDER --only overcast snow --level "-1 m" --
 
 FOLDER/NAME has the movie of each weather along the path of the photos, FOLDER/sun that of a sun
 which moves over a still camera. `warp` is the RMS difference of neighbouring frames warped to one
-another by depth, over their contrast, water and sky left out, and `over_clean` its ratio to the
-clean movie's. `step` is the largest change of the mean luma from one frame to the next, relative;
-`jump` the largest change of that change: a sun that moves evenly has a small one, exposure that
-pumps a large one. Finished frames are kept, so a stopped run resumes.
+another by depth, over their contrast, water and sky left out; `difference` is the same in display
+values, and `over_clean` its ratio to the clean movie's. `step` is the largest relative change of
+the mean luma from one frame to the next, and `jump` the largest change of that change: a sun that
+moves evenly has a small one, exposure that pumps a large one. Finished frames are kept, so a
+stopped run resumes.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import climatenerf
 from climatenerf.api import Run
 from climatenerf.cli.render import parse_size
 from climatenerf.core.srgb import LUMA
-from climatenerf.evaluation.consistency import Frame, warp_error
+from climatenerf.evaluation.consistency import Frame, warp_difference, warp_error
 from climatenerf.paths.camera_path import camera_path
 from climatenerf.weather.description import read_weather, weather_from_table
 
@@ -89,10 +90,12 @@ def steadiness(folder: Path, run: Run, size: tuple[int, int]) -> dict[str, float
         flooded = (folder / "mask_water").is_dir()
         water = layer(folder, "mask_water", index) > 0.5 if flooded else np.zeros_like(depth, bool)
         frames.append(Frame(picture, depth, water, path.c2w[index], path.cameras[index]))
-    errors = [warp_error(a, b) for a, b in zip(frames, frames[1:], strict=False)]
-    return {"warp": float(np.nanmean(errors)), "worst": float(np.nanmax(errors))} | luma_changes(
-        shown
-    )
+    pairs = list(zip(frames, frames[1:], strict=False))
+    found = {
+        "warp": float(np.nanmean([warp_error(*pair) for pair in pairs])),
+        "difference": float(np.nanmean([warp_difference(*pair) for pair in pairs])),
+    }
+    return found | luma_changes(shown)
 
 
 def main() -> None:
@@ -118,7 +121,8 @@ def main() -> None:
         weather = weather_from_table(table)
         climatenerf.render_movie(run, folder, weather, frames=FRAMES, size=size, layers=layers)
         results[name] = steadiness(folder, run, size)
-        results[name]["over_clean"] = results[name]["warp"] / results["clean"]["warp"]
+        ratio = results[name]["difference"] / results["clean"]["difference"]
+        results[name]["over_clean"] = ratio
     if not options.only or "sun" in options.only:
         folder = options.out / "sun"
         file = options.out / "sun.toml"
