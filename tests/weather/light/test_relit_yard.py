@@ -15,6 +15,7 @@ from support.sunlit_yard import (
     yard_scene,
 )
 
+from climatenerf.core.colour import luma
 from climatenerf.core.errors import UserError
 from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.session import RenderSession
@@ -115,6 +116,19 @@ def test_a_new_sun_casts_the_shadow_elsewhere():
     colour = world.field.colour(x, DOWN.expand_as(x))[:, 0]
     assert lit.any() and (~lit).any()
     assert float(colour[lit].median()) > 1.8 * float(colour[~lit].median())
+
+
+def test_what_photos_show_is_as_bright_under_another_sky(overcast):
+    """By luma over all their pixels; a mean over other places would flicker with a moving sun."""
+    ends = [(each.x, each.d, each.t) for each in trace_photos(sunlit_yard(), yard_scene())]
+    seen = [np.isfinite(t) for _, _, t in ends]
+    x, d = (
+        torch.tensor(np.concatenate([each[k][i] for each, i in zip(ends, seen, strict=True)]))
+        for k in (0, 1)
+    )
+    world = overcast.world(0.0)
+    before, after = (f.colour(x.float(), d.float()) for f in (sunlit_yard(), world.field))
+    assert float(luma(after).mean() / luma(before).mean()) == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.slow

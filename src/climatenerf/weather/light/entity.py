@@ -52,6 +52,7 @@ from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Preparation, World
 
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
+EXPOSED = 3  # of what photos show, one pixel in so many counts for the exposure
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
 
@@ -135,22 +136,27 @@ class LightEntity:
             self._lights = {key: replace(light, captured=captured)}
         return self._lights[key]
 
+    @functools.cached_property
+    def _shown(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What photos show: radiance, positions, normals and classes where their rays end."""
+        field, given = self._given.field, self._given
+        assert given.photo_rays is not None, "the light of the photos was found in them"
+        parts = []
+        for photo in given.photo_rays():
+            ends = np.isfinite(photo.t)
+            parts.append([photo.x[ends], photo.d[ends]])
+        x, d = (
+            to_device(np.concatenate(each).astype(np.float32), device_of(field))
+            for each in zip(*parts, strict=True)
+        )
+        return field.colour(x, d, appearance=given.appearance), x, *normals_at(field, x, d)
+
     def _albedo(self, old: SceneLight) -> ReferenceAlbedo | None:
         """The usual albedo of surfaces, where photos have a sun that casts shadows."""
         if old.sun is None or self._given.photo_rays is None:
             return None
         if self._reference is None or self._reference[0] is not old:
-            field, photos = self._given.field, self._given.photo_rays()
-            parts = []
-            for photo in photos:
-                ends = np.isfinite(photo.t)
-                parts.append([photo.x[ends], photo.d[ends]])
-            x, d = (
-                to_device(np.concatenate(each).astype(np.float32), device_of(field))
-                for each in zip(*parts, strict=True)
-            )
-            radiance = field.colour(x, d, appearance=self._given.appearance)
-            normal, kind = normals_at(field, x, d)
+            radiance, x, normal, kind = self._shown
             (shaded,) = SceneLight.shaded((old,), x, normal)
             sun, lit = old.full_sun(normal), old.visibility(x, normal)
             beam = old.sun_irradiance
@@ -275,13 +281,12 @@ class LightEntity:
                 elevation = elevation_azimuth(captured.sun)[0]
             klx = skies.daylight(elevation, captured.hard)
             return float(luma(old.open_irradiance())) / klx
-        # Surfaces stay as bright as photos show them: on average over what the probes see.
-        x, normal = self._gathered.x.reshape(-1, 3), self._gathered.normal.reshape(-1, 3)
-        hit = (normal != 0).any(-1).nonzero()[:, 0][::7]
-        radiance = self._gathered.radiance.reshape(-1, 3)[hit]
-        ratio = new.irradiance(x[hit], normal[hit]) / old.irradiance(x[hit], normal[hit])
-        change = luma(radiance).sum() / luma(radiance * ratio).sum().clamp_min(1e-6)
-        return gain * float(change)
+        # What photos show stays as bright, on average.
+        radiance, x, normal, kind = (each[::EXPOSED] for each in self._shown)
+        shown = RelitField(self._given.field, old, new, True, 1.0, self._albedo(old))
+        shining = radiance * shown.ratio(radiance, x, normal, kind)
+        # 1e-6: black photos, 0/0.
+        return gain * float(luma(radiance).sum() / luma(shining).sum().clamp_min(1e-6))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a sun that does not belong to its sky.
