@@ -1,4 +1,4 @@
-"""Time a frame: clean, with water on about 40 % of it, in smog, under snow.
+"""Time a frame: clean, with water on about 40 % of it, with high waves, in smog, under snow.
 
 python benchmarks/frame_time.py RUN
 python benchmarks/frame_time.py RUN --size 480x270 --path still --repeats 5
@@ -12,6 +12,7 @@ With --sizes a clean frame of each size is timed, and the exponent of seconds ov
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,9 @@ from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import World
 
+# The waves of the reference street's flood-waves.
+WAVES = Flood(wind_speed=3.0, wave_scale=4.0, attenuation=(1.2, 1.2, 1.2), colour=(0.0, 0.0, 0.0))
+
 
 def water_level(field, scene, path: CameraPath, coverage: float = 0.4) -> float:
     """Return the level above the datum (m) at which water covers about `coverage` of the frame."""
@@ -45,7 +49,7 @@ def water_level(field, scene, path: CameraPath, coverage: float = 0.4) -> float:
     return float(min(np.quantile(height, coverage), eye - 0.05)) - scene.ground_z
 
 
-WEATHERS = ("clean", "flood", "smog", "snow")
+WEATHERS = ("clean", "flood", "flood-waves", "smog", "snow")
 
 
 def frames(
@@ -64,6 +68,7 @@ def frames(
     weathers = {
         "clean": Weather(),
         "flood": Weather(flood=Flood(level=level), seed=seed),
+        "flood-waves": Weather(flood=replace(WAVES, level=level), seed=seed),
         "smog": Weather(smog=Smog(visibility=100.0)),
         "snow": Weather(snow=Snow(depth=0.1), seed=seed),
     }
