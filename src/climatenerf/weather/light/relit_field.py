@@ -6,15 +6,21 @@ albedo. It is wrong for what is glossy, and for what photos clip.
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.core.classes import SOLID_OF, VEGETATION
 from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.normals import normals_at
 from climatenerf.field.wrapped import RecolouredField
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
 from climatenerf.weather.light.scene_light import MOST, SceneLight
 
+LEAVES = int(SOLID_OF[VEGETATION])
+HORIZON = -0.05  # sine of the elevation above which a ray may have sky behind it
+DARK = 0.02  # radiance; less is no sky by day
+LIKE_SKY = 0.4  # of the logarithms of a colour over the sky's
 SHARED = 0.4  # m along a ray, within which samples share the change of their light
 
 
@@ -50,8 +56,27 @@ class RelitField(RecolouredField):
             return colour * self.ratio(colour, x, *normals_at(self.field, x, d))
         middle, group = shared_lookups(x, d, ray, SHARED)
         place, along = x[middle], d[ray[middle]]
-        ratio = self.ratio(colour[middle], place, *normals_at(self.field, place, along))
-        return colour * ratio[group]
+        normal, kind = normals_at(self.field, place, along)
+        ratio = self.ratio(colour[middle], place, normal, kind)
+        relit = colour * ratio[group]
+        if not self.new_sky:
+            return relit
+        leaves = ((kind == LEAVES)[group] & (d[ray, 2] > HORIZON)).nonzero()[:, 0]
+        return relit.index_copy(
+            0, leaves, self._under_new_sky(relit[leaves], colour[leaves], d[ray[leaves]])
+        )
+
+    def _under_new_sky(
+        self, relit: Float[Tensor, "s 3"], colour: Float[Tensor, "s 3"], d: Float[Tensor, "s 3"]
+    ) -> Float[Tensor, "s 3"]:
+        """Show the new sky where leaves have the colour of the old one behind them.
+
+        A fit puts haze of the sky's colour around twigs that are finer than a pixel.
+        """
+        old = self.old.radiance(d).clamp(DARK, 1.0)  # photos show no more than white
+        off = (colour.clamp(DARK, 1.0) / old).log().square().sum(-1)
+        like = torch.exp(-off / (2 * LIKE_SKY**2))[:, None]
+        return relit + like * (self.new.radiance(d) - relit)
 
     def ratio(
         self,
