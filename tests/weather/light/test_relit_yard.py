@@ -15,8 +15,10 @@ from support.sunlit_yard import (
     yard_scene,
 )
 
+from climatenerf.core.classes import BUILDING, SOLID, SOLID_OF, VEGETATION
 from climatenerf.core.colour import luma
 from climatenerf.core.errors import UserError
+from climatenerf.field.wrapped import WrappedField
 from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.session import RenderSession
 from climatenerf.weather.description import weather_from_table
@@ -104,6 +106,42 @@ def test_lit_ground_with_a_wrong_normal_does_not_turn_black(overcast):
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(2, 3)
     right, wrong = (field.ratio(radiance, x, normal, kind) for normal in (up, -up))
     torch.testing.assert_close(wrong, right, rtol=0.35, atol=0.0)
+
+
+class OfOneClass(WrappedField):
+    """A field whose matter is all of one class, with level surfaces."""
+
+    kind = VEGETATION
+
+    def surface_heads(self, rays_o, rays_d, samples, selected):
+        up = torch.tensor([[0.0, 0.0, 1.0]]).expand(len(selected), 3)
+        logits = torch.zeros(len(selected), len(SOLID))
+        logits[:, SOLID_OF[self.kind]] = 9.0
+        return up, logits
+
+
+class OfWalls(OfOneClass):
+    kind = BUILDING
+
+
+def test_haze_of_the_old_sky_around_leaves_shows_the_new_sky(overcast):
+    """Leaves of their own colour, walls as white as the sky, and what is seen from above stay."""
+    relit = overcast.world(0.0).field
+    d = torch.nn.functional.normalize(torch.tensor([[1.0, 0.0, 0.3], [1.0, 0.0, -0.5]]), dim=-1)
+    sky = relit.old.radiance(d[:1]).clamp(max=1.0)
+    green = torch.tensor([[0.04, 0.09, 0.02]])
+    x = torch.tensor([[-6.0, -5.0, 2.0]]).expand(3, 3) + torch.arange(3)[:, None]
+    colour, ray = torch.cat([sky, green, sky]), torch.tensor([0, 0, 1])
+
+    def shown(kind, new_sky=True):
+        field = replace(relit, field=kind(relit.field), new_sky=new_sky)
+        return field.recoloured(colour, x, d, ray)
+
+    leaves, same_light = shown(OfOneClass), shown(OfOneClass, new_sky=False)
+    torch.testing.assert_close(leaves[0], relit.new.radiance(d[:1])[0], rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(leaves[1:], same_light[1:], rtol=1e-3, atol=1e-4)
+    assert (leaves[0] - same_light[0]).abs().max() > 0.02
+    assert torch.equal(shown(OfWalls), shown(OfWalls, new_sky=False))
 
 
 @pytest.mark.slow
