@@ -23,7 +23,12 @@ def test_a_sweep_of_a_run_writes_its_strip_and_says_its_responses(run_folder, tm
     pictures = [(out / value["picture"]).read_bytes() for value in sweep["values"]]
     assert pictures[0] == pictures[2] != pictures[1]
     refused = error_message(capsys, "evaluate", run_folder, "--sweep", values, "-o", run_folder)
-    assert "is the folder of the run" in refused
+    assert "is the folder of a run" in refused
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "field.safetensors").touch()
+    other = tmp_path / "other"
+    refused = error_message(capsys, "evaluate", run_folder, "--sweep", values, "-o", other)
+    assert "is the folder of a run" in refused
 
 
 def test_the_rows_of_the_paper_have_weathers_of_their_own(tmp_path, capsys):

@@ -153,11 +153,15 @@ def test_only_strict_steps_in_one_direction_are_monotone():
 
 
 def write(out, texts, root):
+    return list(start(out, texts, root))
+
+
+def start(out, texts, root):
     sweeps = tuple(read(text) for text in texts)
     kind, files = s.kind_of(sweeps), s.sweep_files(sweeps)
     earlier = check_folder(out, s.INDEX, kind, files)
     shot = yard_shot(root, sweeps[0].weathers[0])
-    return list(s.write_sweeps(sweeps, shot, out, {"run": "toy"}, lambda value: None, earlier))
+    return s.write_sweeps(sweeps, shot, out, {"run": "toy"}, lambda value: None, earlier)
 
 
 def test_a_sweep_writes_a_strip_pictures_and_an_index(tmp_path):
@@ -188,6 +192,9 @@ def test_a_shorter_sweep_removes_what_it_leaves_over_and_no_other_file(tmp_path)
     write(out, ["flood.level=10 cm,30 cm"], tmp_path)
     assert (out / "flood.level-02.png").exists() and not (out / "flood.level-03.png").exists()
     assert (out / "mine.png").read_bytes() == b"mine"
+    next(start(out, ["flood.level=20 cm,40 cm"], tmp_path))
+    # Interrupted: nothing of the earlier study is left among the new pictures.
+    assert not (out / "sweep.jpg").exists() and (out / "flood.level.jpg").exists()
     with pytest.raises(UserError, match="of another study"):
         write(out, ["smog.visibility=20 m,50 m"], tmp_path)
 

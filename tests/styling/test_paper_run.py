@@ -152,7 +152,7 @@ def session_of(run, appearance=None):
 def test_colours_approach_the_pictures(run, red, tmp_path, capsys):
     assert paper(run, tmp_path / "out", "--pictures", red) == 0
     err = capsys.readouterr().err
-    assert "views that teach:" in err and "other views:" in err
+    assert "training views:" in err and "other views:" in err
     old, new = load_run(run), load_run(tmp_path / "out")
     view = old.scene.views[1]
     picture = [

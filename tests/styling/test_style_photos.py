@@ -9,8 +9,14 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.srgb import LUMA, to_linear
 from climatenerf.styling.colour_map import colour_map, photo_style
 from climatenerf.styling.measure import palette_of, season_of_photos
-from climatenerf.styling.style_photos import StylePhotos, parse_region, read_style_photos
+from climatenerf.styling.style_photos import (
+    StylePhotos,
+    licence_beside,
+    parse_region,
+    read_style_photos,
+)
 from climatenerf.weather.season.palettes import read_palettes
+from climatenerf.weather.style import Source
 
 RNG = np.random.default_rng(0)
 LEAVES = RNG.uniform(0.0, 1.0, (4000, 3)) ** 2 * [0.5, 0.8, 0.2]
@@ -160,6 +166,22 @@ def test_wrong_regions_are_refused(text):
 
 
 # --- measured season files ------------------------------------------------------------------------
+
+
+def test_a_long_licence_ends_with_a_sentence(tmp_path):
+    path = photo(tmp_path / "a.png")
+    sentence = "Photo by somebody, https://creativecommons.org/licenses/by-sa/4.0/deed.en. "
+    (tmp_path / "LICENSE").write_text(8 * sentence)
+    assert licence_beside(path) == (8 * sentence).strip()
+    (tmp_path / "LICENSE").write_text(90 * sentence)
+    found = licence_beside(path)
+    assert len(found) <= 2000 and found.endswith("deed.en.")
+
+
+def test_a_measured_season_names_the_licence_of_its_photos():
+    source = Source("a.png", "00", "CC BY-SA 4.0, by somebody.")
+    tables = season_of_photos(StylePhotos({VEGETATION: LEAVES}, (source,)))
+    assert tables["note"].endswith("CC BY-SA 4.0, by somebody.")
 
 
 def test_a_palette_holds_the_colours_that_leaves_have_at_any_brightness():

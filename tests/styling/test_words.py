@@ -56,6 +56,8 @@ def test_colours_joined_by_and_are_one_palette():
         ("winter autumn", {"autumn"}),
         ("winter, not red leaves", {"not", "red", "leaves"}),
         ("brown lawn and dark", {"dark"}),
+        ("dark grey sky", {"dark"}),  # its brightness is that of the light
+        ("very slightly autumn", {"very"}),
     ],
 )
 def test_every_word_without_effect_is_named(text, unknown):

@@ -82,7 +82,7 @@ class Fit:
     capture's depth_relative files, else its depth files; none ignores both."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed, in larger
-    steps; the present GPU kernels were tested without a GPU."""
+    steps; the current GPU kernels were tested without a GPU."""
     seed: int = 0
     """Random seed."""
 

@@ -70,7 +70,7 @@ class Render:
     join: bool = False
     """Render nothing; assemble movie.mp4 and movie.json from finished frames."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the present
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the current
     GPU kernels were tested without a GPU."""
     seed: int = 0
     """Random seed of waves and snowfall."""
@@ -203,8 +203,8 @@ def check_out(out: Path, run: Path, scene: Scene) -> None:
         UserError: they would, and a later reading of that folder would take them for its own.
     """
     folder = os.path.realpath(out)
-    if folder == os.path.realpath(run):
-        raise UserError(f"-o {out} is the folder of the run; name another, such as {out / 'movie'}")
+    if folder == os.path.realpath(run) or (out / "field.safetensors").exists():
+        raise UserError(f"-o {out} is the folder of a run; name another, such as {out / 'movie'}")
     if folder in {os.path.realpath(view.path.parent) for view in scene.views}:
         raise UserError(
             f"-o {out} holds photos of the capture, among which frames would later be taken for"

@@ -31,8 +31,8 @@ class Make:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder to write into."""
     votes: int = 72
-    """Pairs that each participant judges, at most. Three hidden repeats and two catch pairs come on
-    top."""
+    """Pairs that each participant judges, at most. Three hidden repeats and two catch pairs are
+    added."""
     without: tuple[str, ...] = ()
     """Methods to leave out, such as frame-noise."""
     seed: int = 0

@@ -66,11 +66,11 @@ class Stylize:
     steps: int = 400
     """Steps of the paper's way; 150 show the look."""
     views: int = 40
-    """The most views that teach."""
+    """The most training views that are used."""
     width: int = 480
     """The most pixels across of the pictures that teach."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the present
+    """Where to compute. cuda: an NVIDIA GPU under Linux, with a C compiler installed; the current
     GPU kernels were tested without a GPU."""
 
 
@@ -193,7 +193,7 @@ def fine_tune(options: Stylize, folder: Path, out: Path) -> int:
     first, last = scores[0], scores[-1]
     if last.step < options.steps:
         progress.say(f"ended after {last.step} steps: other views improved no more")
-    progress.say(f"views that teach: {first.taught:.1f} dB before, {last.taught:.1f} dB after")
+    progress.say(f"training views: {first.taught:.1f} dB before, {last.taught:.1f} dB after")
     if not math.isnan(last.others):  # too few views to set one apart
         progress.say(f"other views: {first.others:.1f} dB before, {last.others:.1f} dB after")
     progress.result(f"run: {out}")

@@ -344,14 +344,16 @@ def write_sweeps(
         out: an existing folder, locked and checked.
         about: what was rendered, for the index.
         progress: called with each parameter and value.
-        earlier: files of an earlier study in the folder, which are removed if they have no
-            successor.
+        earlier: files of an earlier study in the folder, which are removed before the first new
+            one.
     """
     session = shot.session(sweeps[0].weathers[0])
     done: list[Swept] = []
     kind, files = kind_of(sweeps), sweep_files(sweeps)
     for sweep in sweeps:
         swept = render_sweep(sweep, shot, session, progress)
+        if not done:  # strips of another size or view must not stay among the new ones
+            remove_left_over(out, earlier - {INDEX}, ())
         done.append(swept)
         # Before the pictures: by the index they are known as those of a study.
         write_json(out / INDEX, _index(done, about, kind, files, session.effects))
@@ -367,7 +369,6 @@ def write_sweeps(
         for each in done
     ]
     write_jpeg(out / SHEET, contact_sheet(rows, cell_width=SMALL_CELL), MAX_SHEET)
-    remove_left_over(out, earlier, files)
 
 
 def _index(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from climatenerf.core.classes import CLASS_NAMES, SKY, SOLID
 from climatenerf.core.srgb import LUMA
-from climatenerf.styling.style_photos import StylePhotos, is_shown
+from climatenerf.styling.style_photos import MIN_PIXELS, StylePhotos, is_shown
 from climatenerf.weather.style import ClassStyle, SkyPalette, Style
 
 FLOOR = 1e-5  # added to the moments' diagonal: a class without blue has a singular matrix
@@ -83,7 +83,8 @@ def photo_style(
         if not len(own):
             continue
         if not is_shown(new):
-            notes.append(f"{CLASS_NAMES[kind]} stays: the style photos do not show it")
+            how = f"show fewer than {MIN_PIXELS} pixels of it" if len(new) else "do not show it"
+            notes.append(f"{CLASS_NAMES[kind]} stays: the style photos {how}")
             continue
         ratio = (len(own) / here) / (len(new) / there)
         if not 1 / MAX_RATIO < ratio < MAX_RATIO:

@@ -52,7 +52,9 @@ def season_of_photos(photos: StylePhotos) -> dict[str, Any]:
         tables["sky"] = {
             "colour": colour.round(3).tolist(), "gradient": 0.0, "share": SKY_SHARE,
         }  # fmt: skip
-    return {"note": "Measured from photos; brightness 1 keeps the luminance.", **tables}
+    licences = sorted({source.licence for source in photos.sources} - {""})
+    note = " ".join(["Measured from photos; brightness 1 keeps the luminance.", *licences])
+    return {"note": note, **tables}
 
 
 def palette_of(colours: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 3"]:

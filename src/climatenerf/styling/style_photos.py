@@ -27,7 +27,7 @@ from climatenerf.scene.images import read_labels, read_rgb
 from climatenerf.weather.style import Source
 
 MAX_PIXELS = 40_000  # of one photo that are used
-MAX_LICENCE = 400  # characters
+MAX_LICENCE = 2000  # characters
 MIN_SPREAD = 1e-3  # of linear values; below it a photo has one colour
 DARK = 1e-3  # mean linear value of a black photo
 
@@ -212,7 +212,10 @@ def licence_beside(path: Path) -> str:
         for name in ("LICENSE.md", "LICENSE.txt", "LICENSE", "LICENCE.md", "LICENCE.txt"):
             if (folder / name).is_file():
                 text = (folder / name).read_text("utf-8", errors="replace")[: 4 * MAX_LICENCE]
-                return " ".join(text.split())[:MAX_LICENCE]
+                words = " ".join(text.split())
+                # A long text ends with a sentence, so that no address is cut.
+                end = words.rfind(". ", 0, MAX_LICENCE) + 1
+                return words if len(words) <= MAX_LICENCE else words[: end or MAX_LICENCE]
     return ""
 
 

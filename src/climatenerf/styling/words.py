@@ -81,6 +81,11 @@ def read_text(text: str) -> Reading:
         seasons = [word for word in known if word in SEASONS]
         unknown += [word for word in words if word not in known and word not in FILLERS]
         unknown += [word for word in seasons[1:] if SEASONS[word] != SEASONS[seasons[0]]]
+        idle = [word for word in known if word in WEAKER | STRONGER][:-1]  # the last one counts
+        if parts.keys() == {"sky"}:  # its brightness is that of the light
+            idle += [word for word in known if word in DARKER or word in BRIGHTER]
+        unknown += idle
+        known = [word for word in known if word not in idle]
         palettes = replace(palettes, **parts)
         understood.append(f'"{" ".join(known)}" changes {", ".join(parts)}')
     if not understood:

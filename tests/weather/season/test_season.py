@@ -137,7 +137,10 @@ share = 0.5
     ("text", "named"),
     [
         ("[leaves]\npalette = []", "'leaves'"),
-        (GOOD.replace("share = 0.5", ""), "exactly"),
+        (GOOD.replace("share = 0.5", ""), "share is missing"),
+        (GOOD.replace("share = 0.5", "share = 0.5\nfoo = 1"), "'foo' is unknown"),
+        ("", "changes nothing"),
+        ('note = "bare"', "changes nothing"),
         (GOOD.replace("0.5", "1.5"), "share .* from 0 to 1"),
         (GOOD.replace("[1.0, 1.0, 1.0]", "[1.0, 1.0]"), "three numbers"),
         (GOOD.replace("[1.0, 1.0, 1.0]", "[0, 0, 0]"), "not be black"),

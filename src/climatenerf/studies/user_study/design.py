@@ -49,7 +49,7 @@ class Study:
     """Number of pictures and movies without a counterpart."""
     seed: int
     votes: int
-    """Pairs that a participant judges; hidden repeats and catch pairs come on top."""
+    """Pairs that a participant judges; hidden repeats and catch pairs are added."""
 
     def votes_by_comparison(self) -> dict[tuple[str, str, str], float]:
         """Return each comparison's votes by one participant, on average."""

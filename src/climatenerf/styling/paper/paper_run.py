@@ -107,7 +107,7 @@ def write_fine_tuned_run(
         make_folder(unfinished)
         lesson, others = _lessons(field, teacher, shots, unfinished, progress)
         if not len(lesson.rays):
-            raise UserError("the views that teach show nothing but sky; give more with --views")
+            raise UserError("the training views show nothing but sky; give more with --views")
         tuned = FineTuning(field.recolourable(), settings.steps, settings.seed)
         _restore(tuned, unfinished / STATE)
 

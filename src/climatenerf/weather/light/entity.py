@@ -53,6 +53,7 @@ from climatenerf.weather.world import Preparation, World
 
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
 EXPOSED = 3  # of what photos show, one pixel in so many counts for the exposure
+DARKEST = 1e-3  # luminance whose logarithm is taken
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
 
@@ -281,12 +282,13 @@ class LightEntity:
                 elevation = elevation_azimuth(captured.sun)[0]
             klx = skies.daylight(elevation, captured.hard)
             return float(luma(old.open_irradiance())) / klx
-        # What photos show stays as bright, on average.
+        # What photos show keeps its log-average luminance, as photographers expose (Reinhard et al.
+        # 2002, Eq. 1): unlike the mean it does not follow a few places in the sun.
         radiance, x, normal, kind = (each[::EXPOSED] for each in self._shown)
         shown = RelitField(self._given.field, old, new, True, 1.0, self._albedo(old))
         shining = radiance * shown.ratio(radiance, x, normal, kind)
-        # 1e-6: black photos, 0/0.
-        return gain * float(luma(radiance).sum() / luma(shining).sum().clamp_min(1e-6))
+        before, after = (luma(each).clamp_min(DARKEST).log().mean() for each in (radiance, shining))
+        return gain * math.exp(float(before - after))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a sun that does not belong to its sky.

@@ -76,6 +76,8 @@ def read_palettes(table: dict[str, Any], where: str) -> Palettes:
     note = table.get("note", "")
     if not isinstance(note, str):
         raise UserError(f"the note of {where} must be a text")
+    if not set(table) & set(known):
+        raise UserError(f"{where} changes nothing; give it a table, such as [vegetation]")
     parts = {name: _section(table[name], kind, f"[{name}] of {where}")
              for name, kind in known.items() if name in table}  # fmt: skip
     return Palettes(note=note, **parts)
@@ -131,8 +133,12 @@ def kept_differences(mean: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def _section(table: Any, kind: type, where: str) -> Any:
     names = {item.name for item in fields(kind)}
     if not isinstance(table, dict) or set(table) != names:
-        given = sorted(table) if isinstance(table, dict) else table
-        raise UserError(f"{where} must have exactly {', '.join(sorted(names))}; it has {given}")
+        given = set(table) if isinstance(table, dict) else set()
+        odd = [f"{name!r} is unknown" for name in sorted(given - names)]
+        odd += [f"{name} is missing" for name in sorted(names - given)]
+        raise UserError(
+            f"{where} must have exactly {', '.join(sorted(names))}; {', '.join(odd[:3])}"
+        )
     values: dict[str, Any] = {}
     for name, value in table.items():
         if name == "colour":
