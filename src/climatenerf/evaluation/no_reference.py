@@ -197,7 +197,7 @@ def _neighbours(
         apart = np.flatnonzero(distance > 1e-6)  # a photo from the same spot shows nothing
         if not len(apart) or not near.size:
             continue
-        wanted = BASELINE * float(np.median(near))
+        wanted = max(BASELINE * float(np.median(near)), 1e-6)  # matter at the eye: log 0
         j = int(apart[np.abs(np.log(distance[apart] / wanted)).argmin()])
         mine, other = (_colours(photos[k], scene) for k in (i, j))
         x = np.where(

@@ -193,6 +193,8 @@ def test_labels_that_are_wrong_in_every_second_photo_are_found(tmp_path):
 
     (finding,) = label_findings(labelled(scene, tmp_path, CLASSES, exchanged))
     assert finding.code == "labels-disagree"
+    of_one_class = labelled(scene, tmp_path, CLASSES, lambda labels, view: 0 * labels)
+    assert label_findings(of_one_class) == []
     assert "differ from photo to photo" in finding.message
 
 

@@ -23,6 +23,7 @@ SEVEN_SKY_POINTS = 0.25  # points on it, over those of its area
 MAX_POINTS = 1000  # of a view whose labels are compared between views
 MIN_PAIRS = 500  # of labels of one point in two views
 MIN_AGREEMENT = 0.5  # beyond chance; right labels of noisy networks have that at least
+MAX_CHANCE = 0.9  # agreement by chance; above it labels tell nothing
 LOW_AGREEMENT = 0.35  # beyond chance; lower where labels contradict each other
 BETTER = 0.1  # agreement beyond chance that the labels of other photos must gain
 
@@ -153,7 +154,9 @@ def _agreement_by_shift(
             return []
         same = float((found[1:] == found[:-1])[known].mean())
         chance = float(((np.bincount(found[1:][known]) / known.sum()) ** 2).sum())
-        agreement.append((same - chance) / max(1 - chance, 1e-3))
+        if chance > MAX_CHANCE:  # nearly all of one class: they agree anyway
+            return []
+        agreement.append((same - chance) / (1 - chance))
     return agreement
 
 
