@@ -53,6 +53,8 @@ def weathers(level: str, azimuth: float) -> dict[str, dict[str, Any]]:
         "autumn": {"season": {"kind": "autumn"}},
         "winter": {"season": {"kind": "winter"}},
         "drought": {"season": {"kind": "drought"}},
+        "autumn, flood": {"season": {"kind": "autumn"}, "flood": {"level": level}},
+        "winter, snow": {"season": {"kind": "winter"}, "snow": {"depth": "10 cm"}},
     }
 
 
