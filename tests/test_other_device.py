@@ -178,9 +178,16 @@ def test_styles_are_equal_on_both_devices(tmp_path, monkeypatch):
         for kind, (device, kernels) in DEVICES.items():
             out = tmp_path / f"{name}-{kind}"
             with kernels(), monkeypatch.context() as patch:
-                patch.setattr("climatenerf.core.device.resolve_device", lambda _, to=device: to)
+                resolved = {"cpu": CPU, "cuda": device}
+                patch.setattr("climatenerf.core.device.resolve_device", resolved.__getitem__)
                 asked = "cpu" if kind == "cpu" else "cuda"
+                loaded = []
+                patch.setattr(
+                    "climatenerf.api.load_run",
+                    lambda *args, to=loaded, **given: to.append(load_run(*args, **given)) or to[-1],
+                )
                 assert run_cli("stylize", run, "-o", out, *flags, "--device", asked) == 0
+                assert [each.field.embeddings.device.type for each in loaded] == [device.type]
                 styled = load_run(out, device=asked)
                 assert styled.field.embeddings.device.type == device.type
                 pose = styled.scene.c2w_world(styled.scene.views[0])

@@ -95,10 +95,20 @@ def test_lumps_on_the_ground_worsen_ground_neighbours_and_points(capture, right)
     assert lumpy["floating.components"] == 0
 
 
-def test_missing_ground_worsens_ground_and_neighbours(capture, right):
+def test_missing_ground_worsens_ground_and_neighbours(capture, right, tmp_path):
     """What no ray meets is taken to be far away, and does not drop out of the score."""
     bare = scores(capture, LabelledField([WALL], classes=(BUILDING,), box=WIDE))
     assert bare["neighbours.psnr"] < right["neighbours.psnr"] - 1.0
+    as_sky = []
+    for view in capture.views:
+        labels = np.asarray(Image.open(view.label_path))
+        path = tmp_path / view.label_path.name
+        Image.fromarray(np.where(labels == 0, 10, labels).astype(np.uint8)).save(path)
+        as_sky.append(replace(view, label_path=path))
+    left_out = scores(
+        replace(capture, views=tuple(as_sky)), LabelledField([WALL], classes=(BUILDING,), box=WIDE)
+    )
+    assert bare["neighbours.psnr"] < left_out["neighbours.psnr"] - 0.5
     holes = [Box((x, y, -3.0), (x + 0.9, y + 0.9, 0.0)) for x in (-2, -1, 0, 1) for y in range(8)]
     holed = scores(
         capture, LabelledField([WALL, *holes], classes=(BUILDING, *[ROAD] * 32), box=WIDE)
