@@ -1,4 +1,4 @@
-"""Scores of a fitted run that need no true geometry: ground, neighbours, floats, sky, points.
+"""Scores of a fit without true geometry: ground, neighbours, floating matter, sky, points.
 
 Every score is a number or None; `score_reasons` says why one is None. They distinguish a field
 whose geometry carries weather from one that only looks right from the positions of the photos.
