@@ -127,8 +127,12 @@ def test_slopes_stay_below_the_bound_of_the_march():
     rng = np.random.default_rng(1)
     size = (3 * BRICK, 3 * BRICK, 3 * BRICK)
     blank = np.zeros(size, np.int16)
-    points = (rng.uniform(8, 16, (20000, 3)) * SPACING + [-0.3, 0.2, 0.1]).astype(np.float32)
-    steepest = 0.0
+    points = (rng.uniform(8.1, 15.9, (20000, 3)) * SPACING + [-0.3, 0.2, 0.1]).astype(np.float32)
+    lines = rng.normal(size=points.shape)
+    lines /= np.linalg.norm(lines, axis=1, keepdims=True)
+    aside = 0.02  # spacings
+    beside = [(points + s * aside * SPACING * lines).astype(np.float32) for s in (1, -1)]
+    steepest, most_curved = 0.0, 0.0
     for normal in ((1, 0, 0), (1, 1, 0), (1, 1, 1), (3, 2, 1), None):
         if normal is None:
             fill = rng.random(size) < 0.5
@@ -138,7 +142,41 @@ def test_slopes_stay_below_the_bound_of_the_march():
         lattice = dense_lattice(255 * fill.astype(np.uint8), blank, blank.astype(np.uint8))
         gradients = metaballs.evaluate(points, lattice)[1]
         steepest = max(steepest, float(np.linalg.norm(gradients, axis=1).max()) * SPACING)
+        ahead, behind = (metaballs.evaluate(each, lattice)[1] for each in beside)
+        second = ((ahead - behind) * lines).sum(1) * SPACING / (2 * aside)
+        most_curved = max(most_curved, float(second.max()))
     assert 0.5 < steepest < metaballs._SLOPE_BOUND
+    assert 0.7 < most_curved < metaballs._CURVATURE_BOUND
+
+
+def test_a_step_towards_the_snow_is_never_too_long():
+    """Rays that graze a wavy surface meet it where a march in small steps does."""
+    rng = np.random.default_rng(3)
+    size = (4 * BRICK, 4 * BRICK, 3 * BRICK)
+    x, y, z = np.meshgrid(*[np.arange(n) for n in size], indexing="ij")
+    fill = np.clip(12 + 1.5 * np.sin(0.7 * x) * np.cos(0.5 * y) - z + 0.5, 0, 1)
+    lattice = dense_lattice(
+        np.round(255 * fill).astype(np.uint8), np.zeros(size, np.int16), np.ones(size, np.uint8)
+    )
+    n = 400
+    start = np.stack([np.full(n, 8.3), rng.uniform(9, 23, n), rng.uniform(11, 16, n)], 1)
+    towards = np.stack([np.ones(n), rng.uniform(-0.2, 0.2, n), rng.uniform(-0.2, 0.1, n)], 1)
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    corner = np.array([-0.3, 0.2, 0.1])
+    origins = (start * SPACING + corner).astype(np.float32)
+    offsets, t, dt, _ = march(lattice, origins, towards, t_max=15 * SPACING)
+    lengths = np.linspace(0, 15, 3000) * SPACING
+    met = 0
+    for r in range(n):
+        line = origins[r] + lengths[:, None] * towards[r]
+        inside = metaballs.evaluate(line.astype(np.float32), lattice)[0] > 0.47
+        samples = slice(offsets[r], offsets[r + 1])
+        if not inside.any():
+            continue
+        met += 1
+        first = lengths[inside.argmax()]
+        assert (t[samples] - dt[samples] / 2).min() < first + 0.05 * SPACING
+    assert met > 100
 
 
 def half_space(level: float) -> Lattice:

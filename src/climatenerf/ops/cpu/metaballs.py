@@ -40,6 +40,7 @@ MAX_SAMPLES = 24
 LOW = 0.42
 """Sum below which the density is less than a thousandth of that inside."""
 _SLOPE_BOUND = 0.75  # upper bound of a sum's slope per spacing (measured by a test)
+_CURVATURE_BOUND = 1.1  # of its second derivative along any line, per spacing squared (likewise)
 _SLOPE_BIAS = 0.545  # c of `_slope_bias`, spacings
 _SAMPLE_DEPTH = 0.5  # optical depth that is merged into one sample
 _OPAQUE = 7.0  # optical depth at which a ray ends: exp(-7) < 1e-3
@@ -280,6 +281,19 @@ def _to_face(ux, uy, uz, d):
     return max(length, 0.0)
 
 
+@njit(cache=True, fastmath=_FAST, inline="always")
+def _step_below(rise, slope):
+    """Return a length (spacings) over which the sum rises by less than `rise`, above 0.
+
+    The larger of what the bounds of slope and second derivative allow. Along a surface, where the
+    slope is short, the second is some times longer.
+    """
+    if rise <= 0:
+        return 0.0
+    root = math.sqrt(slope * slope + 2 * _CURVATURE_BOUND * rise)
+    return max(rise / _SLOPE_BOUND, (root - slope) / _CURVATURE_BOUND)
+
+
 @njit(cache=True, fastmath=_FAST)
 def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
     """Write the samples of one ray to the given rows; return their number."""
@@ -325,9 +339,9 @@ def _march_ray(lattice, o, d, t, end, out_t, out_dt, out_sigma):
                 s, sigma, step = 0.0, 0.0, 0.0
             else:
                 s, gx, gy, gz = _sum(lattice, brick, px, py, pz)
-                sigma, step = 0.0, max((LOW - s) / _SLOPE_BOUND, 0.05) * h
-            if s >= LOW:
                 slope = gx * d[0] + gy * d[1] + gz * d[2]
+                sigma, step = 0.0, max(_step_below(LOW - s, slope), 0.05) * h
+            if s >= LOW:
                 step = min(max(0.025 / max(abs(slope), 1e-6), 0.01), 0.15) * h
                 step = min(step, end - t)
                 height = _means(lattice, brick, px, py, pz)[0] + _slope_bias(gx, gy, gz)
