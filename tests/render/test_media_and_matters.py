@@ -1,7 +1,7 @@
 """Two media and two matters together: depth order and closed forms."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pytest
 import torch
@@ -191,3 +191,38 @@ def test_matter_may_add_light_that_depends_on_the_pixel():
     ]
     assert seen[1] - seen[0] == pytest.approx(0.25, abs=1e-3)
     assert torch.equal(seen[2], seen[0])
+
+
+@dataclass(frozen=True)
+class Layers(Sheet):
+    """Two layers of samples, each 6 mm thick and 0.4 m apart, in the colour of their height."""
+
+    asked: list = field(default_factory=list)
+
+    def march(self, rays_o, rays_d, t_min, t_max):
+        n, each = len(rays_o), 4
+        steps = torch.arange(2 * each)
+        down = 0.4 * (steps // each) + 1.5e-3 * (steps % each)
+        t = (self.height - down - rays_o[:, 2, None]) / rays_d[:, 2, None]
+        offsets = torch.arange(n + 1) * 2 * each
+        dt = 1.5e-3 / rays_d[:, 2, None].abs().expand_as(t).reshape(-1)
+        return Samples(offsets, t.reshape(-1), dt, 100.0 + 0 * dt)
+
+    def colour(self, x):
+        self.asked.append(len(x))
+        return x[:, 2:] * torch.tensor(self.own_colour)
+
+
+def test_a_layer_of_samples_has_the_colour_of_its_mean_position():
+    o, d = rays()
+    layers = Layers(0.5, 1.0, BLUE, "mask_blue", "blue_thickness")
+    seen = trace(World(AIR, matters=(layers,)), o, d, torch.full((len(d),), 1e-6)).rgb
+    assert layers.asked == [2 * len(o)], "one colour a layer, and two layers"
+    samples = layers.march(o, d, None, None)
+    depth = (samples.sigma * samples.dt).view(len(o), 8)
+    before = depth.cumsum(1) - depth
+    weight = torch.exp(-before) * -torch.expm1(-depth)
+    height = o[:, 2, None] + samples.t.view(len(o), 8) * d[:, 2, None]
+    behind = torch.exp(-depth.sum(1, keepdim=True)) * AIR.sky(d)
+    expected = (weight * height).sum(1)[:, None] * torch.tensor(BLUE) + behind
+    assert seen == pytest.approx(expected.numpy(), abs=1e-4)

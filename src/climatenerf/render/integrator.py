@@ -127,7 +127,8 @@ def _trace(
     checkpoint()
     # --- Light of the field and of matter in front of the surface ---------------------------------
     keep = (front > MIN_WEIGHT).nonzero()[:, 0]
-    colour = sample_colour(world, samples, ray, kind, keep, rays_o, rays_d, pixel_angle)
+    given = samples, ray, kind, keep, front[keep]
+    colour = sample_colour(world, *given, rays_o, rays_d, pixel_angle)
     colour = arrive(colour, ray[keep], samples.t[keep])
     offsets = offsets_of(ray[keep], n)
     rgb = compositing.accumulate(front[keep], colour, offsets)

@@ -6,8 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from climatenerf.core.classes import GROUND, SOLID_OF
 from climatenerf.core.samples import MIN_WEIGHT, Samples
-from climatenerf.field.capabilities import DENSITY, NORMALS
+from climatenerf.field.capabilities import CLASSES, DENSITY, NORMALS
 from climatenerf.field.normals import normals_at
 from climatenerf.ops import compositing
 from climatenerf.weather.world import World
@@ -50,16 +51,21 @@ def with_covered(
     """The kinds of samples, with those of the field that matter covers counted to that matter."""
     if not world.field.capabilities & {NORMALS, DENSITY}:
         return kind  # what faces up is unknown
+    classes = CLASSES in world.field.capabilities
+    ground = torch.as_tensor(SOLID_OF[list(GROUND)], device=weights.device)
     for index, matter in enumerate(world.matters, start=1):
         covers: Callable[[Tensor], Tensor] | None = getattr(matter, "covers", None)
-        if covers is None:
+        veiled: Callable[[Tensor], Tensor] | None = getattr(matter, "veiled", None)
+        if covers is None or veiled is None:
             continue
         own = ((kind == 0) & (weights > MIN_WEIGHT)).nonzero()[:, 0]
         x = rays_o[ray[own]] + samples.t[own, None] * rays_d[ray[own]]
-        covered = covers(x)
-        own, x = own[covered], x[covered]
-        normal, _ = normals_at(world.field, x, rays_d[ray[own]])
-        kind = kind.index_fill(0, own[normal[:, 2] > FACES_UP], index)
+        rough = covers(x)
+        near = rough | veiled(x) if classes else rough
+        own, x, rough = own[near], x[near], rough[near]
+        normal, solid = normals_at(world.field, x, rays_d[ray[own]])
+        covered = rough | torch.isin(solid, ground) if classes else rough
+        kind = kind.index_fill(0, own[covered & (normal[:, 2] > FACES_UP)], index)
     return kind
 
 
@@ -80,29 +86,59 @@ def sample_colour(
     ray: Int[Tensor, "s"],
     kind: Int[Tensor, "s"],
     keep: Int[Tensor, "k"],
+    weights: Float[Tensor, "k"],
     rays_o: Tensor,
     rays_d: Tensor,
     pixel_angle: Float[Tensor, "n"],
 ) -> Float[Tensor, "k 3"]:
-    """Linear radiance of the samples `keep`."""
+    """Linear radiance of the samples `keep`, whose weights are given.
+
+    A layer of matter is a handful of samples on a ray: it has the colour of their mean position.
+    """
     x = rays_o[ray[keep]] + samples.t[keep, None] * rays_d[ray[keep]]
     ids = None if samples.ids is None else samples.ids[keep]
     if not world.matters:
         return world.field.colour(x, rays_d, ray[keep], ids=ids, appearance=world.appearance)
     colour = torch.empty(keep.shape[0], 3, device=x.device)
     for index, matter in enumerate(world.matters, start=1):
-        mine = kind[keep] == index
+        mine = (kind[keep] == index).nonzero()[:, 0]
+        layer, first, t = _layers(samples, ray, keep, mine, weights[mine])
+        own = ray[keep[first]]
+        points = rays_o[own] + t[:, None] * rays_d[own]
         towards: Callable[[Tensor, Tensor, Tensor], Tensor] | None
         towards = getattr(matter, "colour_towards", None)
         if towards is None:
-            colour[mine] = matter.colour(x[mine])
+            colour[mine] = matter.colour(points)[layer]
         else:
-            own = ray[keep[mine]]
-            width = pixel_angle[own] * samples.t[keep[mine]]
-            colour[mine] = towards(x[mine], rays_d[own], width)
+            colour[mine] = towards(points, rays_d[own], pixel_angle[own] * t)[layer]
     own = kind[keep] == 0
     ids = None if ids is None else ids[own]
     colour[own] = world.field.colour(
         x[own], rays_d, ray[keep][own], ids=ids, appearance=world.appearance
     )
     return colour
+
+
+def _layers(
+    samples: Samples,
+    ray: Int[Tensor, "s"],
+    keep: Int[Tensor, "k"],
+    mine: Int[Tensor, "m"],
+    weights: Float[Tensor, "m"],
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "l"], Float[Tensor, "l"]]:
+    """Group the samples `keep[mine]` that follow each other on a ray without a gap.
+
+    Returns:
+        The layer of each sample; the first sample of each layer, as an index of `keep`; and the
+        mean ray length of each layer, m.
+    """
+    own = keep[mine]
+    t, dt = samples.t[own], samples.dt[own]
+    begins = torch.ones_like(own, dtype=torch.bool)
+    adjacent = (mine[1:] == mine[:-1] + 1) & (ray[own[1:]] == ray[own[:-1]])
+    begins[1:] = ~adjacent | (t[1:] - t[:-1] > dt[1:] + dt[:-1])
+    layer = begins.cumsum(0) - 1
+    count = int(begins.sum())
+    total = torch.zeros(count, device=t.device).index_add_(0, layer, weights)
+    mean = torch.zeros(count, device=t.device).index_add_(0, layer, weights * t)
+    return layer, mine[begins], mean / total

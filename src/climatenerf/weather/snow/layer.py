@@ -19,10 +19,11 @@ from torch import Tensor
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
-from climatenerf.field.protocol import RadianceField, observed
+from climatenerf.field.protocol import COMPLETES, RadianceField, ground_height, observed
 from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu.metaballs import Lattice
 from climatenerf.weather.light.sun import sun_direction
+from climatenerf.weather.snow.cover import HIGHEST_VEIL
 from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Deposits, SnowGrid, choose_grid, grow
 from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
@@ -122,6 +123,21 @@ class BakedSnow:
         near = to_device((sums > SKIN) & (rest[:, 0] > -BURIED), x.device)
         return near & (x[:, 2] - to_device(rest[:, 0], x.device) >= self.lattice.floor)
 
+    def veiled(self, x: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+        """Whether a surface of a ground class that faces up at points (m) stands for snowy ground.
+
+        A fitted field shows far ground in veils above the terrain. What lies on the terrain there
+        lies on them; beyond the known terrain all ground is in the open.
+        """
+        if self.ground is None or self.snow.light != "scene":
+            return torch.zeros_like(x[:, 0], dtype=torch.bool)
+        terrain = ground_height(self.ground, x[:, :2])
+        below = torch.cat([x[:, :2], terrain[:, None]], 1)
+        snowy = to_device(metaballs.evaluate(_array(below), self.lattice)[0] > SKIN, x.device)
+        veil = snowy & (x[:, 2] > terrain) & (x[:, 2] < terrain + HIGHEST_VEIL)
+        beyond = terrain.isnan() & (COMPLETES in self.ground.capabilities)
+        return (veil | beyond) & (x[:, 2] >= self.lattice.floor)
+
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the gradient of the sum; up where there is none."""
         return to_device(metaballs.smooth_normals(_array(x), self.lattice), x.device)
@@ -151,10 +167,13 @@ class BakedSnow:
     def _shaded(
         self, x: Float[Tensor, "n 3"], relief: Float[Tensor, "n 2"] | None
     ) -> Float[Tensor, "n 3"]:
-        _, _, rest = metaballs.evaluate(_array(x), self.lattice)
+        sums, _, rest = metaballs.evaluate(_array(x), self.lattice)
         normal = self.normal(x)
         if self.snow.light == "scene":
             height, shade = to_device(rest[:, :2], x.device).unbind(-1)
+            away = to_device(sums < SKIN, x.device)  # on a veil: as on open level ground
+            height = torch.where(away, self.snow.depth or 0.0, height)
+            shade = torch.where(away, SHADE_UNIT, shade)
             if relief is not None:
                 normal = tilted(normal, relief, height)
             return self._in_light_of_place(x, normal, height, shade / SHADE_UNIT)
@@ -221,8 +240,11 @@ class BakedSnow:
 
     def thickness(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Height of points (m) over the ground under the snow, m; 0 where no snow is near."""
-        height = metaballs.evaluate(_array(x), self.lattice)[2][:, 0]
-        return to_device(height, x.device).clamp(min=0)
+        sums, _, rest = metaballs.evaluate(_array(x), self.lattice)
+        height = to_device(rest[:, 0], x.device).clamp(min=0)
+        veil = to_device(sums < SKIN, x.device).nonzero()[:, 0]
+        height[veil] = torch.where(self.veiled(x[veil]), self.snow.depth or 0.0, height[veil])
+        return height
 
 
 def bake_snow(
