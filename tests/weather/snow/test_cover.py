@@ -16,14 +16,15 @@ from climatenerf.render.integrator import trace
 from climatenerf.scene.terrain import Terrain
 from climatenerf.weather.snow.cover import (
     CROWN_HOLDS,
+    EAVES,
     REPOSE,
     bridged,
     cushions,
     held_by_crowns,
+    overhang,
     settled,
     slid,
     slope_share,
-    to_edges,
 )
 from climatenerf.weather.snow.deposition import surfaces_and_leaves
 from climatenerf.weather.snow.lattice import SnowGrid
@@ -145,15 +146,37 @@ def test_gaps_in_the_ground_are_bridged_up_to_some_metres():
     assert np.isnan(unknown).all()
 
 
-def test_shares_reach_the_rounded_edge_of_a_roof_but_not_down_a_wall():
-    height = np.zeros((10, 20))
-    height[:, :10] = 3.0
-    height[:, 10] = 2.95  # a rounded edge
-    height[:, 11] = 1.5  # a wall
-    share = np.where(height == 3.0, 1.0, 0.0)
-    found = to_edges(share, height, H)
-    assert np.all(found[:, 10] == 1)
-    assert np.all(found[:, 11:] == 0)
+def roof_raster(degrees):
+    """Heights of a roof that falls along the columns, 3 m wide, over ground at 0, and its end."""
+    slope = math.tan(math.radians(degrees))
+    height = np.zeros((60, 80))
+    height[:, :60] = 5.0 - slope * H * np.arange(60)
+    return height, slope
+
+
+@pytest.mark.parametrize("degrees", [30.0, 45.0])
+def test_eaves_continue_the_slope_of_a_roof(degrees):
+    height, slope = roof_raster(degrees)
+    found, roof = overhang(height, height > 1.0, H)
+    known = np.isfinite(found)
+    over = known[30].nonzero()[0]
+    assert over.min() == 60, "the roof itself is no overhang"
+    assert EAVES - H < H * len(over) <= EAVES + H
+    assert found[30, over] == pytest.approx(5.0 - slope * H * over, abs=1e-9)
+    assert np.all(height[tuple(roof)][known] > 1.0)
+    assert not known[:, :60].any(), "none before the eaves"
+
+
+def test_flat_roofs_walls_and_small_slopes_have_no_eaves():
+    for degrees in (5.0, 75.0):
+        height, _ = roof_raster(degrees)
+        assert not np.isfinite(overhang(height, height > 1.0, H)[0]).any()
+    height, _ = roof_raster(40.0)
+    assert not np.isfinite(overhang(height, np.zeros(height.shape, bool), H)[0]).any(), "a bank"
+    onto = np.where(height > 0, height, height[:, 59:60] - 0.3)  # a step lower than eaves are high
+    assert not np.isfinite(overhang(onto, height > 1.0, H)[0]).any()
+    narrow = np.where(np.abs(np.arange(60) - 30)[:, None] < 8, height, 0.0)  # 75 cm wide
+    assert not np.isfinite(overhang(narrow, narrow > 1.0, H)[0]).any()
 
 
 def test_lumps_of_the_ground_are_ignored_and_holes_filled():
@@ -234,6 +257,41 @@ def test_snow_covers_roughness_that_faces_up_and_not_what_stands_in_it():
     assert not wet.covers(near).any()
 
 
+def snow_seen(solids, classes, eye, towards, **terrain):
+    """The snow's mask and thickness (m) along one ray."""
+    ground = dataclasses.replace(flat_terrain(), **terrain)
+    field = CompletedField(LabelledField(solids, classes=classes, box=BOX), ground)
+    baked = bake_snow(field, Snow(depth=0.15), np.array([eye]), np.ones(3), grid=GRID)
+    assert baked is not None
+    world = World(field, matters=(dataclasses.replace(baked, ground=field),))
+    d = torch.nn.functional.normalize(torch.tensor([towards]), dim=-1)
+    seen = trace(world, torch.tensor([eye]), d, torch.full((1,), 1e-3))
+    return float(seen.layers["mask_snow"][0]), float(seen.layers["snow_thickness"][0])
+
+
+def test_veils_of_ground_classes_over_snowy_ground_are_white():
+    """The terrain carries the snow; a ray that meets a veil above it sees snow as well."""
+    veil = Box((-0.6, -0.6, 0.7), (0.6, 0.6, 0.8))
+    from_above = [0.0, -2.0, 1.6], [0.0, 2.0, -0.8]
+    mask, thickness = snow_seen([HalfSpace(), veil], [ROAD, ROAD], *from_above)
+    assert mask == pytest.approx(1, abs=0.02)
+    assert thickness == pytest.approx(0.15, abs=0.01)
+    side = [0.0, -2.0, 0.75], [0.0, 1.0, 0.0]
+    assert snow_seen([HalfSpace(), veil], [ROAD, ROAD], *side)[0] < 0.02, "it does not face up"
+    # Under a roof lies no snow, hence none on veils there.
+    roof = Box((-1.5, -1.5, 2.4), (1.5, 1.5, 2.5))
+    scene = [HalfSpace(), veil, roof], [ROAD, ROAD, BUILDING]
+    assert snow_seen(*scene, [0.0, -1.2, 1.4], [0.0, 1.2, -0.6])[0] < 0.02
+
+
+def test_ground_beyond_the_known_terrain_is_white():
+    bush = Box((-0.7, -0.7, 1.4), (0.7, 0.7, 2.0))
+    scene = [HalfSpace(), bush], [ROAD, VEGETATION]
+    below = [0.0, -1.4, 0.8], [0.0, 1.4, -0.8]
+    lost = {"height": np.full((41, 41), np.nan, np.float32), "open": np.zeros((41, 41), bool)}
+    assert snow_seen(*scene, *below, **lost)[0] == pytest.approx(1, abs=0.02)
+
+
 def test_deposits_know_whether_any_snow_stays():
     assert snow_on([HalfSpace()], [ROAD]).deposits.any()
     slope = HalfSpace((math.sin(math.radians(75)), 0.0, math.cos(math.radians(75))), 0.0)
@@ -251,7 +309,7 @@ def test_a_wall_gets_no_heap_of_what_it_stops(tilt):
         near = (np.abs(catch.position[..., 1]) < 1) & (np.abs(catch.position[..., 0]) < 0.95)
         near &= (catch.position[..., 2] < 0.1) & (catch.weight > 0)
         assert near.any()
-        assert catch.of_fall[near].max() < 1.2
+        assert catch.of_fall[near].max() < 1.3
 
 
 def test_slanted_snow_falls_through_a_crown_to_the_ground_of_its_own_place():

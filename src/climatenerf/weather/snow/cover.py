@@ -24,11 +24,13 @@ ONE_LAYER = 0.6  # m below the highest leaf nearby; deeper leaves carry no part 
 CROWN_KEEPS, CROWN_SHEDS = 0.9, 2.0  # slopes (rise over run) of crowns that keep all and nothing
 CLOSED = (0.2, 0.45)  # fraction covered by leaves at which a cushion begins, and is complete
 HIGHEST_VEIL = 2.0  # m above the ground; what hangs higher may be a roof of a wrong class
-EDGE = 0.12  # m from the edge of a surface, within which its normals are blurred
-STEEPEST_EDGE = math.tan(math.radians(50))  # of a surface and its rounded edge
+EAVES = 0.1  # m, by which snow overhangs the lower edge of a roof
+DRAWN_BACK = 0.15  # m from the edge of a fitted roof, within which it is rounded
+ROOF = math.tan(math.radians(20)), math.tan(math.radians(60))  # slopes of roofs with eaves
+HIGH, WIDE = 0.5, 1.0  # m, drop at eaves, and the least side of a roof
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
-PILE = 0.35  # m, standard deviation of the heap of what slid
+PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
 MAX_SWEEPS = 40  # of `settled`; a metre of snow on a lattice of 5 cm takes 20
 
@@ -237,32 +239,49 @@ def settled(
     return np.maximum(top - base, 0.0)
 
 
-def to_edges(
-    share: Float[np.ndarray, "h w"], height: Float[np.ndarray, "h w"], spacing: float
-) -> Float[np.ndarray, "h w"]:
-    """Continue shares over the last `EDGE` m of a surface, whose fitted edges are rounded.
+def overhang(
+    height: Float[np.ndarray, "h w"], solid: Bool[np.ndarray, "h w"], spacing: float
+) -> tuple[Float[np.ndarray, "h w"], Any]:
+    """Continue roofs beyond their eaves, down their slope.
 
-    The share of a node is the largest within that distance on ground that is no steeper than
-    `STEEPEST_EDGE` from here.
+    Snow creeps over eaves and overhangs them (EN 1991-1-3, 6.3); and thin eaves of a fitted field
+    end some decimetres before the true ones.
 
     Args:
-        share: fraction of the depth that stays.
         height: of the surface, m; NaN without one.
+        solid: where it may belong to a roof.
         spacing: of the raster, m.
+
+    Returns:
+        Heights of the overhang, m (NaN elsewhere), and rows and columns of the nodes of the roof
+        that each node continues.
     """
-    reach = round(EDGE / spacing)
-    if reach == 0:
-        return share
-    padded = np.pad(height, reach, constant_values=np.nan), np.pad(share, reach)
-    rows, columns = share.shape
-    result = share.copy()
-    for j in range(-reach, reach + 1):
-        for i in range(-reach, reach + 1):
-            part = slice(reach + j, reach + j + rows), slice(reach + i, reach + i + columns)
-            limit = STEEPEST_EDGE * spacing * math.hypot(j, i)
-            near = np.abs(padded[0][part] - height) <= limit  # NaN compares False
-            result = np.where(near, np.maximum(result, padded[1][part]), result)
-    return result
+    back = max(1, round(DRAWN_BACK / spacing))
+    none = np.full(height.shape, np.nan)
+    # Slopes over as many nodes, on roofs that have no edge there.
+    slope = [np.full(height.shape, np.nan), np.full(height.shape, np.nan)]
+    slope[0][back:-back] = (height[2 * back :] - height[: -2 * back]) / (2 * back * spacing)
+    slope[1][:, back:-back] = (height[:, 2 * back :] - height[:, : -2 * back]) / (
+        2 * back * spacing
+    )
+    steepness = np.hypot(*slope)
+    roof = solid & (steepness > ROOF[0]) & (steepness < ROOF[1])  # NaN compares False
+    side = max(1, round(WIDE / spacing) - 2 * back)
+    core: Any = ndimage.binary_opening(roof, np.ones((side, side), bool))
+    if not core.any():
+        return none, np.indices(height.shape)
+    found: Any = ndimage.distance_transform_edt(~core, return_indices=True)
+    distance, nearest = found
+    rows, columns = np.indices(height.shape)
+    down, across = (rows - nearest[0]) * spacing, (columns - nearest[1]) * spacing
+    at = tuple(nearest)
+    fall = slope[0][at] * down + slope[1][at] * across
+    continued = height[at] + fall
+    lower = ~(height > continued - HIGH)  # NaN: nothing is there
+    # Along the slope; what lies beside a gable is no overhang.
+    below = fall < -0.8 * steepness[at] * distance * spacing
+    near = (distance > 0) & (distance < back + EAVES / spacing + 0.5)
+    return np.where(lower & below & near, continued, np.nan), nearest
 
 
 def bridged(

@@ -25,9 +25,9 @@ from climatenerf.weather.snow.cover import (
     bridged,
     cushions,
     lumps,
+    overhang,
     slid,
     slope_share,
-    to_edges,
 )
 from climatenerf.weather.snow.drift import drifted
 from climatenerf.weather.snow.fall_rays import (
@@ -47,7 +47,6 @@ LEAF = int(SOLID_OF[VEGETATION])
 GROUND_KINDS = SOLID_OF[list(GROUND)]
 UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
 STEPS = 8  # towards the ground below a slanted ray
-SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
 ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
 BETWEEN_LEAVES = 0.026  # m of snow that open or steep crowns take before any bridges their leaves
@@ -148,9 +147,6 @@ def _caught(
     cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
     share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
     wall = cosine < WALL
-    edged = to_edges(share, surface, h)
-    # In slanted snow walls are slopes of the raster; their cells are no edges.
-    share = np.where(wall & (-rays.direction[2] < SLANTED), share, edged)
     # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there.
     lost = np.where(wall, 0.0, 1 - share)
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
@@ -159,6 +155,11 @@ def _caught(
     caught = crown.keeps * np.clip(rays.opacity, 0, 1)
     weight = np.where(own, np.clip((rays.opacity - 0.5) / 0.1, 0, 1), 1.0)  # the terrain is whole
     catches = [_catch(smooth, moved * share + arrived, -share * caught, 0 * share, weight)]
+    eaves, roof = overhang(surface, own & ~on_ground, h)
+    if np.isfinite(eaves).any():
+        part = np.where(np.isfinite(eaves), share[tuple(roof)], 0.0)
+        whole = np.isfinite(eaves).astype(np.float64)
+        catches.append(_catch(rays.at(eaves), part, 0 * part, 0 * part, whole))
     if caught.any():
         position = rays.at(crown.height)
         gaps = BETWEEN_LEAVES * (1 - crown.keeps)
