@@ -22,6 +22,7 @@ from climatenerf.field.wrapped import WrappedField
 from climatenerf.render.photo_rays import trace_photos
 from climatenerf.render.session import RenderSession
 from climatenerf.weather.description import weather_from_table
+from climatenerf.weather.light import entity
 from climatenerf.weather.light import find_light as finding
 from climatenerf.weather.light import sun_map as sun_maps
 from climatenerf.weather.light.captured import UnknownLight, elevation_azimuth
@@ -184,6 +185,29 @@ def test_exposure_is_kept_on_average_and_ev_doubles_it(overcast):
     assert float(twice.field.sky(up)[0, 0] / overcast.world(0.0).field.sky(up)[0, 0]) == (
         pytest.approx(2.0, rel=0.01)
     )
+
+
+@pytest.mark.slow
+def test_snow_is_not_overexposed_under_a_new_sky(overcast, monkeypatch):
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+
+    def exposures(**sky):
+        """Of the sky without snow and with it."""
+        dry = session(sunlit_yard(), sky={"kind": "overcast", **sky}).world(0.0).light
+        snow = {"depth": "10 cm"}
+        wet = session(sunlit_yard(), sky={"kind": "overcast", **sky}, snow=snow).world(0.0).light
+        return float(wet.radiance(up)[0, 0] / dry.radiance(up)[0, 0])
+
+    light = overcast.world(0.0).light
+    open_ground = ACROSS[ACROSS[:, 0] < -3]
+    white = float(luma(light.irradiance(open_ground, up.expand_as(open_ground))).median()) / np.pi
+    assert white > 0.9
+    assert exposures() * white < 0.95
+    assert exposures(exposure="fixed") == pytest.approx(1.0, rel=1e-5)
+    monkeypatch.setattr(entity, "SNOW_WHITE", 0.4)
+    assert exposures() * white == pytest.approx(0.4, rel=0.15)  # this ground is the brightest
+    monkeypatch.setattr(entity, "SNOW_WHITE", 4.0)
+    assert exposures() == pytest.approx(1.0, rel=1e-5)
 
 
 @pytest.mark.slow

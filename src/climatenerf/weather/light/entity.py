@@ -54,6 +54,8 @@ from climatenerf.weather.world import Preparation, World
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
 EXPOSED = 3  # of what photos show, one pixel in so many counts for the exposure
 DARKEST = 1e-3  # luminance whose logarithm is taken
+SNOW_WHITE = 0.85  # median radiance of white level ground, at most, where snow falls; 1 is white
+LEVEL = 0.7  # z of normals of level ground
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
 
@@ -288,7 +290,13 @@ class LightEntity:
         shown = RelitField(self._given.field, old, new, True, 1.0, self._albedo(old))
         shining = radiance * shown.ratio(radiance, x, normal, kind)
         before, after = (luma(each).clamp_min(DARKEST).log().mean() for each in (radiance, shining))
-        return gain * math.exp(float(before - after))
+        kept = gain * math.exp(float(before - after))
+        if not any(moment.snow.depth for moment in self._given.moments):
+            return kept
+        # Nor is snow overexposed, for which photographers look at the brightest of what matters.
+        up = normal[:, 2] > LEVEL
+        white = luma(new.irradiance(x[up], normal[up]) if bool(up.any()) else new.open_irradiance())
+        return min(kept, SNOW_WHITE * math.pi * gain / float(white.median()))
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a sun that does not belong to its sky.
