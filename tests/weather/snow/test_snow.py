@@ -12,6 +12,7 @@ from support.holed_ground import LabelledField
 
 from climatenerf.core.classes import BUILDING, ROAD
 from climatenerf.core.errors import UserError
+from climatenerf.ops.cpu import metaballs
 from climatenerf.weather.snow.cover import REPOSE
 from climatenerf.weather.snow.fall_rays import fall_directions
 from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
@@ -314,6 +315,21 @@ def test_brightness_has_no_steps_in_depth():
     # Each is half a millimetre; the first millimetres of snow whiten dark ground fastest.
     assert steps.max() < 0.12
     assert steps[4:].max() < 0.05, "after two millimetres no more than a tenth a millimetre"
+
+
+def test_thin_snow_on_slopes_has_no_ripples():
+    plane = ground(math.radians(40), 0.5)
+    snow = bake([plane], 0.03)
+    down = torch.tensor([[-0.25, 0.54, -0.8]]).expand(4000, 3)
+    points, opacity = mean_hit(snow, on_plane(plane, 4000, 1.0) - 0.4 * down, down, 1.0)
+    points = points[opacity > 0.9].numpy()
+    rough = metaballs.evaluate(points, snow.lattice)[2][:, 0]
+    normals, heights = metaballs.smooth_surface(points, snow.lattice)
+    assert heights.mean() == pytest.approx(0.03 * 2 / 3, rel=0.1)
+    assert heights.std() < 0.75 * rough.std()
+    assert np.quantile(normals @ np.array(plane.normal), 0.02) > 0.998
+    away = metaballs.smooth_surface(np.array([[0.0, 0.0, 2.9]], np.float32), snow.lattice)
+    assert away[0][0].tolist() == [0, 0, 1] and away[1][0] == 0
 
 
 def test_a_steep_roof_sheds_its_snow_to_the_ground_below():

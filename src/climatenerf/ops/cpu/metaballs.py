@@ -214,47 +214,58 @@ def evaluate(
 
 
 @njit(cache=True, parallel=True, fastmath=_FAST)
-def smooth_normals(points: Float32[np.ndarray, "n 3"], lattice: Lattice) -> np.ndarray:
-    """Return outward unit normals [n, 3] for shading; up where there is no snow.
+def smooth_surface(
+    points: Float32[np.ndarray, "n 3"], lattice: Lattice
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals [n, 3] and heights over the ground [n] (m) of surfaces, for shading.
 
-    Columns of one spacing leave ripples of that length on slopes. The mean of the gradient over
-    four positions on the surface, half a spacing apart along x and y, has none of them.
+    Columns of one spacing leave ripples of that length on slopes. Means over four positions on the
+    surface, half a spacing apart along x and y, have none of them. Where there is no snow normals
+    point up, and heights are 0.
     """
     n = points.shape[0]
     normals = np.zeros((n, 3), np.float32)
+    heights = np.zeros(n, np.float32)
     for r in prange(n):
         x, y, z = np.float64(points[r, 0]), np.float64(points[r, 1]), np.float64(points[r, 2])
-        gx, gy, gz, h = _gradient(lattice, x, y, z)
+        gx, gy, gz, _, h = _gradient(lattice, x, y, z)
         # Along the surface; not on the sides of the snow, where it is too steep.
         rise_x, rise_y = 0.0, 0.0
         if gz < -0.3 * math.sqrt(gx * gx + gy * gy + gz * gz):
             rise_x, rise_y = -gx / gz, -gy / gz
-        sx, sy, sz = 0.0, 0.0, 0.0
-        for a in (-0.25, 0.25):
-            for b in (-0.25, 0.25):
-                dx, dy = a * h, b * h
-                gx, gy, gz, _ = _gradient(lattice, x + dx, y + dy, z + dx * rise_x + dy * rise_y)
+        sx, sy, sz, total, known = 0.0, 0.0, 0.0, 0.0, 0.0
+        # Ripples of steep slopes have the lattice's period in z.
+        step = 0.25 * h / max(1.0, math.sqrt(rise_x * rise_x + rise_y * rise_y))
+        for a in (-1, 1):
+            for b in (-1, 1):
+                dx, dy = a * step, b * step
+                at = x + dx, y + dy, z + dx * rise_x + dy * rise_y
+                gx, gy, gz, height, inside = _gradient(lattice, *at)
                 sx, sy, sz = sx + gx, sy + gy, sz + gz
+                if inside > 0:
+                    total, known = total + height, known + 1
+        heights[r] = total / max(known, 1.0)
         length = math.sqrt(sx * sx + sy * sy + sz * sz)
         if length < 1e-6:  # no gradient: 0/0
             normals[r, 2] = 1.0
             continue
         normals[r, 0], normals[r, 1], normals[r, 2] = -sx / length, -sy / length, -sz / length
-    return normals
+    return normals, heights
 
 
 @njit(cache=True, fastmath=_FAST)
 def _gradient(lattice, x, y, z):
-    """Return the gradient of the sum per spacing at a position, and the spacing; 0 outside."""
+    """Return at a position the sum's gradient per spacing, height (m) and spacing; 0 outside."""
     k, brick, i, j, m = _find(lattice, x, y, z)
     if brick < 0:
-        return 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0
     h = lattice.spacing[k]
     px = (x - lattice.lower[k, 0]) / h - i * BRICK
     py = (y - lattice.lower[k, 1]) / h - j * BRICK
     pz = (z - lattice.lower[k, 2]) / h - m * BRICK
     _, gx, gy, gz = _sum(lattice, brick, px, py, pz)
-    return np.float64(gx), np.float64(gy), np.float64(gz), h
+    height = _means(lattice, brick, px, py, pz)[0] + _slope_bias(gx, gy, gz)
+    return np.float64(gx), np.float64(gy), np.float64(gz), height * h, h
 
 
 @njit(cache=True, fastmath=_FAST)

@@ -140,7 +140,7 @@ class BakedSnow:
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the gradient of the sum; up where there is none."""
-        return to_device(metaballs.smooth_normals(_array(x), self.lattice), x.device)
+        return to_device(metaballs.smooth_surface(_array(x), self.lattice)[0], x.device)
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Linear radiance of the snow at points (m), the same in all directions.
@@ -168,9 +168,10 @@ class BakedSnow:
         self, x: Float[Tensor, "n 3"], relief: Float[Tensor, "n 2"] | None
     ) -> Float[Tensor, "n 3"]:
         sums, _, rest = metaballs.evaluate(_array(x), self.lattice)
-        normal = self.normal(x)
+        surface = metaballs.smooth_surface(_array(x), self.lattice)
+        normal, height = (to_device(each, x.device) for each in surface)
         if self.snow.light == "scene":
-            height, shade = to_device(rest[:, :2], x.device).unbind(-1)
+            shade = to_device(rest[:, 1], x.device)
             away = to_device(sums < SKIN, x.device)  # on a veil: as on open level ground
             height = torch.where(away, self.snow.depth or 0.0, height)
             shade = torch.where(away, SHADE_UNIT, shade)
