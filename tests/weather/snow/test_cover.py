@@ -20,8 +20,8 @@ from climatenerf.weather.snow.cover import (
     REPOSE,
     bridged,
     cushions,
+    eaves,
     held_by_crowns,
-    overhang,
     settled,
     slid,
     slope_share,
@@ -157,26 +157,43 @@ def roof_raster(degrees):
 @pytest.mark.parametrize("degrees", [30.0, 45.0])
 def test_eaves_continue_the_slope_of_a_roof(degrees):
     height, slope = roof_raster(degrees)
-    found, roof = overhang(height, height > 1.0, H)
+    height[:, 58:60] -= np.array([0.05, 0.2])  # a rounded edge
+    found, rim, roof = eaves(height, height > 1.0, H)
     known = np.isfinite(found)
+    assert rim[30].nonzero()[0].tolist() == [54, 55, 56, 57, 58, 59]
     over = known[30].nonzero()[0]
     assert over.min() == 60, "the roof itself is no overhang"
     assert EAVES - H < H * len(over) <= EAVES + H
     assert found[30, over] == pytest.approx(5.0 - slope * H * over, abs=1e-9)
-    assert np.all(height[tuple(roof)][known] > 1.0)
+    assert np.all(height[roof][known | rim] > 1.0)
     assert not known[:, :60].any(), "none before the eaves"
 
 
 def test_flat_roofs_walls_and_small_slopes_have_no_eaves():
     for degrees in (5.0, 75.0):
         height, _ = roof_raster(degrees)
-        assert not np.isfinite(overhang(height, height > 1.0, H)[0]).any()
+        assert not np.isfinite(eaves(height, height > 1.0, H).overhang).any()
     height, _ = roof_raster(40.0)
-    assert not np.isfinite(overhang(height, np.zeros(height.shape, bool), H)[0]).any(), "a bank"
+    assert not np.isfinite(eaves(height, np.zeros(height.shape, bool), H).overhang).any(), "a bank"
     onto = np.where(height > 0, height, height[:, 59:60] - 0.3)  # a step lower than eaves are high
-    assert not np.isfinite(overhang(onto, height > 1.0, H)[0]).any()
+    assert not np.isfinite(eaves(onto, height > 1.0, H).overhang).any()
     narrow = np.where(np.abs(np.arange(60) - 30)[:, None] < 8, height, 0.0)  # 75 cm wide
-    assert not np.isfinite(overhang(narrow, narrow > 1.0, H)[0]).any()
+    assert not np.isfinite(eaves(narrow, narrow > 1.0, H).overhang).any()
+
+
+def test_heaps_do_not_depend_on_the_spacing():
+    """A heap of .25 m2 before a wall: a wedge at the angle of repose, .77 m high."""
+    heights = []
+    for spacing in (0.06, 0.03, 0.02):
+        nodes = round(2.4 / spacing)
+        heap = np.zeros((5, nodes))
+        heap[:, : round(0.12 / spacing)] = 0.25 / 0.12
+        lying = settled(np.zeros_like(heap), heap, REPOSE * spacing)
+        assert lying.sum() * spacing / 5 == pytest.approx(0.25, rel=1e-6)
+        slope = np.abs(np.diff(lying, axis=1)) / spacing
+        assert slope.max() < 1.02 * REPOSE
+        heights.append(lying.max())
+    assert heights == pytest.approx([math.sqrt(2 * REPOSE * 0.25)] * 3, rel=0.12)
 
 
 def test_lumps_of_the_ground_are_ignored_and_holes_filled():

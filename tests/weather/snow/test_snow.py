@@ -166,7 +166,7 @@ def test_no_snow_hangs_below_a_thin_table():
             below = torch.cat([xy, torch.full((4000, 1), z)], -1)
             if z < 0.61 and depth > 0.2:  # a heap of what slid off the table lies around it
                 below = below[(xy.abs() < 0.35).all(1)]
-            assert snow.density(below).max() == 0
+            assert snow.density(below).max() < 1e-6
         on_top = torch.cat([xy, torch.full((4000, 1), 0.75)], -1)[(xy.abs() < 0.3).all(1)]
         assert depth_over(snow, on_top).numpy() == pytest.approx(depth, rel=0.1)
 

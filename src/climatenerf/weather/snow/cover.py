@@ -27,12 +27,13 @@ HIGHEST_VEIL = 2.0  # m above the ground; what hangs higher may be a roof of a w
 EAVES = 0.1  # m, by which snow overhangs the lower edge of a roof
 DRAWN_BACK = 0.15  # m from the edge of a fitted roof, within which it is rounded
 ROOF = math.tan(math.radians(20)), math.tan(math.radians(60))  # slopes of roofs with eaves
-HIGH, WIDE = 0.5, 1.0  # m, drop at eaves, and the least side of a roof
+HIGH, ROUNDED = 0.5, 0.3  # m below a roof's plane: what lies below its eaves, and its rounded rim
+WIDE = 1.0  # m, the least side of a roof
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
-MAX_SWEEPS = 40  # of `settled`; a metre of snow on a lattice of 5 cm takes 20
+MAX_SWEEPS = 1000  # of `settled`; a heap of a metre on a lattice of 3 cm takes 300
 
 
 def slope_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarray, "*n"]:
@@ -206,12 +207,16 @@ def settled(
     """
     rows, columns = base.shape
     top = base + thickness
+    waiting = np.ones((rows, columns), np.bool_)  # nodes near a change since they were looked at
     for sweep in range(MAX_SWEEPS):
         changed = False
         for a in range(rows):
             j = a if sweep % 2 == 0 else rows - 1 - a
             for b in range(columns):
                 i = b if sweep % 4 < 2 else columns - 1 - b
+                if not waiting[j, i]:
+                    continue
+                waiting[j, i] = False
                 own = top[j, i]
                 if not own - base[j, i] > 1e-6:  # NaN compares False
                     continue
@@ -234,15 +239,29 @@ def settled(
                     top[j, i] = own - moved
                     top[to_j, to_i] += moved
                     changed = True
+                    for jj in range(max(min(j, to_j) - 1, 0), min(max(j, to_j) + 2, rows)):
+                        for ii in range(max(min(i, to_i) - 1, 0), min(max(i, to_i) + 2, columns)):
+                            waiting[jj, ii] = True
         if not changed:
             break
     return np.maximum(top - base, 0.0)
 
 
-def overhang(
+class Eaves(NamedTuple):
+    """The lower edges of roofs."""
+
+    overhang: Float[np.ndarray, "h w"]
+    """Heights at which roofs would go on beyond their edges, m; NaN elsewhere."""
+    rim: Bool[np.ndarray, "h w"]
+    """Nodes of roofs at their edges, which fits round."""
+    roof: tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]
+    """Rows and columns of the nodes inside a roof that each node of both continues."""
+
+
+def eaves(
     height: Float[np.ndarray, "h w"], solid: Bool[np.ndarray, "h w"], spacing: float
-) -> tuple[Float[np.ndarray, "h w"], Any]:
-    """Continue roofs beyond their eaves, down their slope.
+) -> Eaves:
+    """Continue roofs down their slopes, to their edges and beyond.
 
     Snow creeps over eaves and overhangs them (EN 1991-1-3, 6.3); and thin eaves of a fitted field
     end some decimetres before the true ones.
@@ -251,37 +270,34 @@ def overhang(
         height: of the surface, m; NaN without one.
         solid: where it may belong to a roof.
         spacing: of the raster, m.
-
-    Returns:
-        Heights of the overhang, m (NaN elsewhere), and rows and columns of the nodes of the roof
-        that each node continues.
     """
     back = max(1, round(DRAWN_BACK / spacing))
-    none = np.full(height.shape, np.nan)
+    rows, columns = np.indices(height.shape)
     # Slopes over as many nodes, on roofs that have no edge there.
     slope = [np.full(height.shape, np.nan), np.full(height.shape, np.nan)]
-    slope[0][back:-back] = (height[2 * back :] - height[: -2 * back]) / (2 * back * spacing)
-    slope[1][:, back:-back] = (height[:, 2 * back :] - height[:, : -2 * back]) / (
-        2 * back * spacing
-    )
+    run = 2 * back * spacing
+    slope[0][back:-back] = (height[2 * back :] - height[: -2 * back]) / run
+    slope[1][:, back:-back] = (height[:, 2 * back :] - height[:, : -2 * back]) / run
     steepness = np.hypot(*slope)
     roof = solid & (steepness > ROOF[0]) & (steepness < ROOF[1])  # NaN compares False
     side = max(1, round(WIDE / spacing) - 2 * back)
     core: Any = ndimage.binary_opening(roof, np.ones((side, side), bool))
+    # Without nodes whose slopes are measured over the rounded rim.
+    core = ndimage.binary_erosion(core, np.ones((2 * back + 1, 2 * back + 1), bool))
     if not core.any():
-        return none, np.indices(height.shape)
+        return Eaves(np.full(height.shape, np.nan), np.zeros(height.shape, bool), (rows, columns))
     found: Any = ndimage.distance_transform_edt(~core, return_indices=True)
     distance, nearest = found
-    rows, columns = np.indices(height.shape)
-    down, across = (rows - nearest[0]) * spacing, (columns - nearest[1]) * spacing
     at = tuple(nearest)
+    down, across = (rows - nearest[0]) * spacing, (columns - nearest[1]) * spacing
     fall = slope[0][at] * down + slope[1][at] * across
     continued = height[at] + fall
-    lower = ~(height > continued - HIGH)  # NaN: nothing is there
-    # Along the slope; what lies beside a gable is no overhang.
+    # Along the slope; what lies beside a gable is no eaves.
     below = fall < -0.8 * steepness[at] * distance * spacing
-    near = (distance > 0) & (distance < back + EAVES / spacing + 0.5)
-    return np.where(lower & below & near, continued, np.nan), nearest
+    near = below & (distance > 0) & (distance < 2 * back + EAVES / spacing + 0.5)
+    lower = ~(height > continued - HIGH)  # NaN: nothing is there
+    rim = near & solid & (height > continued - ROUNDED)
+    return Eaves(np.where(near & lower, continued, np.nan), rim, at)
 
 
 def bridged(

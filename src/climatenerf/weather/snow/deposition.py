@@ -24,8 +24,8 @@ from climatenerf.weather.snow.cover import (
     WALL,
     bridged,
     cushions,
+    eaves,
     lumps,
-    overhang,
     slid,
     slope_share,
 )
@@ -146,7 +146,9 @@ def _caught(
     learned = own & np.isfinite(normal_z) & ~low
     cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
     share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
-    wall = cosine < WALL
+    edges = eaves(surface, own & ~on_ground, h)
+    share = np.where(edges.rim, np.maximum(share, share[edges.roof]), share)
+    wall = (cosine < WALL) & ~edges.rim
     # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there.
     lost = np.where(wall, 0.0, 1 - share)
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
@@ -155,11 +157,12 @@ def _caught(
     caught = crown.keeps * np.clip(rays.opacity, 0, 1)
     weight = np.where(own, np.clip((rays.opacity - 0.5) / 0.1, 0, 1), 1.0)  # the terrain is whole
     catches = [_catch(smooth, moved * share + arrived, -share * caught, 0 * share, weight)]
-    eaves, roof = overhang(surface, own & ~on_ground, h)
-    if np.isfinite(eaves).any():
-        part = np.where(np.isfinite(eaves), share[tuple(roof)], 0.0)
-        whole = np.isfinite(eaves).astype(np.float64)
-        catches.append(_catch(rays.at(eaves), part, 0 * part, 0 * part, whole))
+    over = np.isfinite(edges.overhang)
+    if over.any():
+        part = np.where(over, share[edges.roof], 0.0)
+        catches.append(
+            _catch(rays.at(edges.overhang), part, 0 * part, 0 * part, over.astype(np.float64))
+        )
     if caught.any():
         position = rays.at(crown.height)
         gaps = BETWEEN_LEAVES * (1 - crown.keeps)
