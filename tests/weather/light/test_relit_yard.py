@@ -188,7 +188,7 @@ def test_exposure_is_kept_on_average_and_ev_doubles_it(overcast):
 
 
 @pytest.mark.slow
-def test_snow_is_not_overexposed_under_a_new_sky(overcast, monkeypatch):
+def test_snow_is_neither_grey_nor_overexposed_under_a_new_sky(overcast, monkeypatch):
     up = torch.tensor([[0.0, 0.0, 1.0]])
 
     def exposures(**sky):
@@ -204,9 +204,11 @@ def test_snow_is_not_overexposed_under_a_new_sky(overcast, monkeypatch):
     assert white > 0.9
     assert exposures() * white < 0.95
     assert exposures(exposure="fixed") == pytest.approx(1.0, rel=1e-5)
-    monkeypatch.setattr(entity, "SNOW_WHITE", 0.4)
+    monkeypatch.setattr(entity, "SNOW_WHITE", (0.1, 0.4))
     assert exposures() * white == pytest.approx(0.4, rel=0.15)  # this ground is the brightest
-    monkeypatch.setattr(entity, "SNOW_WHITE", 4.0)
+    monkeypatch.setattr(entity, "SNOW_WHITE", (1.5, 4.0))
+    assert exposures() * white == pytest.approx(1.5, rel=0.15)
+    monkeypatch.setattr(entity, "SNOW_WHITE", (0.1, 4.0))
     assert exposures() == pytest.approx(1.0, rel=1e-5)
 
 

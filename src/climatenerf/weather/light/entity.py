@@ -54,7 +54,7 @@ from climatenerf.weather.world import Preparation, World
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
 EXPOSED = 3  # of what photos show, one pixel in so many counts for the exposure
 DARKEST = 1e-3  # luminance whose logarithm is taken
-SNOW_WHITE = 0.85  # median radiance of white level ground, at most, where snow falls; 1 is white
+SNOW_WHITE = 0.5, 0.85  # of white level ground where snow falls, median radiance; 1 is white
 LEVEL = 0.7  # z of normals of level ground
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
@@ -293,10 +293,11 @@ class LightEntity:
         kept = gain * math.exp(float(before - after))
         if not any(moment.snow.depth for moment in self._given.moments):
             return kept
-        # Nor is snow overexposed, for which photographers look at the brightest of what matters.
+        # For snow that is neither grey nor without relief, photographers correct the exposure.
         up = normal[:, 2] > LEVEL
         white = luma(new.irradiance(x[up], normal[up]) if bool(up.any()) else new.open_irradiance())
-        return min(kept, SNOW_WHITE * math.pi * gain / float(white.median()))
+        least, most = (each * math.pi * gain / float(white.median()) for each in SNOW_WHITE)
+        return min(max(kept, least), most)
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a sun that does not belong to its sky.

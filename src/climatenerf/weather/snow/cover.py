@@ -272,7 +272,8 @@ def eaves(
         spacing: of the raster, m.
     """
     back = max(1, round(DRAWN_BACK / spacing))
-    rows, columns = np.indices(height.shape)
+    grid: Any = np.indices(height.shape)
+    rows, columns = grid
     # Slopes over as many nodes, on roofs that have no edge there.
     slope = [np.full(height.shape, np.nan), np.full(height.shape, np.nan)]
     run = 2 * back * spacing
