@@ -301,6 +301,17 @@ def test_thin_snow_lets_the_ground_through_and_deep_snow_hides_it():
     assert mean[0] == pytest.approx(float(bare[dark].mean()), abs=0.12)
 
 
+def test_contact_shade_ends_above_the_ground():
+    snow = bake([ground()], 0.3)
+    height = torch.tensor([0.05, 0.6, 30.0])
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
+    half, all_of_it = (
+        snow._in_light_of_place(up, up, height, torch.full((3,), share))[:, 0]
+        for share in (0.5, 1.0)
+    )
+    assert half / all_of_it == pytest.approx([0.5, 1 - 0.5 * math.exp(-1), 1.0], abs=1e-5)
+
+
 def test_brightness_has_no_steps_in_depth():
     ground_colour = HalfSpace(colour=(0.12, 0.12, 0.12))
     field = AnalyticField([ground_colour], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))

@@ -38,6 +38,7 @@ from climatenerf.weather.world import Preparation, World
 LEVEL_Z, SIDE_Z = 0.5, 0.2  # z of normals of a layer's surface, and of its sides
 SIDE = 0.3  # m of snow behind a side
 SKIN = 0.15  # sum of the balls half a spacing above a level surface
+CONTACT, RISES = 0.1, 0.5  # m over the ground: where contact shade is known; scale of its decay
 BURIED = 0.04  # m below the ground, to which roughness reaches
 OPAQUE, CLEAN_OPAQUE = 0.95, 0.99
 """Reflectance of a slab from which on the ground below is left out, which then has less than a
@@ -198,8 +199,10 @@ class BakedSnow:
     ) -> Float[Tensor, "n 3"]:
         """Radiance of snow with unit normals, at heights (m) over the ground below.
 
-        What stands close by leaves the fraction `contact` of the diffuse light of the place.
+        What stands close by leaves the fraction `contact` of the diffuse light of the place, near
+        the ground; the top of a heap rises above it.
         """
+        contact = 1 - (1 - contact) * torch.exp(-(height - CONTACT).clamp_min(0) / RISES)
         if self.place_light is None:
             white = to_device(self.light.irradiance_over_pi.astype(np.float32), x.device)
             white = white * contact[:, None]
