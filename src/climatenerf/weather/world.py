@@ -65,7 +65,8 @@ class Matter(Protocol):
     """Solid matter on the scene, such as snow: density and colour of its own.
 
     Its method `covers`, if it has one, says at which positions (m, [n, 3]) upward surfaces of the
-    field belong below it: a fitted surface is rough, and would reach out of thin matter. Its method
+    field belong below it: a fitted surface is rough, and would reach out of thin matter. `veiled`
+    says where upward surfaces of ground classes do: far ground hangs in veils. Its method
     `colour_towards`, if it has one, gives what an eye sees in place of `colour`; see `snow.layer`.
     """
 
