@@ -22,6 +22,7 @@ from climatenerf.weather.snow.cover import (
     cushions,
     eaves,
     held_by_crowns,
+    mean_within,
     settled,
     slid,
     slope_share,
@@ -158,7 +159,7 @@ def roof_raster(degrees):
 def test_eaves_continue_the_slope_of_a_roof(degrees):
     height, slope = roof_raster(degrees)
     height[:, 58:60] -= np.array([0.05, 0.2])  # a rounded edge
-    found, rim, roof = eaves(height, height > 1.0, H)
+    found, inside, rim, roof = eaves(height, height > 1.0, H)
     known = np.isfinite(found)
     assert rim[30].nonzero()[0].tolist() == [54, 55, 56, 57, 58, 59]
     over = known[30].nonzero()[0]
@@ -179,6 +180,15 @@ def test_flat_roofs_walls_and_small_slopes_have_no_eaves():
     assert not np.isfinite(eaves(onto, height > 1.0, H).overhang).any()
     narrow = np.where(np.abs(np.arange(60) - 30)[:, None] < 8, height, 0.0)  # 75 cm wide
     assert not np.isfinite(eaves(narrow, narrow > 1.0, H).overhang).any()
+
+
+def test_means_within_a_mask_know_nothing_of_what_is_outside():
+    mask = np.zeros((40, 40), bool)
+    mask[10:30, 5:20] = True
+    found = mean_within(np.where(mask, 0.7, np.nan), mask, 3.0)
+    assert found[mask] == pytest.approx(0.7)
+    assert np.all(np.isfinite(found))
+    assert found[39, 39] == 0
 
 
 def test_heaps_do_not_depend_on_the_spacing():

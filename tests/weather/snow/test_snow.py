@@ -367,6 +367,32 @@ def test_a_steep_roof_sheds_its_snow_to_the_ground_below():
     assert behind.numpy() == pytest.approx(0.1, rel=0.1)
 
 
+def test_a_rough_roof_carries_an_even_layer():
+    """Bumps of 4 cm on a roof, as a fit has them, do not show in the snow."""
+    slope = math.radians(35)
+    normal = (math.sin(slope), 0.0, math.cos(slope))
+    inside = Box((-2.0, -2.0, 0.5), (1.0, 2.0, 3.0))
+    plane = HalfSpace(normal, 1.5 * math.cos(slope))
+    rng = np.random.default_rng(0)
+    roofs = [Roof(inside, plane)]
+    for x, y in rng.uniform([-1.8, -1.8], [0.8, 1.8], (60, 2)):
+        bump = Box((x - 0.06, y - 0.06, 0.5), (x + 0.06, y + 0.06, 3.0))
+        roofs.append(Roof(bump, HalfSpace(normal, 1.54 * math.cos(slope))))
+    box = ((-4.0, -4.0, -1.0), (4.0, 4.0, 3.5))
+    field = LabelledField([ground(), *roofs], classes=[ROAD, *[BUILDING] * len(roofs)], box=box)
+    grid = SnowGrid((0.0, 0.0), (-1.0, 3.2), 0.05, 64)
+    snow = bake_snow(field, Snow(depth=0.1), CAMERAS, WHITE, grid=grid)
+    assert snow is not None
+    catch = snow.deposits.cascades[0][0]
+    x, y, z = np.moveaxis(catch.position, -1, 0)
+    roof = (catch.weight > 0) & (x > -1.5) & (x < 0.5) & (np.abs(y) < 1.5)
+    over = z[roof] - (1.5 - x[roof] * math.tan(slope))
+    assert 0 < over.mean() < 0.02
+    assert over.std() < 0.006  # that of the bumps is .014
+    assert catch.of_fall[roof].std() < 0.03
+    assert catch.of_fall[roof].mean() == pytest.approx(25 / 30, abs=0.08)
+
+
 def test_deep_snow_on_a_post_and_a_bench_slopes_at_the_angle_of_repose():
     post = Box((-0.05, -0.05, -1.0), (0.05, 0.05, 0.8))
     bench = Box((0.6, -0.4, -1.0), (1.4, 0.4, 0.5))

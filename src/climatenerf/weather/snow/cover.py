@@ -252,8 +252,10 @@ class Eaves(NamedTuple):
 
     overhang: Float[np.ndarray, "h w"]
     """Heights at which roofs would go on beyond their edges, m; NaN elsewhere."""
+    inside: Bool[np.ndarray, "h w"]
+    """Nodes of roofs, but for their edges."""
     rim: Bool[np.ndarray, "h w"]
-    """Nodes of roofs at their edges, which fits round."""
+    """Nodes of roofs at their lower edges, which fits round."""
     roof: tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]
     """Rows and columns of the nodes inside a roof that each node of both continues."""
 
@@ -286,7 +288,8 @@ def eaves(
     # Without nodes whose slopes are measured over the rounded rim.
     core = ndimage.binary_erosion(core, np.ones((2 * back + 1, 2 * back + 1), bool))
     if not core.any():
-        return Eaves(np.full(height.shape, np.nan), np.zeros(height.shape, bool), (rows, columns))
+        none = np.zeros(height.shape, bool)
+        return Eaves(np.full(height.shape, np.nan), none, none, (rows, columns))
     found: Any = ndimage.distance_transform_edt(~core, return_indices=True)
     distance, nearest = found
     at = tuple(nearest)
@@ -298,7 +301,16 @@ def eaves(
     near = below & (distance > 0) & (distance < 2 * back + EAVES / spacing + 0.5)
     lower = ~(height > continued - HIGH)  # NaN: nothing is there
     rim = near & solid & (height > continued - ROUNDED)
-    return Eaves(np.where(near & lower, continued, np.nan), rim, at)
+    return Eaves(np.where(near & lower, continued, np.nan), core, rim, at)
+
+
+def mean_within(
+    values: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], sigma: float
+) -> Float[np.ndarray, "h w"]:
+    """Gaussian means (`sigma` in nodes) over the nodes of a mask; 0 far from them."""
+    weight = ndimage.gaussian_filter(mask.astype(np.float64), sigma)
+    total = ndimage.gaussian_filter(np.where(mask, values, 0.0).astype(np.float64), sigma)
+    return total / np.maximum(weight, 1e-6)  # far from the mask both are 0: 0/0
 
 
 def bridged(

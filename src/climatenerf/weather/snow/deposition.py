@@ -26,6 +26,7 @@ from climatenerf.weather.snow.cover import (
     cushions,
     eaves,
     lumps,
+    mean_within,
     slid,
     slope_share,
 )
@@ -49,6 +50,7 @@ UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
 STEPS = 8  # towards the ground below a slanted ray
 ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
+ROOF_SMOOTHING, ROOF_PASSES = 0.3, 6  # m and passes; fitted roofs are planes with roughness
 BETWEEN_LEAVES = 0.026  # m of snow that open or steep crowns take before any bridges their leaves
 _CHUNK = 1 << 14  # positions per evaluation
 
@@ -138,7 +140,8 @@ def _caught(
     # Far ground is rougher in the field: its slopes are measured over more metres.
     base = max(SLOPE_CELLS, round(SLOPE_BASE / h))
     fall = rays.direction / -rays.direction[2]
-    smooth, cosine = smooth_ground(rays.at(surface), fall, 0.03 + 0.5 * h, base)
+    tolerance = 0.03 + 0.5 * h
+    smooth, cosine = smooth_ground(rays.at(surface), fall, tolerance, base)
     own = surface == rays.surface  # NaN compares False: elsewhere the terrain stands in
     # Learned normals are more accurate at edges and on curved surfaces than heights on a raster. On
     # the ground and on grass they are those of each clump.
@@ -146,9 +149,13 @@ def _caught(
     learned = own & np.isfinite(normal_z) & ~low
     cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
     share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
-    edges = eaves(surface, own & ~on_ground, h)
+    wall = cosine < WALL
+    edges = eaves(surface, own & ~on_ground & ~wall, h)
     share = np.where(edges.rim, np.maximum(share, share[edges.roof]), share)
-    wall = (cosine < WALL) & ~edges.rim
+    roofs = edges.inside | edges.rim
+    share = np.where(roofs, mean_within(share, roofs, ROOF_SMOOTHING / h), share)
+    for _ in range(ROOF_PASSES if roofs.any() else 0):
+        smooth[roofs] = smooth_ground(smooth, fall, tolerance, base)[0][roofs]
     # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there.
     lost = np.where(wall, 0.0, 1 - share)
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
