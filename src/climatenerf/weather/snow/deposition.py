@@ -48,6 +48,7 @@ LEAF = int(SOLID_OF[VEGETATION])
 GROUND_KINDS = SOLID_OF[list(GROUND)]
 UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
 STEPS = 8  # towards the ground below a slanted ray
+SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
 ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
 ROOF_SMOOTHING, ROOF_PASSES = 0.3, 6  # m and passes; fitted roofs are planes with roughness
@@ -150,7 +151,9 @@ def _caught(
     cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
     share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
     wall = cosine < WALL
-    edges = eaves(surface, own & ~on_ground & ~wall, h)
+    # In slanted snow walls are slopes of the raster as well; none of them is a roof.
+    upright = -rays.direction[2] > SLANTED
+    edges = eaves(surface, own & ~on_ground & ~wall & upright, h)
     share = np.where(edges.rim, np.maximum(share, share[edges.roof]), share)
     roofs = edges.inside | edges.rim
     share = np.where(roofs, mean_within(share, roofs, ROOF_SMOOTHING / h), share)
