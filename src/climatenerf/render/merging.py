@@ -56,15 +56,16 @@ def with_covered(
     for index, matter in enumerate(world.matters, start=1):
         covers: Callable[[Tensor], Tensor] | None = getattr(matter, "covers", None)
         veiled: Callable[[Tensor], Tensor] | None = getattr(matter, "veiled", None)
-        if covers is None or veiled is None:
+        if covers is None:
             continue
         own = ((kind == 0) & (weights > MIN_WEIGHT)).nonzero()[:, 0]
         x = rays_o[ray[own]] + samples.t[own, None] * rays_d[ray[own]]
         rough = covers(x)
-        near = rough | veiled(x) if classes else rough
+        near = rough | veiled(x) if classes and veiled is not None else rough
         own, x, rough = own[near], x[near], rough[near]
         normal, solid = normals_at(world.field, x, rays_d[ray[own]])
-        covered = rough | torch.isin(solid, ground) if classes else rough
+        # What is near and not rough lies in a veil.
+        covered = rough | torch.isin(solid, ground)
         kind = kind.index_fill(0, own[covered & (normal[:, 2] > FACES_UP)], index)
     return kind
 
@@ -139,6 +140,6 @@ def _layers(
     begins[1:] = ~adjacent | (t[1:] - t[:-1] > dt[1:] + dt[:-1])
     layer = begins.cumsum(0) - 1
     count = int(begins.sum())
-    total = torch.zeros(count, device=t.device).index_add_(0, layer, weights)
-    mean = torch.zeros(count, device=t.device).index_add_(0, layer, weights * t)
+    total = weights.new_zeros(count).index_add_(0, layer, weights)
+    mean = weights.new_zeros(count).index_add_(0, layer, weights * t)
     return layer, mine[begins], mean / total

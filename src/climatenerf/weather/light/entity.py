@@ -54,7 +54,7 @@ from climatenerf.weather.world import Preparation, World
 DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor parameters place
 EXPOSED = 3  # of what photos show, one pixel in so many counts for the exposure
 DARKEST = 1e-3  # luminance whose logarithm is taken
-SNOW_WHITE = 0.5, 0.85  # of white level ground where snow falls, median radiance; 1 is white
+SNOW_RADIANCE = 0.5, 0.85  # limits of the median radiance of snow on level ground; 1 is white
 LEVEL = 0.7  # z of normals of level ground
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
@@ -244,7 +244,7 @@ class LightEntity:
         level = float(luma(under(1.0).open_irradiance()))
         first = float(luma(old.open_irradiance())) / level
         bare = relit(self._surfaces, old, under(first))
-        gain = self._gain(weather, old, bare, first) * 2.0**weather.sky.ev
+        gain = self._gain(weather, old, bare, first, cover) * 2.0**weather.sky.ev
         lit = replace(under(gain), coefficients=gain / first * bare.coefficients)
         hazy = below_smog(weather, lit)
         if surfaces is None and hazy is lit:
@@ -274,8 +274,13 @@ class LightEntity:
         sun = (flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(elevation))
         return skies.NewSky(weather.sky.kind, sun, weather.sky.cover)
 
-    def _gain(self, weather: Weather, old: SceneLight, new: SceneLight, gain: float) -> float:
-        """Factor from klx to the units of the photos; `new` has the factor `gain`."""
+    def _gain(
+        self, weather: Weather, old: SceneLight, new: SceneLight, gain: float, cover: float
+    ) -> float:
+        """Factor from klx to the units of the photos; `new` has the factor `gain`.
+
+        Snow on the fraction `cover` of the ground is in it, but its light is not in `new`.
+        """
         if weather.sky.exposure == "fixed":
             captured = self.captured
             assert captured is not None
@@ -291,13 +296,13 @@ class LightEntity:
         shining = radiance * shown.ratio(radiance, x, normal, kind)
         before, after = (luma(each).clamp_min(DARKEST).log().mean() for each in (radiance, shining))
         kept = gain * math.exp(float(before - after))
-        if not any(moment.snow.depth for moment in self._given.moments):
-            return kept
         # For snow that is neither grey nor without relief, photographers correct the exposure.
         up = normal[:, 2] > LEVEL
         white = luma(new.irradiance(x[up], normal[up]) if bool(up.any()) else new.open_irradiance())
-        least, most = (each * math.pi * gain / float(white.median()) for each in SNOW_WHITE)
-        return min(max(kept, least), most)
+        # 1e-6: without light 0/0.
+        white_at_one = max(float(white.median()), 1e-6) / math.pi / gain
+        least, most = (radiance / white_at_one for radiance in SNOW_RADIANCE)
+        return kept * (min(max(kept, least), most) / kept) ** cover
 
     def check(self, moments: tuple[Weather, ...]) -> None:
         """Refuse a sun that does not belong to its sky.

@@ -27,13 +27,14 @@ HIGHEST_VEIL = 2.0  # m above the ground; what hangs higher may be a roof of a w
 EAVES = 0.1  # m, by which snow overhangs the lower edge of a roof
 DRAWN_BACK = 0.15  # m from the edge of a fitted roof, within which it is rounded
 ROOF = math.tan(math.radians(20)), math.tan(math.radians(60))  # slopes of roofs with eaves
-HIGH, ROUNDED = 0.5, 0.3  # m below a roof's plane: what lies below its eaves, and its rounded rim
+MIN_DROP = 0.5  # m below the eaves of a roof, of what lies there
+MAX_ROUNDING = 0.3  # m between a roof's plane and its rounded rim
 WIDE = 1.0  # m, the least side of a roof
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
-MAX_SWEEPS = 1000  # of `settled`; a heap of a metre on a lattice of 3 cm takes 300
+MAX_SWEEPS = 400  # of `settled`
 
 
 def slope_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarray, "*n"]:
@@ -255,9 +256,9 @@ class Eaves(NamedTuple):
     inside: Bool[np.ndarray, "h w"]
     """Nodes of roofs, but for their edges."""
     rim: Bool[np.ndarray, "h w"]
-    """Nodes of roofs at their lower edges, which fits round."""
-    roof: tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]
-    """Rows and columns of the nodes inside a roof that each node of both continues."""
+    """Nodes of roofs at their lower edges, which are rounded in a fitted field."""
+    nearest: tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]
+    """Rows and columns of the nearest node inside a roof."""
 
 
 def eaves(
@@ -299,8 +300,8 @@ def eaves(
     # Along the slope; what lies beside a gable is no eaves.
     below = fall < -0.8 * steepness[at] * distance * spacing
     near = below & (distance > 0) & (distance < 2 * back + EAVES / spacing + 0.5)
-    lower = ~(height > continued - HIGH)  # NaN: nothing is there
-    rim = near & solid & (height > continued - ROUNDED)
+    lower = ~(height > continued - MIN_DROP)  # NaN: nothing is there
+    rim = near & solid & (np.abs(height - continued) < MAX_ROUNDING)
     return Eaves(np.where(near & lower, continued, np.nan), core, rim, at)
 
 

@@ -154,7 +154,7 @@ def _caught(
     # In slanted snow walls are slopes of the raster as well; none of them is a roof.
     upright = -rays.direction[2] > SLANTED
     edges = eaves(surface, own & ~on_ground & ~wall & upright, h)
-    share = np.where(edges.rim, np.maximum(share, share[edges.roof]), share)
+    share = np.where(edges.rim, np.maximum(share, share[edges.nearest]), share)
     roofs = edges.inside | edges.rim
     share = np.where(roofs, mean_within(share, roofs, ROOF_SMOOTHING / h), share)
     for _ in range(ROOF_PASSES if roofs.any() else 0):
@@ -169,10 +169,9 @@ def _caught(
     catches = [_catch(smooth, moved * share + arrived, -share * caught, 0 * share, weight)]
     over = np.isfinite(edges.overhang)
     if over.any():
-        part = np.where(over, share[edges.roof], 0.0)
-        catches.append(
-            _catch(rays.at(edges.overhang), part, 0 * part, 0 * part, over.astype(np.float64))
-        )
+        part = np.where(over, (moved * share)[edges.nearest], 0.0)
+        added = _catch(rays.at(edges.overhang), part, 0 * part, 0 * part, over.astype(np.float64))
+        catches.append(replace(added, ends=True))
     if caught.any():
         position = rays.at(crown.height)
         gaps = BETWEEN_LEAVES * (1 - crown.keeps)

@@ -80,6 +80,8 @@ class Catch:
     shade: Float32[np.ndarray, "h w"]
     """0 to 1; NaN: unknown. In the light of the place: light over that around, by `SHADE_UNIT`. In
     the paper's light: the brightness of the snow."""
+    ends: bool = False
+    """Whether snow slides down where the raster ends, to the ground far below."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,8 @@ def _columns(
     for catch in catches:
         thickness = catch.of_fall * np.float64(depth) + catch.of_held * held - catch.hidden
         used = (catch.weight > 0) & (thickness > 0)
-        base = np.where(catch.weight > 0, catch.position[..., 2].astype(np.float64), np.nan)
+        nothing = -1e3 if catch.ends else np.nan  # far below; NaN holds the snow
+        base = np.where(catch.weight > 0, catch.position[..., 2].astype(np.float64), nothing)
         thickness = settled(base, np.where(used, thickness, 0.0), REPOSE * spacing)
         used &= thickness > _THINNEST
         parts.append(

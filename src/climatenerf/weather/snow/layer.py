@@ -23,13 +23,13 @@ from climatenerf.field.protocol import COMPLETES, RadianceField, ground_height, 
 from climatenerf.ops.cpu import metaballs
 from climatenerf.ops.cpu.metaballs import Lattice
 from climatenerf.weather.light.sun import sun_direction
-from climatenerf.weather.snow.cover import HIGHEST_VEIL
+from climatenerf.weather.snow.cover import HIGHEST_VEIL, slope_share
 from climatenerf.weather.snow.deposition import Light, find_deposits
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Deposits, SnowGrid, choose_grid, grow
 from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.relief import slopes, tilted
-from climatenerf.weather.snow.shadow_masks import ShadowMasks
+from climatenerf.weather.snow.shadow_masks import ShadowMasks, check_folder
 from climatenerf.weather.snow.sparkle import glints
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import Light as PlaceLight
@@ -38,7 +38,9 @@ from climatenerf.weather.world import Preparation, World
 LEVEL_Z, SIDE_Z = 0.5, 0.2  # z of normals of a layer's surface, and of its sides
 SIDE = 0.3  # m of snow behind a side
 SKIN = 0.15  # sum of the balls half a spacing above a level surface
-CONTACT, RISES = 0.1, 0.5  # m over the ground: where contact shade is known; scale of its decay
+DUSTING = 0.005, 0.02  # m; up to the first the depth that fell counts, from the second the lattice
+CONTACT_HEIGHT = 0.1  # m over the ground, where contact shade is known
+CONTACT_DECAY = 0.5  # m, over which it falls to 1/e
 BURIED = 0.04  # m below the ground, to which roughness reaches
 OPAQUE, CLEAN_OPAQUE = 0.95, 0.99
 """Reflectance of a slab from which on the ground below is left out, which then has less than a
@@ -174,7 +176,13 @@ class BakedSnow:
         if self.snow.light == "scene":
             shade = to_device(rest[:, 1], x.device)
             away = to_device(sums < SKIN, x.device)  # on a veil: as on open level ground
-            height = torch.where(away, self.snow.depth or 0.0, height)
+            depth = self.snow.depth or 0.0
+            height = torch.where(away, depth, height)
+            # The lattice stores heights to some millimetres: a dusting has the depth that fell.
+            dusting = min(max((DUSTING[1] - depth) / (DUSTING[1] - DUSTING[0]), 0.0), 1.0)
+            if dusting > 0:
+                share = slope_share(to_numpy(normal[:, 2]), self.snow).astype(np.float32)
+                height = torch.lerp(height, depth * to_device(share, x.device), dusting)
             shade = torch.where(away, SHADE_UNIT, shade)
             if relief is not None:
                 normal = tilted(normal, relief, height)
@@ -202,7 +210,9 @@ class BakedSnow:
         What stands close by leaves the fraction `contact` of the diffuse light of the place, near
         the ground; the top of a heap rises above it.
         """
-        contact = 1 - (1 - contact) * torch.exp(-(height - CONTACT).clamp_min(0) / RISES)
+        contact = 1 - (1 - contact) * torch.exp(
+            -(height - CONTACT_HEIGHT).clamp_min(0) / CONTACT_DECAY
+        )
         if self.place_light is None:
             white = to_device(self.light.irradiance_over_pi.astype(np.float32), x.device)
             white = white * contact[:, None]
@@ -211,7 +221,8 @@ class BakedSnow:
         deep = torch.tensor(albedo_of(self.snow), dtype=torch.float32, device=x.device)
         # A side shows the snow behind it, however thin the layer is there.
         side = ((LEVEL_Z - normal[:, 2]) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
-        slab = slab_reflectance(height + SIDE * side, self.snow.grain)[:, None]
+        behind = SIDE * min((self.snow.depth or 0.0) / DUSTING[1], 1.0)  # a dusting has no sides
+        slab = slab_reflectance(height + behind * side, self.snow.grain)[:, None]
         reflectance = torch.minimum(slab, deep)
         opaque = OPAQUE if float(deep.max()) < OPAQUE else CLEAN_OPAQUE
         thin = (slab[:, 0] < opaque).nonzero()[:, 0]
@@ -300,8 +311,12 @@ class SnowEntity:
         self._preparation = preparation
         self._baked = self._grown = None
         snowy = [moment for moment in preparation.moments if moment.snow.depth > 0]
-        if any(moment.snow.shadows and moment.snow.light != "paper" for moment in snowy):
-            raise UserError("--snow.shadows belongs to the paper's shading; add --snow.light paper")
+        for folder in {moment.snow.shadows for moment in snowy if moment.snow.shadows}:
+            if any(moment.snow.light != "paper" for moment in snowy):
+                raise UserError(
+                    "--snow.shadows belongs to the paper's shading; add --snow.light paper"
+                )
+            check_folder(Path(folder))  # before photos are traced for it
         if snowy:
             self._bake(snowy[-1])
 

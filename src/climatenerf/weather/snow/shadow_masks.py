@@ -24,6 +24,19 @@ REACH = 0.5  # m from a place, up to which rays count
 PROPORTIONS = 0.05  # relative difference of those of a reduced photo and its mask
 
 
+def check_folder(folder: Path) -> None:
+    """Check that a folder of masks exists.
+
+    Raises:
+        UserError: it does not.
+    """
+    if not folder.is_dir():
+        raise UserError(
+            f"--snow.shadows: there is no folder {excerpt(str(folder))}; give one with a mask"
+            " for each photo, white in shadow"
+        )
+
+
 class ShadowMasks:
     """Sunlight of places, by masks of the photos."""
 
@@ -38,11 +51,7 @@ class ShadowMasks:
         Raises:
             UserError: there is no such folder, no mask of any photo in it, or one cannot be read.
         """
-        if not folder.is_dir():
-            raise UserError(
-                f"--snow.shadows: there is no folder {excerpt(str(folder))}; give one with a mask"
-                " for each photo, white in shadow"
-            )
+        check_folder(folder)
         files, ends, values = FileNames(folder), [], []
         for photo in photos:
             path = files.find_any(_names(photo.view.name))
