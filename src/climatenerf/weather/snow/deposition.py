@@ -148,7 +148,10 @@ def _caught(
     # the ground and on grass they are those of each clump.
     low = on_ground | (surface < ground + UNDERGROWTH)  # NaN compares False
     learned = own & np.isfinite(normal_z) & ~low
-    cosine = ndimage.median_filter(np.where(learned, normal_z, cosine), 5)
+    cosine = np.where(learned, normal_z, cosine)
+    # At the border of what is known the median is not that of nothing, which is 0.
+    cosine = np.where(np.isfinite(surface), cosine, ndimage.maximum_filter(cosine, 5))
+    cosine = ndimage.median_filter(cosine, 5)
     share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
     wall = cosine < WALL
     # In slanted snow walls are slopes of the raster as well; none of them is a roof.

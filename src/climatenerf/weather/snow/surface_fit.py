@@ -115,18 +115,22 @@ def _tangent(
     tangent = (1.0, 0.0, 0.0) if di > 0 else (0.0, 1.0, 0.0)
     signs = 0.0
     for side in (-1, 1):
-        row, column = j + side * dj, i + side * di
-        if row < 0 or column < 0 or row >= rows or column >= columns:
+        length = max(dj, di)
+        while length > 0:  # shorter where the surface ends sooner
+            row, column = j + side * min(dj, length), i + side * min(di, length)
+            inside = row >= 0 and column >= 0 and row < rows and column < columns
+            if inside and not math.isnan(points[row, column, 2]):
+                break
+            length //= 2
+        if length == 0:
             continue
         x = (points[row, column, 0] - points[j, i, 0]) * side
         y = (points[row, column, 1] - points[j, i, 1]) * side
         z = (points[row, column, 2] - points[j, i, 2]) * side
-        if math.isnan(z):
-            continue
         if signs * z < 0:  # a ridge or a groove
             return (1.0, 0.0, 0.0) if di > 0 else (0.0, 1.0, 0.0)
         signs = z
-        if abs(z) < best:
-            best = abs(z)
+        if abs(z) / length < best:
+            best = abs(z) / length
             tangent = (x, y, z)
     return tangent
