@@ -28,7 +28,7 @@ from climatenerf.weather.snow.cover import (
     slope_share,
 )
 from climatenerf.weather.snow.deposition import surfaces_and_leaves
-from climatenerf.weather.snow.lattice import SnowGrid
+from climatenerf.weather.snow.lattice import Catch, SnowGrid, _columns
 from climatenerf.weather.snow.layer import bake_snow
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.world import World
@@ -447,3 +447,18 @@ def test_snow_on_a_steep_slope_hides_it_without_gaps():
     samples = baked.march(feet - 0.5 * d, d, torch.zeros(500), torch.full((500,), 0.5))
     depth = torch.zeros(500).index_add_(0, samples.ray_index(), samples.sigma * samples.dt)
     assert (torch.exp(-depth) < 0.5).float().mean() > 0.99
+
+
+def test_deep_snow_on_an_overhang_ends_in_a_slope():
+    """Snow of .6 m on eaves two nodes wide is no higher there than the angle of repose allows."""
+    position = np.full((9, 9, 3), np.nan, np.float32)
+    position[2:7, 4:6] = [0.0, 0.0, 3.0]
+    weight = np.zeros((9, 9), np.float32)
+    weight[2:7, 4:6] = 1
+    one, none = np.ones((9, 9), np.float32), np.zeros((9, 9), np.float32)
+    thickest = []
+    for ends in (True, False):
+        catch = Catch(position, one, none, none, weight, none, ends)
+        thickest.append(float(_columns((catch,), 0.6, H)[3].max()))
+    assert thickest[0] == pytest.approx(REPOSE * H, rel=0.01)
+    assert thickest[1] == pytest.approx(0.6)
