@@ -9,9 +9,10 @@ and the true dry one elsewhere; `snow and gains` multiplies the dry one by the b
 class and channel. In the rows of vegetation all else is the truth, and vegetation is the dry
 picture, the best mixture of it with white, or the truth blurred by some pixels. `no_vegetation`
 leaves out vegetation's pixels. With a run `ours` is its picture, and in `ours, edges true` the
-truth stands within some pixels of edges: of classes, of depth and of what is snowed on. Floods have
-it with the dry part or the water from the truth too. All in dB of display values, the mean of all
-views.
+truth stands within some pixels of edges: of classes, of depth and of what is snowed on. In `ours,
+true where the fit errs` it stands where the fit's clean depth is wrong, and within some pixels of
+that. Floods have it with the dry part or the water from the truth too. All in dB of display
+values, the mean of all views.
 """
 
 import argparse
@@ -23,17 +24,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
+from climatenerf.api import load_run
 from climatenerf.core.classes import MERGED, VEGETATION
 from climatenerf.core.srgb import to_linear
 from climatenerf.evaluation.evaluated_run import EvaluatedRun, display_8bit, prepare_weather
 from climatenerf.evaluation.reference import Reference, Truth, WeatherTruth, read_reference
-from climatenerf.field.checkpoint import load_field
 from climatenerf.render.frame import see_frame
-from climatenerf.scene import load_scene
+from climatenerf.weather.world import World
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference" / "street"
 BLURS = (2.0, 4.0)  # px
 EDGES = (1, 2)  # px from an edge
+DEPTH_ERROR = 0.03, 0.05  # of the depth and m, whichever is more
 MIN_SNOW = 1e-3  # m of thickness
 Picture = Float[np.ndarray, "h w 3"]
 
@@ -82,6 +84,15 @@ def snow_ceilings(
     if folder is not None:
         ours, _ = rendered(reference, case, folder)
         rows["ours"] = scores(lambda k: ours[k], everywhere)
+        errs = wrong_depth(reference, folder)
+        for reach in (0, *EDGES):
+            wrong = [
+                ndimage.binary_dilation(each, iterations=reach) if reach else each for each in errs
+            ]
+            right = [~each for each in wrong]
+            rows[f"ours, true where the fit errs and within {reach} px"] = scores(
+                lambda k: ours[k], right
+            ) | {"pixels": float(np.mean(wrong))}
         for reach in EDGES:
             edges = [near_edges(view, case, reach) for view in reference.truths]
             inner = [~each for each in edges]
@@ -102,6 +113,26 @@ def near_edges(view: Truth, case: WeatherTruth, reach: int) -> Bool[np.ndarray, 
     for kind in (MERGED[view.label], (layers["thickness"] > MIN_SNOW).astype(np.uint8)):
         edge |= ndimage.maximum_filter(kind, 3) != ndimage.minimum_filter(kind, 3)
     return ndimage.binary_dilation(edge, iterations=reach)
+
+
+def wrong_depth(reference: Reference, folder: Path) -> list[Bool[np.ndarray, "h w"]]:
+    """Pixels of the test views in which a run's clean depth is wrong."""
+    run = evaluated(reference, folder)
+    found = []
+    for view in reference.truths:
+        _, layers = see_frame(World(run.completed or run.field), *run.camera(view))
+        known = np.isfinite(view.depth)
+        # Infinite depths are sky, which is right where both have it.
+        error = np.abs(np.where(known, layers["depth"], 0) - np.where(known, view.depth, 0))
+        wrong = error > np.maximum(DEPTH_ERROR[0] * np.where(known, view.depth, 1), DEPTH_ERROR[1])
+        found.append(np.where(known, wrong, np.isfinite(layers["depth"])))
+    return found
+
+
+def evaluated(reference: Reference, folder: Path) -> EvaluatedRun:
+    """A run with its completed ground."""
+    run = load_run(folder)
+    return EvaluatedRun(run.field, run.scene, reference, run.completed())
 
 
 def gains(
@@ -159,7 +190,7 @@ def rendered(
     reference: Reference, case: WeatherTruth, folder: Path
 ) -> tuple[list[Picture], list[dict[str, np.ndarray]]]:
     """A run's pictures of the test views in a weather, linear, and their layers."""
-    run = EvaluatedRun(load_field(folder), load_scene(folder), reference)
+    run = evaluated(reference, folder)
     cameras = [run.camera(truth) for truth in reference.truths]
     session = prepare_weather(run, case.weather, case.time, [c2w for _, c2w in cameras])
     frames = [see_frame(session.world(case.time), *camera) for camera in cameras]

@@ -166,7 +166,7 @@ def test_no_snow_hangs_below_a_thin_table():
             below = torch.cat([xy, torch.full((4000, 1), z)], -1)
             if z < 0.61 and depth > 0.2:  # a heap of what slid off the table lies around it
                 below = below[(xy.abs() < 0.35).all(1)]
-            assert snow.density(below).max() < 1e-6
+            assert snow.density(below).max() == 0
         on_top = torch.cat([xy, torch.full((4000, 1), 0.75)], -1)[(xy.abs() < 0.3).all(1)]
         assert depth_over(snow, on_top).numpy() == pytest.approx(depth, rel=0.1)
 
@@ -294,10 +294,10 @@ def test_thin_snow_lets_the_ground_through_and_deep_snow_hides_it():
         contrast.append(float((seen[light].mean() - seen[dark].mean()) / seen.mean()))
         mean.append(float(seen[dark].mean()))
     fading = np.diff(contrast)
-    assert np.all(fading[:-1] < 0) and fading[-1] < 1e-9  # nothing is left to fade in the end
+    assert np.all(fading[:-1] < 0) and fading[-1] <= 0  # nothing is left to fade in the end
     assert contrast[0] > 0.4
     assert contrast[-1] < 0.01
-    assert np.all(np.diff(mean) >= -1e-3)
+    assert np.all(np.diff(mean) >= 0)
     assert mean[0] == pytest.approx(float(bare[dark].mean()), abs=0.12)
 
 

@@ -186,7 +186,8 @@ def evaluate(
 
     Returns:
         float32 arrays: the normalised sum s [n]; its gradient [n, 3], 1/m; and [n, 3]: height above
-        the ground, m, brightness, and density O, 1/m, which is 0 below the ground.
+        the ground, m, brightness, and density O, 1/m, which is 0 below the ground and where s is
+        low.
     """
     n = points.shape[0]
     sums = np.zeros(n, np.float32)
@@ -208,7 +209,8 @@ def evaluate(
         height, shade = _means(lattice, brick, px, py, pz)
         height += _slope_bias(gx, gy, gz)
         means[r, 0], means[r, 1] = height * h, shade
-        if height * h > -lattice.burial[k] and z - height * h >= lattice.floor:
+        above_ground = height * h > -lattice.burial[k] and z - height * h >= lattice.floor
+        if s >= LOW and above_ground:  # as along rays
             means[r, 2] = _extinction(s, h)
     return sums, gradients, means
 

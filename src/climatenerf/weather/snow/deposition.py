@@ -22,6 +22,7 @@ from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField, device_of, ground_height
 from climatenerf.weather.snow.cover import (
     WALL,
+    Eaves,
     bridged,
     cushions,
     eaves,
@@ -157,13 +158,15 @@ def _caught(
     # In slanted snow walls are slopes of the raster as well; none of them is a roof.
     upright = -rays.direction[2] > SLANTED
     edges = eaves(surface, own & ~on_ground & ~wall & upright, h)
-    share = np.where(edges.rim, np.maximum(share, share[edges.nearest]), share)
-    roofs = edges.inside | edges.rim
-    share = np.where(roofs, mean_within(share, roofs, ROOF_SMOOTHING / h), share)
-    for _ in range(ROOF_PASSES if roofs.any() else 0):
-        smooth[roofs] = smooth_ground(smooth, fall, tolerance, base)[0][roofs]
-    # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there.
-    lost = np.where(wall, 0.0, 1 - share)
+    if edges.inside.any():
+        share = _even_on_roofs(share, edges, h)
+        roofs = edges.inside | edges.rim
+        for _ in range(ROOF_PASSES):
+            smooth[roofs] = smooth_ground(smooth, fall, tolerance, base)[0][roofs]
+    # What hits a wall falls with the rest: slanted rays that a wall stops must not pile up there,
+    # nor at its foot, which is a bend of the raster since slopes are measured over `base` nodes.
+    stops = wall if upright else ndimage.binary_dilation(wall, iterations=base // 2)
+    lost = np.where(stops, 0.0, 1 - share)
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
     shelter = np.where(np.isfinite(leaves), leaves, smooth[..., 2])
     moved = drifted(smooth[..., 2], shelter, snow.drift, snow.wind_direction, h)
@@ -174,7 +177,7 @@ def _caught(
     if over.any():
         part = np.where(over, (moved * share)[edges.nearest], 0.0)
         added = _catch(rays.at(edges.overhang), part, 0 * part, 0 * part, over.astype(np.float64))
-        catches.append(replace(added, ends=True))
+        catches.append(replace(added, overhangs=True))
     if caught.any():
         position = rays.at(crown.height)
         gaps = BETWEEN_LEAVES * (1 - crown.keeps)
@@ -189,6 +192,15 @@ def _caught(
         inside = (offset < half) & (offset >= inner)  # NaN compares False
         kept.append(replace(each, weight=each.weight * inside))
     return kept
+
+
+def _even_on_roofs(
+    share: Float[np.ndarray, "h w"], edges: Eaves, spacing: float
+) -> Float[np.ndarray, "h w"]:
+    """Shares that roofs keep, without their roughness, and continued to their rims."""
+    roofs = edges.inside | edges.rim
+    share = np.where(edges.rim, np.maximum(share, share[edges.nearest]), share)
+    return np.where(roofs, mean_within(share, roofs, ROOF_SMOOTHING / spacing), share)
 
 
 def _catch(

@@ -28,7 +28,7 @@ _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 # surface as a half-space.
 _BURIAL = SUPPORT + _BLUR
 _BELOW, _ABOVE = 20.0, 40.0  # m; ground up to this far below and above the cameras carries snow
-SHADE_UNIT = 0.5
+SHADE_UNIT = 128 / 255  # a value that a byte holds
 """`Catch.shade` of snow that receives as much light as its surroundings."""
 _THINNEST = 2e-4  # m; thinner snow is no layer of grains
 
@@ -80,8 +80,8 @@ class Catch:
     shade: Float32[np.ndarray, "h w"]
     """0 to 1; NaN: unknown. In the light of the place: light over that around, by `SHADE_UNIT`. In
     the paper's light: the brightness of the snow."""
-    ends: bool = False
-    """Whether snow slides down where the raster ends, to the ground far below."""
+    overhangs: bool = False
+    """Whether it hangs over lower ground, to which snow falls from its edges."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def _columns(
     for catch in catches:
         thickness = catch.of_fall * np.float64(depth) + catch.of_held * held - catch.hidden
         used = (catch.weight > 0) & (thickness > 0)
-        nothing = -1e3 if catch.ends else np.nan  # far below; NaN holds the snow
+        nothing = -1e3 if catch.overhangs else np.nan  # far below; beside NaN snow stays
         base = np.where(catch.weight > 0, catch.position[..., 2].astype(np.float64), nothing)
         thickness = settled(base, np.where(used, thickness, 0.0), REPOSE * spacing)
         used &= thickness > _THINNEST
