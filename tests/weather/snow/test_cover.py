@@ -182,6 +182,23 @@ def test_flat_roofs_walls_and_small_slopes_have_no_eaves():
     assert not np.isfinite(eaves(narrow, narrow > 1.0, H).overhang).any()
 
 
+def test_what_falls_deep_is_scattered():
+    """The same snow that slides from edges 3 and 9 m high; a ledge of one node builds no tower."""
+    highest = []
+    for high in (3.0, 9.0):
+        height = np.zeros((120, 120))
+        height[:, :40] = high + 1.2 * H * np.arange(40)[::-1]
+        share = np.where(height > 0, 0.5, 1.0)
+        arrived = slid(1 - share, share, height, H)
+        assert arrived.sum() == pytest.approx((1 - share).sum(), rel=0.05)
+        highest.append(arrived.max())
+    assert highest[1] < 0.3 * highest[0]
+    height = 9.0 - 1.2 * H * np.broadcast_to(np.arange(60.0), (60, 60))
+    share = np.full((60, 60), 0.5)
+    share[30, 30] = 1.0
+    assert slid(1 - share, share, height, H).max() < 5
+
+
 def test_means_within_a_mask_know_nothing_of_what_is_outside():
     mask = np.zeros((40, 40), bool)
     mask[10:30, 5:20] = True

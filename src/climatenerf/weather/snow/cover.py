@@ -33,6 +33,8 @@ WIDE = 1.0  # m, the least side of a roof
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
+SCATTERS, DROPS = 0.2, (0.0, 4.0, 8.0)  # of the drop (m), by which what falls deep is spread
+LEDGE = 0.1  # share of level nodes within reach of what arrives
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
 MAX_SWEEPS = 400  # of `settled`
 
@@ -99,8 +101,9 @@ def slid(
     """Depth that arrives from steeper surfaces above, over the depth that falls.
 
     What a slope does not keep slides down, over edges as well, to the first surface that keeps all
-    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m. What slides
-    passes over depressions of a slope, which are roughness of the field.
+    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m, and over
+    `SCATTERS` of its drop from higher edges, so that no spires stand below crowns of a wrong class.
+    What slides passes over depressions of a slope, which are roughness of the field.
 
     Args:
         lost: depth that slides off each node, over the depth that falls.
@@ -116,11 +119,17 @@ def slid(
     smooth = np.where(np.abs(smooth - height) < spacing, smooth, height)
     filled = _depressions_filled(smooth, share > KEEPS_ALL)
     order = np.argsort(np.where(known, -filled, np.inf), axis=None, kind="stable")
-    arrived = _routed(lost, share, filled, order[: int(known.sum())])
+    arrived, drop = _routed(lost, share, filled, order[: int(known.sum())])
     level = (share > KEEPS_ALL).astype(np.float64)
-    sigma = PILE / spacing
-    reach = np.maximum(ndimage.gaussian_filter(level, sigma), 1e-3)
-    return level * ndimage.gaussian_filter(arrived / reach, sigma)
+    heaps = np.zeros_like(level)
+    for low, high in zip(DROPS, (*DROPS[1:], math.inf), strict=True):
+        part = np.where((drop >= low) & (drop < high), arrived, 0.0)
+        if part.any():
+            sigma = max(PILE, SCATTERS * low) / spacing
+            # What finds no more than a ledge to lie on is lost, and builds no tower there.
+            reach = np.maximum(ndimage.gaussian_filter(level, sigma), LEDGE)
+            heaps += level * ndimage.gaussian_filter(part / reach, sigma)
+    return heaps
 
 
 @njit(cache=True)
@@ -167,11 +176,17 @@ def _routed(
     share: Float[np.ndarray, "h w"],
     height: Float[np.ndarray, "h w"],
     order: Int[np.ndarray, "n"],
-) -> Float[np.ndarray, "h w"]:
-    """Carry what does not stay to the lowest neighbours, from the highest node to the lowest."""
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Carry what does not stay to the lowest neighbours, from the highest node to the lowest.
+
+    Returns:
+        What arrives at nodes that keep all, over the depth that falls, and the highest step that it
+        has dropped, m.
+    """
     rows, columns = share.shape
     carried = np.zeros((rows, columns))
     arrived = np.zeros((rows, columns))
+    drop = np.zeros((rows, columns))
     for q in order:
         j, i = q // columns, q % columns
         if share[j, i] > KEEPS_ALL:
@@ -188,7 +203,10 @@ def _routed(
                     best, to_j, to_i = fall, jj, ii
         if to_j >= 0:
             carried[to_j, to_i] += carried[j, i] + lost[j, i]
-    return arrived
+            if carried[j, i] + lost[j, i] > 0:
+                step = height[j, i] - height[to_j, to_i]
+                drop[to_j, to_i] = max(drop[to_j, to_i], drop[j, i], step)
+    return arrived, drop
 
 
 @njit(cache=True)
