@@ -1,6 +1,7 @@
 """Shadows of the photos, baked from masks: the mean over the rays that see a place."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from climatenerf.scene.photo_rays import PhotoRays
 from climatenerf.scene.scene import Scene, View
 from climatenerf.weather.description import weather_from_table, weather_to_table
 from climatenerf.weather.snow.lattice import SnowGrid
-from climatenerf.weather.snow.layer import bake_snow
+from climatenerf.weather.snow.layer import SnowEntity, bake_snow
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.shadow_masks import ShadowMasks
 
@@ -108,3 +109,14 @@ def test_masks_belong_to_the_papers_shading_and_survive_a_weather_file(tmp_path)
     table["snow"]["light"] = "scene"
     with pytest.raises(UserError, match="add --snow.light paper"):
         RenderSession(field, scene, weather_from_table(table))
+
+
+def test_a_missing_folder_is_told_before_photos_are_traced():
+    def trace():
+        raise AssertionError("photos are traced")
+
+    moment = weather_from_table(
+        {"snow": {"depth": "0.1 m", "light": "paper", "shadows": "no/such/folder"}}
+    )
+    with pytest.raises(UserError, match="there is no folder"):
+        SnowEntity(SimpleNamespace(moments=(moment,), photo_rays=trace))

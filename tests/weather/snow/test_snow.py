@@ -328,6 +328,19 @@ def test_brightness_has_no_steps_in_depth():
     assert steps[4:].max() < 0.05, "after two millimetres no more than a tenth a millimetre"
 
 
+def test_a_dusting_is_as_even_as_it_fell():
+    """A millimetre, stored in steps of a part of one, shows no rings on level ground."""
+    plane = ground(0.01, 0.3)
+    field = AnalyticField([plane], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
+    grid = SnowGrid((0.013, 0.027), (-1.0, 3.0), 0.2, 32)
+    snow = dataclasses.replace(bake([plane], 0.001, grid), ground=field)
+    feet = on_plane(plane, 2000, 2.0)
+    seen = snow.colour(feet + torch.tensor([0.0, 0.0, 0.001]))
+    bare = field.colour(feet, torch.tensor([[0.0, 0.0, -1.0]]).expand(2000, 3))
+    assert seen.mean() > bare.mean() + 0.05
+    assert (seen - bare).std(0).max() < 0.01
+
+
 def test_thin_snow_on_slopes_has_no_ripples():
     plane = ground(math.radians(40), 0.5)
     snow = bake([plane], 0.03)
