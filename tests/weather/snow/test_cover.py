@@ -16,7 +16,6 @@ from climatenerf.render.integrator import trace
 from climatenerf.scene.terrain import Terrain
 from climatenerf.weather.snow.cover import (
     CROWN_HOLDS,
-    EAVES,
     REPOSE,
     bridged,
     cushions,
@@ -164,7 +163,7 @@ def test_eaves_continue_the_slope_of_a_roof(degrees):
     assert rim[30].nonzero()[0].tolist() == [54, 55, 56, 57, 58, 59]
     over = known[30].nonzero()[0]
     assert over.min() == 60, "the roof itself is no overhang"
-    assert EAVES - H < H * len(over) <= EAVES + H
+    assert len(over) == 2, "a decimetre"
     assert found[30, over] == pytest.approx(5.0 - slope * H * over, abs=1e-9)
     assert np.all(height[roof][known | rim] > 1.0)
     assert not known[:, :60].any(), "none before the eaves"
@@ -329,8 +328,9 @@ def test_veils_of_ground_classes_over_snowy_ground_are_white():
 
 
 def test_ground_beyond_the_known_terrain_is_white():
-    bush = Box((-0.7, -0.7, 1.4), (0.7, 0.7, 2.0))
-    scene = [HalfSpace(), bush], [ROAD, VEGETATION]
+    # Wide, so that no open ground is near that would be continued below it.
+    crowns = Box((-4.0, -4.0, 1.4), (4.0, 4.0, 2.0))
+    scene = [HalfSpace(), crowns], [ROAD, VEGETATION]
     below = [0.0, -1.4, 0.8], [0.0, 1.4, -0.8]
     lost = {"height": np.full((41, 41), np.nan, np.float32), "open": np.zeros((41, 41), bool)}
     assert snow_seen(*scene, *below, **lost)[0] == pytest.approx(1, abs=0.02)

@@ -19,6 +19,7 @@ from climatenerf.weather.snow.lattice import SnowGrid
 from climatenerf.weather.snow.layer import SnowEntity, bake_snow
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.shadow_masks import ShadowMasks
+from climatenerf.weather.weather import Weather
 
 SIDE = 40  # rays along a side of a photo of 8 m of level ground
 
@@ -115,8 +116,6 @@ def test_a_missing_folder_is_told_before_photos_are_traced():
     def trace():
         raise AssertionError("photos are traced")
 
-    moment = weather_from_table(
-        {"snow": {"depth": "0.1 m", "light": "paper", "shadows": "no/such/folder"}}
-    )
+    moment = Weather(snow=Snow(depth=0.1, light="paper", shadows="no/such/folder"))
     with pytest.raises(UserError, match="there is no folder"):
         SnowEntity(SimpleNamespace(moments=(moment,), photo_rays=trace))

@@ -17,7 +17,7 @@ from climatenerf.weather.snow.cover import REPOSE
 from climatenerf.weather.snow.fall_rays import fall_directions
 from climatenerf.weather.snow.lattice import SnowGrid, choose_grid
 from climatenerf.weather.snow.layer import SnowEntity, bake_snow
-from climatenerf.weather.snow.optics import albedo_of
+from climatenerf.weather.snow.optics import albedo_of, over_ground, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
 
@@ -332,13 +332,14 @@ def test_a_dusting_is_as_even_as_it_fell():
     """A millimetre, stored in steps of a part of one, shows no rings on level ground."""
     plane = ground(0.01, 0.3)
     field = AnalyticField([plane], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.0)))
-    grid = SnowGrid((0.013, 0.027), (-1.0, 3.0), 0.2, 32)
+    grid = SnowGrid((0.013, 0.027), (-1.0, 3.0), 0.4, 32)
     snow = dataclasses.replace(bake([plane], 0.001, grid), ground=field)
     feet = on_plane(plane, 2000, 2.0)
     seen = snow.colour(feet + torch.tensor([0.0, 0.0, 0.001]))
     bare = field.colour(feet, torch.tensor([[0.0, 0.0, -1.0]]).expand(2000, 3))
-    assert seen.mean() > bare.mean() + 0.05
-    assert (seen - bare).std(0).max() < 0.01
+    slab = slab_reflectance(torch.tensor([[0.001]]), snow.snow.grain)
+    white = over_ground(slab, torch.tensor(albedo_of(snow.snow)).float(), bare)
+    assert seen == pytest.approx(white.numpy(), abs=2e-3)
 
 
 def test_thin_snow_on_slopes_has_no_ripples():
@@ -381,16 +382,18 @@ def test_a_steep_roof_sheds_its_snow_to_the_ground_below():
 
 
 def test_a_rough_roof_carries_an_even_layer():
-    """Bumps of 4 cm on a roof, as a fit has them, do not show in the snow."""
+    """Bumps of 4 cm and of other slopes on a roof, as a fit has them, do not show in the snow."""
     slope = math.radians(35)
     normal = (math.sin(slope), 0.0, math.cos(slope))
     inside = Box((-2.0, -2.0, 0.5), (1.0, 2.0, 3.0))
     plane = HalfSpace(normal, 1.5 * math.cos(slope))
     rng = np.random.default_rng(0)
     roofs = [Roof(inside, plane)]
-    for x, y in rng.uniform([-1.8, -1.8], [0.8, 1.8], (60, 2)):
-        bump = Box((x - 0.06, y - 0.06, 0.5), (x + 0.06, y + 0.06, 3.0))
-        roofs.append(Roof(bump, HalfSpace(normal, 1.54 * math.cos(slope))))
+    for x, y, tilt in rng.uniform([-1.8, -1.8, 0.45], [0.8, 1.8, 0.8], (90, 3)):
+        bump = Box((x - 0.09, y - 0.09, 0.5), (x + 0.09, y + 0.09, 3.0))
+        up = (math.sin(tilt), 0.0, math.cos(tilt))
+        top = 1.54 - x * math.tan(slope)
+        roofs.append(Roof(bump, HalfSpace(up, up[0] * x + up[2] * top)))
     box = ((-4.0, -4.0, -1.0), (4.0, 4.0, 3.5))
     field = LabelledField([ground(), *roofs], classes=[ROAD, *[BUILDING] * len(roofs)], box=box)
     grid = SnowGrid((0.0, 0.0), (-1.0, 3.2), 0.05, 64)
@@ -401,7 +404,7 @@ def test_a_rough_roof_carries_an_even_layer():
     roof = (catch.weight > 0) & (x > -1.5) & (x < 0.5) & (np.abs(y) < 1.5)
     over = z[roof] - (1.5 - x[roof] * math.tan(slope))
     assert 0 < over.mean() < 0.02
-    assert over.std() < 0.006  # that of the bumps is .014
+    assert over.std() < 0.009  # .013 where roofs are smoothed as ground is
     assert catch.of_fall[roof].std() < 0.03
     assert catch.of_fall[roof].mean() == pytest.approx(25 / 30, abs=0.08)
 
