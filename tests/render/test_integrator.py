@@ -8,6 +8,7 @@ import pytest
 import torch
 from support.analytic_fields import AnalyticField, Box, HalfSpace
 from support.random_field import directions, random_field
+from support.threads import threads
 
 from climatenerf.core.cameras import Camera
 from climatenerf.core.samples import MIN_TAU, Samples
@@ -448,7 +449,6 @@ def test_white_furnace_from_under_water():
 @pytest.mark.slow
 def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch):
     """A hash field with snow and water uses Numba kernels, unlike the analytic field."""
-    import numba
 
     from climatenerf.field import compositing as module
 
@@ -465,14 +465,11 @@ def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch)
     d = directions(600)
     d[:, 2] = -d[:, 2].abs()
     angle = torch.full((600,), 1 / 60)
-    whole = trace(snowy, o, d, angle), trace(wet, o, d, angle)
+    with threads(None):
+        whole = trace(snowy, o, d, angle), trace(wet, o, d, angle)
     monkeypatch.setattr(module, "RAYS_AT_ONCE", 77)
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
+    with threads(1):
         parts = trace(snowy, o, d, angle), trace(wet, o, d, angle)
-    finally:
-        numba.set_num_threads(threads)
     assert (whole[0].layers["mask_snow"] > 0.5).sum() > 50
     assert (whole[1].layers["mask_water"] > 0.5).sum() > 50
     for one, other in zip(whole, parts, strict=True):
@@ -484,12 +481,11 @@ def test_renders_of_an_analytic_field_do_not_depend_on_threads_or_chunks(monkeyp
     from climatenerf.field import compositing as module
 
     world = World(street(), None, (medium(Smog(visibility=60.0), 0.0),), (), (flooded(0.3),))
-    whole = linear(world).rgb
+    with threads(None):
+        whole = linear(world).rgb
     monkeypatch.setattr(module, "RAYS_AT_ONCE", 777)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    parts = linear(world).rgb
-    torch.set_num_threads(threads)
+    with threads(1):
+        parts = linear(world).rgb
     assert (whole - parts).abs().max() < 1e-5
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.threads import threads
 
 from climatenerf.weather.flood import spectrum, waves
 from climatenerf.weather.flood.parameters import Flood
@@ -17,10 +18,8 @@ SEA = Flood(level=0.0, wind_speed=10.0, fetch=1e5, depth=200.0)
 @pytest.fixture(autouse=True, scope="module")
 def one_thread():
     """Run on one thread: thousands of small FFTs are slower on several."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    with threads(1):
+        yield
 
 
 def single_tile(flood: Flood, seed: int, peaks: float = 16, n: int = 64):

@@ -3,12 +3,12 @@
 import dataclasses
 import math
 
-import numba
 import numpy as np
 import pytest
 import torch
 from support.analytic_fields import AnalyticField, Box, HalfSpace, ground, table
 from support.holed_ground import LabelledField
+from support.threads import threads
 
 from climatenerf.core.classes import BUILDING, ROAD
 from climatenerf.core.errors import UserError
@@ -219,19 +219,16 @@ def test_empty_scene_and_extreme_parameters_stay_finite():
 
 
 def test_snow_depends_on_the_seed_but_not_on_threads():
-    threads = numba.get_num_threads()
     scene = [ground(0.04, 2.0), *table()]
-    first = bake(scene, seed=3)
     rays_o = torch.tensor([[0.1, 0.2, 2.0]]).repeat(300, 1)
     rays_d = torch.nn.functional.normalize(torch.randn(300, 3) * 0.3 + torch.tensor([0, 0, -1.0]))
     zero = torch.zeros(300)
-    expected = first.march(rays_o, rays_d, zero, zero + 9)
-    try:
-        numba.set_num_threads(1)
+    with threads(None):
+        first = bake(scene, seed=3)
+        expected = first.march(rays_o, rays_d, zero, zero + 9)
+    with threads(1):
         second = bake(scene, seed=3)
         again = second.march(rays_o, rays_d, zero, zero + 9)
-    finally:
-        numba.set_num_threads(threads)
     for one, other in zip(first.lattice, second.lattice, strict=True):
         assert np.array_equal(one, other)
     assert torch.equal(expected.t, again.t)
