@@ -447,6 +447,7 @@ def test_white_furnace_from_under_water():
 
 
 @pytest.mark.slow
+@pytest.mark.all_cores
 def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch):
     """A hash field with snow and water uses Numba kernels, unlike the analytic field."""
 
@@ -465,8 +466,7 @@ def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch)
     d = directions(600)
     d[:, 2] = -d[:, 2].abs()
     angle = torch.full((600,), 1 / 60)
-    with threads(None):
-        whole = trace(snowy, o, d, angle), trace(wet, o, d, angle)
+    whole = trace(snowy, o, d, angle), trace(wet, o, d, angle)
     monkeypatch.setattr(module, "RAYS_AT_ONCE", 77)
     with threads(1):
         parts = trace(snowy, o, d, angle), trace(wet, o, d, angle)
@@ -477,12 +477,12 @@ def test_renders_of_a_hash_field_do_not_depend_on_threads_or_chunks(monkeypatch)
             assert (values(one, name) - values(other, name)).abs().max() < 1e-4, name
 
 
+@pytest.mark.all_cores
 def test_renders_of_an_analytic_field_do_not_depend_on_threads_or_chunks(monkeypatch):
     from climatenerf.field import compositing as module
 
     world = World(street(), None, (medium(Smog(visibility=60.0), 0.0),), (), (flooded(0.3),))
-    with threads(None):
-        whole = linear(world).rgb
+    whole = linear(world).rgb
     monkeypatch.setattr(module, "RAYS_AT_ONCE", 777)
     with threads(1):
         parts = linear(world).rgb

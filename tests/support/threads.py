@@ -8,10 +8,9 @@ import torch
 
 
 @contextmanager
-def threads(count: int | None) -> Iterator[None]:
-    """Run on `count` threads of torch and of Numba; None: all that Numba has."""
+def threads(count: int) -> Iterator[None]:
+    """Run on `count` threads of torch and of Numba."""
     before = torch.get_num_threads(), numba.get_num_threads()
-    count = count or numba.config.NUMBA_NUM_THREADS
     torch.set_num_threads(count)
     numba.set_num_threads(count)
     try:
