@@ -256,3 +256,20 @@ def test_cells_without_snow_have_low_sums():
         a, b, c = cell[i] + 1  # one vertex below the cell, in the padded array
         assert near[i] == around[a : a + 4, b : b + 4, c : c + 4].any()
     assert 100 < (~near).sum() < 3900
+
+
+def test_the_spacing_is_that_of_the_cascade_that_holds_a_point():
+    lattice = half_space(0.5)
+    side = lattice.bricks[0] * BRICK * SPACING
+    centre = lattice.lower[0] + side / 2
+    # A second cascade of twice the spacing around the same centre.
+    nested = lattice._replace(
+        lower=np.stack([lattice.lower[0], centre - side]),
+        spacing=np.array([SPACING, 2 * SPACING]),
+        bricks=np.repeat(lattice.bricks, 2, 0),
+    )
+    margin = BRICK * SPACING
+    points = np.repeat(centre[None], 4, 0)
+    points[1:, 0] += side[0] / 2 - margin + np.array([-0.01, 0.01, 1e3])
+    found = metaballs.spacing_at(points.astype(np.float32), nested)
+    assert found == pytest.approx(SPACING * np.array([1, 1, 2, 2]))

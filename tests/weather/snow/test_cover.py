@@ -43,6 +43,11 @@ def test_shares_of_the_standard_and_of_the_paper():
     assert paper[2] == pytest.approx(0.5)
     assert np.all(np.diff(paper) < 0)
     assert slope_share(np.array([1.0 + 1e-7]), Snow()) == pytest.approx([1])
+    for degrees, sharpness in ((0.0, 50.0), (20.0, 50.0), (37.0, 1.0), (90.0, 1000.0)):
+        snow = Snow(slope=math.radians(degrees), slope_sharpness=sharpness)
+        shares = slope_share(np.array([1.0, 0.9, 0.0]), snow)
+        assert shares[0] == pytest.approx(1), "level ground keeps all"
+        assert np.all(np.diff(shares) <= 0) and shares.min() >= 0
 
 
 def test_crowns_hold_little_of_deep_snow():
@@ -124,6 +129,18 @@ def test_settled_snow_is_nowhere_steeper_than_repose_and_none_is_lost():
         assert np.all(np.abs(step) <= steepest)
 
 
+def test_snow_that_slides_onto_bare_nodes_stays_there():
+    """What falls on half a raster alone heaps up on the other half as well, and none is lost."""
+    x, y = np.meshgrid(H * np.arange(9), H * np.arange(9))
+    position = np.stack([x, y, 0 * x], -1).astype(np.float32)
+    one = np.ones((9, 9), np.float32)
+    fall = one * (x < 0.22)
+    catch = Catch(position, fall, 0 * one, 0 * one, one, one)
+    thickness = _columns((catch,), 0.6, H)[3]
+    assert thickness.sum() == pytest.approx(0.6 * fall.sum(), rel=1e-3)
+    assert len(thickness) == 81
+
+
 def test_snow_of_a_narrow_table_slides_to_its_foot():
     base = np.zeros((40, 40))
     base[15:25, 18:22] = 1.0
@@ -198,7 +215,7 @@ def test_what_falls_deep_is_scattered():
     assert slid(1 - share, share, height, H).max() < 5
 
 
-def test_means_within_a_mask_know_nothing_of_what_is_outside():
+def test_means_within_a_mask_leave_out_what_is_outside():
     mask = np.zeros((40, 40), bool)
     mask[10:30, 5:20] = True
     found = mean_within(np.where(mask, 0.7, np.nan), mask, 3.0)
@@ -282,6 +299,25 @@ def test_a_crown_carries_a_cap_and_lets_the_rest_through():
     assert catch.of_held[open_ground] == pytest.approx(0, abs=1e-3)
 
 
+def test_thin_snow_is_thinner_below_a_crown_and_whitens_it_without_steps():
+    grey = (0.12, 0.12, 0.12)
+    solids = [HalfSpace(colour=grey), Box((-0.5, -0.5, 1.5), (0.5, 0.5, 2.5), grey)]
+    baked = snow_on(solids, [ROAD, VEGETATION])
+    field = LabelledField(solids, classes=[ROAD, VEGETATION], box=BOX)
+    below, apart = [], []
+    for depth in np.arange(1, 40) * 1e-3:
+        snow = dataclasses.replace(baked.with_depth(depth), ground=field)
+        left = depth - held_by_crowns(depth)
+        feet = torch.tensor([[0.0, 0.0, left], [1.2, 1.2, depth]], dtype=torch.float32)
+        colour = snow.colour(feet)[:, 0]
+        below.append(float(colour[0]))
+        apart.append(float(colour[1]))
+    assert below[2] < 0.8 * apart[2], "a third of 3 mm lies there"
+    for seen in (below, apart):
+        assert np.diff(seen).min() > -2e-3
+        assert np.diff(seen)[2:].max() < 0.1
+
+
 def test_a_house_shelters_the_ground_and_carries_all():
     house = Box((-0.5, -0.5, 0.0), (0.5, 0.5, 2.5))
     baked = snow_on([HalfSpace(), house], [ROAD, BUILDING])
@@ -336,7 +372,7 @@ def test_ground_beyond_the_known_terrain_is_white():
     assert snow_seen(*scene, *below, **lost)[0] == pytest.approx(1, abs=0.02)
 
 
-def test_deposits_know_whether_any_snow_stays():
+def test_deposits_tell_whether_any_snow_stays():
     assert snow_on([HalfSpace()], [ROAD]).deposits.any()
     slope = HalfSpace((math.sin(math.radians(75)), 0.0, math.cos(math.radians(75))), 0.0)
     steep = LabelledField([slope], classes=[BUILDING], box=BOX)
@@ -410,7 +446,7 @@ def test_bumps_of_the_ground_are_white_under_thin_snow_and_a_wall_is_not():
     assert (seen.layers["mask_snow"][2:] < 0.01).all()
     assert seen.rgb[:2].min() > 0.5 and seen.rgb[2:, 1].max() < 0.3
     assert (seen.layers["seen"] == 1).all()
-    # A field that does not know what faces up keeps its bump.
+    # A field without normals keeps its bump.
     bare = dataclasses.replace(field, capabilities=frozenset())
     blind = trace(World(bare, matters=(snow,)), o, d, torch.full((4,), 1e-3))
     assert (blind.layers["mask_snow"][:2] < 0.01).all()
@@ -479,3 +515,16 @@ def test_deep_snow_on_an_overhang_ends_in_a_slope():
         thickest.append(float(_columns((catch,), 0.6, H)[3].max()))
     assert thickest[0] == pytest.approx(REPOSE * H, rel=0.01)
     assert thickest[1] == pytest.approx(0.6)
+
+
+def test_deep_snow_on_a_high_block_settles_to_the_angle_of_repose():
+    """A block of 6 m under 2 m of snow, on a lattice of 3 cm, ends in slopes of repose."""
+    spacing = 0.03
+    base = np.zeros((3, 400))
+    base[:, :200] = 6.0
+    found = settled(base, np.full(base.shape, 2.0), REPOSE * spacing)
+    assert found.sum() == pytest.approx(2.0 * base.size)
+    foot = np.diff((base + found)[1, 200:]) / spacing
+    assert np.abs(foot).max() < 1.01 * REPOSE
+    block = np.diff(found[1, :200]) / spacing
+    assert np.abs(block).max() < 1.01 * REPOSE and found[1, 199] < 1.01 * REPOSE * spacing

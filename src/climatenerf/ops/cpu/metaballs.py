@@ -93,6 +93,19 @@ def occupied_cells(fill: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([first, last], 1).astype(np.uint8), near
 
 
+def spacing_at(points: Float32[np.ndarray, "n 3"], lattice: Lattice) -> Float32[np.ndarray, "n"]:
+    """Spacing of the finest cascade that contains each point, m; outside all, of the coarsest."""
+    found = np.full(len(points), lattice.spacing[-1], np.float32)
+    for k in reversed(range(len(lattice.spacing))):
+        brick = BRICK * lattice.spacing[k]
+        # The outermost bricks are a margin, as in `_find`.
+        lower = lattice.lower[k, :2] + brick
+        upper = lattice.lower[k, :2] + (lattice.bricks[k, :2] - 1) * brick
+        inside = ((points[:, :2] >= lower) & (points[:, :2] < upper)).all(1)
+        found[inside] = lattice.spacing[k]
+    return found
+
+
 @njit(cache=True, fastmath=_FAST, inline="always")
 def _find(lattice, x, y, z):
     """Return the finest cascade that contains a position, and its brick there (-1: none)."""

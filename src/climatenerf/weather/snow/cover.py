@@ -36,20 +36,23 @@ PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
 SCATTERS, DROPS = 0.2, (0.0, 4.0, 8.0)  # of the drop (m), by which what falls deep is spread
 LEDGE = 0.1  # share of level nodes within reach of what arrives
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
-MAX_SWEEPS = 400  # of `settled`
+SETTLED = 1e-3  # of the rise over a cell; what is steeper by less stays
+MAX_SWEEPS = 20_000  # of `settled`; 2 m of snow on walls of 6 m need some thousands
 
 
 def slope_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarray, "*n"]:
     """Fraction of the depth that slopes keep, from the cosine of the slope.
 
-    All up to 30 degrees, none from 60 (EN 1991-1-3, 5.3); or the paper's logistic, if
-    `Snow.slope` says where half of it stays.
+    All up to 30 degrees, none from 60 (EN 1991-1-3, 5.3); or the paper's logistic over its value on
+    level ground, if `Snow.slope` says where half of it stays.
     """
     if snow.slope is None:
         slope = np.arccos(np.clip(cosine, 0, 1))
         return np.clip((STEEPEST - slope) / (STEEPEST - LEVEL), 0, 1)
     logit = snow.slope_sharpness * (cosine - math.cos(snow.slope))
-    return 1 / (1 + np.exp(-np.clip(logit, -60, 60)))
+    level = snow.slope_sharpness * (1 - math.cos(snow.slope))
+    of_level = 1 + math.exp(-min(level, 60.0))  # level ground keeps all
+    return np.minimum(of_level / (1 + np.exp(-np.clip(logit, -60, 60))), 1)
 
 
 def held_by_crowns(depth: float) -> float:
@@ -226,11 +229,16 @@ def settled(
     """
     rows, columns = base.shape
     top = base + thickness
+    tolerance = SETTLED * rise
     waiting = np.ones((rows, columns), np.bool_)  # nodes near a change since they were looked at
+    busy = np.ones(rows, np.bool_)  # rows of such nodes
     for sweep in range(MAX_SWEEPS):
         changed = False
         for a in range(rows):
             j = a if sweep % 2 == 0 else rows - 1 - a
+            if not busy[j]:
+                continue
+            busy[j] = False
             for b in range(columns):
                 i = b if sweep % 4 < 2 else columns - 1 - b
                 if not waiting[j, i]:
@@ -252,13 +260,14 @@ def settled(
                         highest = max(other, base[j, i]) + rise * length
                         if highest < limit or (highest == limit and other < lower):
                             limit, lower, to_j, to_i = highest, other, jj, ii
-                if limit < own - 1e-5:
+                if limit < own - tolerance:
                     # The neighbour rises by as much as this falls; below an edge it may.
                     moved = (own - limit) * (0.5 if lower >= base[j, i] else 1.0)
                     top[j, i] = own - moved
                     top[to_j, to_i] += moved
                     changed = True
                     for jj in range(max(min(j, to_j) - 1, 0), min(max(j, to_j) + 2, rows)):
+                        busy[jj] = True
                         for ii in range(max(min(i, to_i) - 1, 0), min(max(i, to_i) + 2, columns)):
                             waiting[jj, ii] = True
         if not changed:

@@ -31,7 +31,7 @@ from climatenerf.weather.snow.cover import (
     slid,
     slope_share,
 )
-from climatenerf.weather.snow.drift import drifted
+from climatenerf.weather.snow.drift import REACH, Shelter, drifted
 from climatenerf.weather.snow.fall_rays import (
     PASSES,
     SINGLE_PASS,
@@ -39,6 +39,7 @@ from climatenerf.weather.snow.fall_rays import (
     cast,
     fall_directions,
     inner_side,
+    seen_from_above,
 )
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Catch, Deposits, SnowGrid
 from climatenerf.weather.snow.openness import contact_shade
@@ -54,6 +55,7 @@ ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the 
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
 ROOF_SMOOTHING, ROOF_PASSES = 0.3, 6  # m and passes; fitted roofs are planes with roughness
 BETWEEN_LEAVES = 0.026  # m of snow that open or steep crowns take before any bridges their leaves
+SHELTER_SPACING, SHELTER_CELLS = 0.15, 3  # m and cells, at least, of what stands in the wind
 _CHUNK = 1 << 14  # positions per evaluation
 
 
@@ -100,6 +102,10 @@ def find_deposits(
     cascades: list[tuple[Catch, ...]] = []
     for k in range(grid.cascades):
         catches: list[Catch] = []
+        shelter = None
+        if snow.drift > 0:
+            step = max(SHELTER_SPACING, SHELTER_CELLS * grid.spacing_of(k))
+            shelter = seen_from_above(field, grid, grid.half_side(k) + REACH, step, seed)
         for p in range(passes[k]):
 
             def pass_progress(fraction: float, done: int = done) -> None:
@@ -108,7 +114,7 @@ def find_deposits(
 
             random = np.random.default_rng([seed, k, p])
             rays = cast(field, grid, k, directions[p], random, pass_progress)
-            found = _caught(field, snow, grid, k, rays)
+            found = _caught(field, snow, grid, k, rays, shelter)
             done += 1
             if p == 0 and snow.light == "paper":
                 found = [
@@ -124,12 +130,17 @@ def find_deposits(
 
 
 def _caught(
-    field: RadianceField, snow: Snow, grid: SnowGrid, cascade: int, rays: FallRays
+    field: RadianceField,
+    snow: Snow,
+    grid: SnowGrid,
+    cascade: int,
+    rays: FallRays,
+    shelter: Shelter | None,
 ) -> list[Catch]:
     """What catches the snow of one pass over one cascade: surfaces, and crowns above them if any.
 
     The tent functions of `snow.lattice` on the rays' grid are a partition of unity, so level ground
-    receives exactly the same amount of snow everywhere.
+    receives exactly the same amount of snow everywhere. Without `shelter` there are no drifts.
     """
     h = grid.spacing_of(cascade)
     normal_z, kind = _seen_from_above(field, rays)
@@ -168,8 +179,9 @@ def _caught(
     stops = wall if upright else ndimage.binary_dilation(wall, iterations=base // 2)
     lost = np.where(stops, 0.0, 1 - share)
     arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
-    shelter = np.where(np.isfinite(leaves), leaves, smooth[..., 2])
-    moved = drifted(smooth[..., 2], shelter, snow.drift, snow.wind_direction, h)
+    moved = np.ones(share.shape)
+    if shelter is not None:
+        moved = drifted(smooth, shelter, snow.drift, snow.wind_direction, h)
     caught = crown.keeps * np.clip(rays.opacity, 0, 1)
     weight = np.where(own, np.clip((rays.opacity - 0.5) / 0.1, 0, 1), 1.0)  # the terrain is whole
     catches = [_catch(smooth, moved * share + arrived, -share * caught, 0 * share, weight)]

@@ -5,6 +5,7 @@ positive in the lee of something higher, negative on a crest.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,44 +19,54 @@ MOST = 2.5  # times the depth of the open, at the most
 SMOOTH = 0.3  # m, standard deviation; drifts have no sharper edge
 
 
+class Shelter(NamedTuple):
+    """Heights of all that stands in the wind, as seen from above."""
+
+    height: Float[np.ndarray, "y x"]
+    """World z, m; NaN where nothing is. Rows lie along +y, columns along +x."""
+    first: tuple[float, float]
+    """x and y of the first node, m."""
+    spacing: float
+    """m."""
+
+
 def upwind_slope(
-    height: Float[np.ndarray, "h w"],
-    shelter: Float[np.ndarray, "h w"],
-    wind_direction: float,
-    spacing: float,
+    position: Float[np.ndarray, "h w 3"], shelter: Shelter, wind_direction: float
 ) -> Float[np.ndarray, "h w"]:
-    """Steepest slope (rise over run) from each node to what stands within `REACH` upwind of it.
+    """Steepest slope (rise over run) from each point to what stands within `REACH` upwind of it.
 
     Args:
-        height: of the surface, m; NaN where nothing is. Rows lie along +y, columns along +x.
-        shelter: height of what stands there, hedges included, m; NaN where nothing is.
+        position: points on the surface, m; NaN where nothing is.
+        shelter: what stands there, hedges included.
         wind_direction: where the wind comes from, clockwise from +y, rad.
-        spacing: of the raster, m.
 
     Returns:
         The slope; 0 where nothing is known upwind.
     """
-    rows, columns = height.shape
-    upwind = np.array([math.cos(wind_direction), math.sin(wind_direction)]) / spacing
-    known = np.isfinite(shelter).astype(np.float64)
-    filled, at = np.where(known > 0, shelter, -1e9), np.mgrid[:rows, :columns]
+    spacing = shelter.spacing
+    upwind = np.array([math.sin(wind_direction), math.cos(wind_direction)])
+    known = np.isfinite(shelter.height).astype(np.float64)
+    filled = np.where(known > 0, shelter.height, -1e9)
+    xy, height = position[..., :2].astype(np.float64), position[..., 2]
     steepest = np.full(height.shape, -np.inf)
     distances = np.geomspace(max(spacing, NEAREST), REACH, STEPS)
     for distance in distances:
-        there = at + (distance * upwind)[:, None, None]
+        there = (xy + distance * upwind - np.array(shelter.first)) / spacing
+        # Points that are NaN lie outside of every raster.
+        at = np.nan_to_num(np.moveaxis(there[..., ::-1], -1, 0), nan=-1e6)
         # The highest within half a step, so that no thin wall lies between two of them.
         step = (distances[1] / distances[0] - 1) * distance / spacing
         highest = ndimage.maximum_filter(filled, max(1, round(step)))
-        inside: np.ndarray = ndimage.map_coordinates(known, there, order=0)
-        level: np.ndarray = ndimage.map_coordinates(highest, there, order=0)
+        inside: np.ndarray = ndimage.map_coordinates(known, at, order=0)
+        level: np.ndarray = ndimage.map_coordinates(highest, at, order=0)
         slope = np.where(inside > 0, (level - height) / distance, -np.inf)
         steepest = np.fmax(steepest, slope)
     return np.where(np.isfinite(steepest), steepest, 0.0)
 
 
 def drifted(
-    height: Float[np.ndarray, "h w"],
-    shelter: Float[np.ndarray, "h w"],
+    position: Float[np.ndarray, "h w 3"],
+    shelter: Shelter,
     strength: float,
     wind_direction: float,
     spacing: float,
@@ -63,14 +74,12 @@ def drifted(
     """Depth of snow over that of open level ground, by shelter from the wind; 1 without wind.
 
     Args:
-        height: of the surface, m; NaN where nothing is.
-        shelter: height of what stands there, m; NaN where nothing is.
+        position: points on the surface, m; NaN where nothing is.
+        shelter: what stands in the wind.
         strength: `Snow.drift`, 0 to 1.
         wind_direction: where the wind comes from, clockwise from +y, rad.
-        spacing: of the raster, m.
+        spacing: of the points, m.
     """
-    if strength == 0:
-        return np.ones(height.shape)
-    slope = upwind_slope(height, shelter, wind_direction, spacing)
+    slope = upwind_slope(position, shelter, wind_direction)
     factor = np.clip(1 + strength * GAIN * slope, 1 - strength, 1 + strength * (MOST - 1))
     return ndimage.gaussian_filter(factor, SMOOTH / spacing)

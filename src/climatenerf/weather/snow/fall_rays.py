@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32
 
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.field.protocol import RadianceField, device_of
+from climatenerf.weather.snow.drift import Shelter
 from climatenerf.weather.snow.lattice import SnowGrid
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.snow.surface_fit import depth_crossings
@@ -130,6 +131,35 @@ def cast(
     return FallRays(direction, crossing, middle, leaves, surface, opacity, reached)
 
 
+def seen_from_above(
+    field: RadianceField, grid: SnowGrid, half_side: float, spacing: float, seed: int
+) -> Shelter:
+    """Heights at which vertical rays end, over a square around the grid's centre.
+
+    Args:
+        field: the fitted field.
+        grid: where snow is simulated.
+        half_side: of the square, m.
+        spacing: of the rays, m.
+        seed: of the first samples' offset.
+    """
+    random = np.random.default_rng(seed)
+    bottom, top = grid.z_range
+    nodes = np.arange(-half_side, half_side, spacing)
+    x, y = np.meshgrid(grid.centre[0] + nodes, grid.centre[1] + nodes)
+    rays_o = np.stack([x, y, np.full_like(x, top)], -1)
+    down = np.array([0.0, 0.0, -1.0])
+    height = np.full(x.shape, np.nan)
+    rows = max(1, _CHUNK // len(nodes))
+    for row in range(0, len(nodes), rows):
+        part = rays_o[row : row + rows].reshape(-1, 3)
+        t, _ = _first_hits(
+            field, part, down, top - bottom, _STRETCH * spacing, random, device_of(field)
+        )
+        height[row : row + rows] = (top - t[:, 1]).reshape(-1, len(nodes))
+    return Shelter(height, (float(x[0, 0]), float(y[0, 0])), spacing)
+
+
 def inner_side(grid: SnowGrid, cascade: int) -> float:
     """Half the side of the square that the next finer cascade covers, with some overlap, m."""
     return grid.half_side(cascade - 1) - 3 * grid.spacing_of(cascade) if cascade > 0 else 0.0
@@ -183,8 +213,8 @@ def _first_hits(
         found_t, found_depth = depth_crossings(
             *(to_numpy(part) for part in parts), depth[active], np.array(DEPTHS)
         )
-        known = np.isnan(found_t)
-        hit_t[active] = np.where(known, hit_t[active], found_t + start[:, None])
+        missing = np.isnan(found_t)
+        hit_t[active] = np.where(missing, hit_t[active], found_t + start[:, None])
         depth[active] = found_depth
         next_start[active] += stretch
         active = active[(found_depth < 7) & (next_start[active] < length)]

@@ -193,11 +193,12 @@ def _columns(
     parts = []
     for catch in catches:
         thickness = catch.of_fall * np.float64(depth) + catch.of_held * held - catch.hidden
-        used = (catch.weight > 0) & (thickness > 0)
+        surface = catch.weight > 0
         nothing = -1e3 if catch.overhangs else np.nan  # far below; beside NaN snow stays
-        base = np.where(catch.weight > 0, catch.position[..., 2].astype(np.float64), nothing)
-        thickness = settled(base, np.where(used, thickness, 0.0), REPOSE * spacing)
-        used &= thickness > _THINNEST
+        base = np.where(surface, catch.position[..., 2].astype(np.float64), nothing)
+        thickness = np.where(surface, np.maximum(thickness, 0.0), 0.0)
+        thickness = settled(base, thickness, REPOSE * spacing)
+        used = surface & (thickness > _THINNEST)
         parts.append(
             [each[used] for each in (catch.position, catch.weight, catch.shade, thickness)]
         )

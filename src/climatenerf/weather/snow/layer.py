@@ -21,7 +21,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
 from climatenerf.field.protocol import COMPLETES, RadianceField, ground_height, observed
 from climatenerf.ops.cpu import metaballs
-from climatenerf.ops.cpu.metaballs import Lattice
+from climatenerf.ops.cpu.metaballs import HEIGHT_UNIT, Lattice
 from climatenerf.weather.light.sun import sun_direction
 from climatenerf.weather.snow.cover import HIGHEST_VEIL, slope_share
 from climatenerf.weather.snow.deposition import Light, find_deposits
@@ -38,7 +38,8 @@ from climatenerf.weather.world import Preparation, World
 LEVEL_Z, SIDE_Z = 0.5, 0.2  # z of normals of a layer's surface, and of its sides
 SIDE = 0.3  # m of snow behind a side
 SKIN = 0.15  # sum of the balls half a spacing above a level surface
-DUSTING = 0.005, 0.02  # m; up to the first the depth that fell counts, from the second the lattice
+DUSTING = 0.005, 0.02  # m; between these the steps of stored heights cease to show
+SAME, OTHER = 1.0, 1.5  # steps of stored heights, up to which two are the same, and from which not
 CONTACT_HEIGHT = 0.1  # m over the ground, where contact shade is known
 CONTACT_DECAY = 0.5  # m, over which it falls to 1/e
 BURIED = 0.04  # m below the ground, to which roughness reaches
@@ -178,11 +179,8 @@ class BakedSnow:
             away = to_device(sums < SKIN, x.device)  # on a veil: as on open level ground
             depth = self.snow.depth or 0.0
             height = torch.where(away, depth, height)
-            # The lattice stores heights to some millimetres: a dusting has the depth that fell.
-            dusting = min(max((DUSTING[1] - depth) / (DUSTING[1] - DUSTING[0]), 0.0), 1.0)
-            if dusting > 0:
-                share = slope_share(to_numpy(normal[:, 2]), self.snow).astype(np.float32)
-                height = torch.lerp(height, depth * to_device(share, x.device), dusting)
+            if depth < DUSTING[1]:
+                height = self._without_steps(x, normal, height, depth)
             shade = torch.where(away, SHADE_UNIT, shade)
             if relief is not None:
                 normal = tilted(normal, relief, height)
@@ -197,6 +195,25 @@ class BakedSnow:
         white = self.light.irradiance_over_pi
         white = torch.tensor(white, dtype=torch.float32, device=x.device)
         return (shade * wrap)[:, None] * white
+
+    def _without_steps(
+        self,
+        x: Float[Tensor, "n 3"],
+        normal: Float[Tensor, "n 3"],
+        height: Float[Tensor, "n"],
+        depth: float,
+    ) -> Float[Tensor, "n"]:
+        """Heights of thin snow over the ground (m), without the steps in which they are stored.
+
+        A height as close to what fell on that slope as the lattice can store is what fell. Others
+        differ by crowns, drifts and slides.
+        """
+        share = slope_share(to_numpy(normal[:, 2]), self.snow).astype(np.float32)
+        fell = depth * to_device(share, x.device)
+        step = HEIGHT_UNIT * to_device(metaballs.spacing_at(_array(x), self.lattice), x.device)
+        differs = (((height - fell).abs() / step - SAME) / (OTHER - SAME)).clamp(0, 1)
+        deep = min(max((depth - DUSTING[0]) / (DUSTING[1] - DUSTING[0]), 0.0), 1.0)
+        return torch.lerp(fell, height, differs.clamp_min(deep))
 
     def _in_light_of_place(
         self,
@@ -239,10 +256,14 @@ class BakedSnow:
     def glints(
         self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """Radiance that crystal faces add in a hard sun; arguments as of `colour_towards`."""
+        """Radiance that crystal faces add in a hard sun; arguments as of `colour_towards`.
+
+        None in the paper's light.
+        """
         added = torch.zeros_like(x)
         beam = None if self.place_light is None else self.place_light.beam()
-        if beam is None or self.place_light is None or self.snow.sparkle == 0:
+        wanted = self.snow.sparkle > 0 and self.snow.light == "scene"
+        if beam is None or self.place_light is None or not wanted:
             return added
         sun, irradiance = beam
         found = glints(x, d, width, sun, self.snow.sparkle)
@@ -344,7 +365,7 @@ class SnowEntity:
         if snow.shadows is None:
             return None
         if self._preparation.photo_rays is None:
-            raise UserError("--snow.shadows needs a field that knows its surfaces; leave it out")
+            raise UserError("--snow.shadows needs a field with surfaces; leave it out")
         photos = self._preparation.photo_rays()
         return ShadowMasks(Path(snow.shadows), photos).sunlight
 

@@ -40,13 +40,13 @@ class Snow:
     relief: Annotated[float, quantity(LENGTH, 0.0, 0.05)] = 0.003
     """Standard deviation of the fine bumps that tilt the surface towards the light. 0: smooth."""
     albedo_offset: Annotated[float, number(0.0, 100.0)] = 4.0
-    """c0 of the paper's snow colour (g + c0)/(1 + c0); larger is whiter."""
+    """c0 of the colour (g + c0)/(1 + c0) for `light` = paper; larger is whiter."""
     wrap: Annotated[float, number(0.0, 100.0)] = 8.0
-    """Wrap lighting gamma of (n.l + gamma)/(1 + gamma); larger is flatter."""
+    """Wrap lighting gamma of (n.l + gamma)/(1 + gamma) for `light` = paper; larger is flatter."""
     sun_share: Annotated[float, number(0.0, 1.0)] = 0.7
-    """beta_s: brightness that the sun's shadow takes away."""
+    """beta_s: brightness that the sun's shadow takes away, for `light` = paper."""
     shade: Annotated[float, number(0.0, 1.0)] = 0.3
-    """V_s0: brightness that is left in shadow."""
+    """V_s0: brightness that is left in shadow, for `light` = paper."""
     shadows: Annotated[str | None, folder()] = None
     """Masks of the photos, white in shadow, for `light` = paper. none: shadows by geometry."""
 
@@ -64,7 +64,11 @@ SNOW = Effect(
         Measure("snow_share", "mask_snow"),
         Measure("mean_snow_thickness_m", "snow_thickness", "mask_snow"),
     ),
+    only_with=tuple(
+        (name, "light", ("paper",)) for name in ("albedo_offset", "wrap", "sun_share", "shade")
+    ),
     after=("sky", "flood"),
+    version="2",
     prepared_from=(
         "snow.fall_tilt",
         "snow.wind_direction",

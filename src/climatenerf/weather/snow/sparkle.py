@@ -18,7 +18,6 @@ MIRRORED = 0.02  # of the light, by ice at steep incidence (Fresnel, n = 1.31)
 SUN_RADIUS = 0.00465  # rad
 SUN_SOLID_ANGLE = math.pi * SUN_RADIUS**2
 TILTS = SUN_SOLID_ANGLE / 4  # sr of normals that mirror some of the sun's disc to the eye
-NARROWEST = 5e-4  # m; a pixel that shows less of the surface shows a part of one face
 WIDEST = 0.25  # m; beyond, sparkles are fainter than 2 % of the snow
 
 
@@ -38,8 +37,9 @@ def glints(
         sun: unit vector towards the sun.
         faces: area of all faces over that of the snow, 0 to 1; their tilts are random.
     """
-    level = torch.log2(width.clamp(NARROWEST, WIDEST)).round()
-    side = torch.exp2(level)
+    narrowest = math.sqrt(FACE)  # a pixel that shows less of the surface shows a part of one face
+    level = torch.log2(width.clamp(narrowest, WIDEST)).round()
+    side = torch.exp2(level).clamp_min(narrowest)
     piece = torch.floor(x / side[:, None]).long()
     half = torch.nn.functional.normalize(sun - d, dim=-1)  # 0 where the eye looks into the sun
     # Equal areas of the sphere: z and azimuth.
@@ -48,7 +48,7 @@ def glints(
     tilt = torch.stack([(half[:, 2] * steps).floor(), (azimuth * steps).floor()], dim=-1).long()
     expected = faces / FACE * side.square() * TILTS / (2 * math.pi)
     number = torch.floor(expected + _uniform(torch.cat([piece, tilt, level.long()[:, None]], -1)))
-    seen = (FACE / side.square()).clamp_max(1.0)
+    seen = FACE / side.square()
     return torch.where(width < WIDEST, number * seen * MIRRORED / SUN_SOLID_ANGLE, 0.0)
 
 
