@@ -1,5 +1,6 @@
 """Light in a yard photographed in the sun: found, replaced, and changed by weather."""
 
+import math
 import pickle
 from dataclasses import replace
 
@@ -28,6 +29,7 @@ from climatenerf.weather.light import sun_map as sun_maps
 from climatenerf.weather.light.captured import UnknownLight, elevation_azimuth
 from climatenerf.weather.light.relit_field import RelitField
 from climatenerf.weather.light.sun_map import sun_map
+from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.world import Kept
 
 ACROSS = torch.tensor([[x, y, 0.0] for x in np.linspace(-5, 3, 81) for y in (0.0, 0.4)]).float()
@@ -261,15 +263,58 @@ def test_the_photos_own_sun_keeps_its_shadows_under_snow(snowy):
 
 
 @pytest.mark.slow
-def test_what_keeps_no_snow_sends_no_more_light():
-    """By the paper's rule with half of the snow at 0 degrees, level ground carries half."""
+def test_half_a_cover_of_snow_lights_a_wall_half_as_much():
     field = sunlit_yard()
-    half = session(field, snow={"depth": "10 cm", "slope": "0 deg"}).world(0.0)
-    whole = session(field, snow={"depth": "10 cm"}).world(0.0)
+    half = session(field, snow={"depth": "5.3 mm"}).world(0.0)
+    whole = session(field, snow={"depth": "50 cm"}).world(0.0)
     wall = torch.tensor([[-4.0, 5.99, 1.0]])
     ahead = torch.tensor([[0.0, 1.0, 0.0]])
     dry, some, most = (each.colour(wall, ahead)[0, 0] for each in (field, half.field, whole.field))
-    assert 0.3 < float((some - dry) / (most - dry)) < 0.7
+    assert 0.4 < float((some - dry) / (most - dry)) < 0.6
+
+
+def test_snow_covers_surfaces_by_their_slope():
+    cosine = torch.tensor([1.0, math.cos(math.radians(45)), 0.3, -1.0])
+    assert entity.snow_cover(Snow(), 0.8, cosine) == pytest.approx([0.8, 0.4, 0, 0], abs=1e-6)
+
+
+@pytest.mark.slow
+def test_growing_snow_brightens_a_wall_evenly():
+    """From frame to frame of a movie, across the steps in which light is computed."""
+    film = session(sunlit_yard(), snow={"depth": {"0 s": "2 cm", "1 s": "4 cm"}})
+    wall = torch.tensor([[-4.0, 5.99, 1.0]])
+    ahead = torch.tensor([[0.0, 1.0, 0.0]])
+    seen = [film.world(t).field.colour(wall, ahead)[0, 0] for t in np.linspace(0, 1, 21)]
+    steps = np.diff([float(each) for each in seen])
+    assert steps.min() > 0
+    assert steps.max() < 2.5 * steps.mean()
+
+
+@pytest.mark.slow
+def test_the_papers_snow_follows_another_sky():
+    table = {"snow": {"depth": "10 cm", "light": "paper"}, "sky": {"kind": "overcast"}}
+    place = torch.tensor([[-6.0, -5.0, 0.1]])
+    dim = session(sunlit_yard(), **table)
+    (snow,) = dim.world(0.0).matters
+    table["sky"]["ev"] = 1.0
+    (bright,) = session(sunlit_yard(), **table).world(0.0).matters
+    assert bright.colour(place) == pytest.approx(2 * snow.colour(place).numpy(), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_sun_that_comes_back_keeps_its_shadows():
+    """Snow, then two other suns without it, then the first again: the photos' shadow stays."""
+    field = sunlit_yard()
+    changing = session(field, snow={"depth": "10 cm"})
+    x, _ = ground(field)
+    first = changing.world(0.0).field.colour(x, DOWN.expand_as(x))
+    for azimuth in ("20 deg", "60 deg"):
+        other = {"snow": {"depth": "0 m"}, "flood": {"level": "0.1 m"}, "sun": {"azimuth": azimuth}}
+        changing.change(weather_from_table(other))
+        changing.world(0.0)
+    changing.change(weather_from_table({"snow": {"depth": "10 cm"}}))
+    again = changing.world(0.0).field.colour(x, DOWN.expand_as(x))
+    torch.testing.assert_close(again, first)
 
 
 @pytest.mark.slow

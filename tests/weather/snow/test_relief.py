@@ -47,6 +47,15 @@ def test_a_pixel_shows_the_mean_of_what_it_covers(incidence):
     assert torch.corrcoef(torch.stack([found[:, 0], mean[:, 0]]))[0, 1] > 0.95
 
 
+def test_no_place_is_special():
+    """The waves do not meet in phase at the origin of the world."""
+    near = torch.linspace(-0.4, 0.4, 41)
+    x = torch.cartesian_prod(near, near, torch.zeros(1))
+    found = slopes(x, DOWN.expand_as(x), torch.zeros(len(x)), HEIGHT)
+    usual = slopes(x + 300.0, DOWN.expand_as(x), torch.zeros(len(x)), HEIGHT)
+    assert found.norm(dim=-1).max() < 3.5 * usual.square().sum(-1).mean().sqrt()
+
+
 def test_far_snow_is_smooth():
     x = 50 * torch.rand(1000, 3, generator=torch.Generator().manual_seed(1))
     flat = torch.nn.functional.normalize(torch.tensor([0.0, 1.0, -0.05]), dim=0).expand_as(x)

@@ -34,6 +34,7 @@ from climatenerf.weather.light.scene_light import (
     Radiance,
     SceneLight,
     Surfaces,
+    between,
     light_of_photos,
     plausible_surfaces,
     relit,
@@ -67,7 +68,7 @@ class LightEntity:
         self._given = preparation
         self._reference: tuple[SceneLight, ReferenceAlbedo] | None = None
         self._maps: list[SunMap] = []
-        self._last: tuple[object, SceneLight, float] | None = None
+        self._new: dict[object, tuple[SceneLight, SceneLight]] = {}
         self._lights: dict[tuple[float, ...], SceneLight] = {}
         self._surfaces: GatheredLight  # what they reflect; known with the light of the photos
 
@@ -197,27 +198,35 @@ class LightEntity:
             return world  # snow, water and smog are lit as in the open
         override = None if new_sky else self._sun_of_photos(weather)
         old = self._photographed(override)
-        slab = float(slab_reflectance(torch.tensor(snow, device="cpu"), weather.snow.grain))
-        cover = round(slab * COVER_STEPS) / COVER_STEPS
+        cover = float(slab_reflectance(torch.tensor(snow, device="cpu"), weather.snow.grain))
         if (
             not (new_sky or seasonal)
             and cover == 0
             and not (old.sun is not None and _lit_smog(weather))
         ):
             return replace(world, light=old)
-        white = _whiteness(weather) if cover else ()
-        smog = weather.smog if _lit_smog(weather) else None
-        slopes = weather.snow.slope, weather.snow.slope_sharpness
-        season = weather.season if seasonal else None
-        key = weather.sky, weather.sun, cover, white, slopes, smog, season
-        if self._last is None or self._last[0] != key:
-            new = self._new_light(weather, old, cover)
-            brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
-            self._last = key, new, brighter
-        _, new, brighter = self._last
+        # Snow that grows in a movie brightens its place evenly: between two steps of its cover.
+        step = math.floor(cover * COVER_STEPS + 1e-3)
+        part = max(cover * COVER_STEPS - step, 0.0)
+        new = self._in_step(weather, old, step, seasonal)
+        if part > 0:
+            new = between(new, self._in_step(weather, old, step + 1, seasonal), part)
+        brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
         shown = new_sky or seasonal
         field = RelitField(world.field, old, new, shown, brighter, self._albedo(old))
         return replace(world, field=field, light=new)
+
+    def _in_step(self, weather: Weather, old: SceneLight, step: int, seasonal: bool) -> SceneLight:
+        """The new light with the snow's cover of one step; the last two are kept."""
+        snow = weather.snow
+        covering = (_whiteness(weather), snow.slope, snow.slope_sharpness) if step else ()
+        smog = weather.smog if _lit_smog(weather) else None
+        season = weather.season if seasonal else None
+        key = weather.sky, weather.sun, step, covering, smog, season
+        if key not in self._new or self._new[key][0] is not old:
+            found = old, self._new_light(weather, old, step / COVER_STEPS)
+            self._new = dict([*self._new.items(), (key, found)][-2:])
+        return self._new[key][1]
 
     def _new_light(self, weather: Weather, old: SceneLight, cover: float) -> SceneLight:
         albedo = to_device(np.array(_whiteness(weather), np.float32), device_of(self._given.field))

@@ -241,6 +241,25 @@ def white_balanced(light: SceneLight, eyes: Float[Tensor, "n 3"]) -> SceneLight:
     )
 
 
+def between(one: SceneLight, other: SceneLight, part: float) -> SceneLight:
+    """Light between two that share their grid and their sun; `part` 0 is the first, 1 the other."""
+    sky = one.radiance
+    if other.radiance is not sky:
+        sky = functools.partial(_mixed, sky, other.radiance, part)
+    return replace(
+        one,
+        coefficients=torch.lerp(one.coefficients, other.coefficients, part),
+        radiance=sky,
+        sun_irradiance=torch.lerp(one.sun_irradiance, other.sun_irradiance, part),
+    )
+
+
+def _mixed(
+    one: Radiance, other: Radiance, part: float, d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    return torch.lerp(one(d), other(d), part)
+
+
 def scaled(
     factor: float | Float[Tensor, "3"], sky: Radiance, d: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:

@@ -26,6 +26,7 @@ from climatenerf.weather.snow.cover import (
     bridged,
     cushions,
     eaves,
+    ground_share,
     lumps,
     mean_within,
     slid,
@@ -164,7 +165,8 @@ def _caught(
     # At the border of what is known the median is not that of nothing, which is 0.
     cosine = np.where(np.isfinite(surface), cosine, ndimage.maximum_filter(cosine, 5))
     cosine = ndimage.median_filter(cosine, 5)
-    share = np.where(np.isfinite(surface), slope_share(cosine, snow), 0.0)
+    share = np.where(low, ground_share(cosine, snow), slope_share(cosine, snow))
+    share = np.where(np.isfinite(surface), share, 0.0)
     wall = cosine < WALL
     # In slanted snow walls are slopes of the raster as well; none of them is a roof.
     upright = -rays.direction[2] > SLANTED

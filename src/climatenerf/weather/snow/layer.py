@@ -37,6 +37,9 @@ from climatenerf.weather.world import Preparation, World
 
 LEVEL_Z, SIDE_Z = 0.5, 0.2  # z of normals of a layer's surface, and of its sides
 SIDE = 0.3  # m of snow behind a side
+RIM_Z = 0.95, 0.8  # z of normals of the layer, and of its rims
+RIM_HEIGHT = 0.9, 0.5  # of the usual height; a tilted layer that is lower is a rim
+RIM_SHARE = 0.2  # of the depth, the least usual height
 SKIN = 0.15  # sum of the balls half a spacing above a level surface
 DUSTING = 0.005, 0.02  # m; between these the steps of stored heights cease to show
 SAME, OTHER = 1.0, 1.5  # steps of stored heights, up to which two are the same, and from which not
@@ -140,7 +143,8 @@ class BakedSnow:
         snowy = to_device(metaballs.evaluate(_array(below), self.lattice)[0] > SKIN, x.device)
         veil = snowy & (x[:, 2] > terrain) & (x[:, 2] < terrain + HIGHEST_VEIL)
         beyond = terrain.isnan() & (COMPLETES in self.ground.capabilities)
-        return (veil | beyond) & (x[:, 2] >= self.lattice.floor)
+        floor = self.lattice.floor
+        return (veil & (terrain >= floor)) | (beyond & (x[:, 2] >= floor))
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the gradient of the sum; up where there is none."""
@@ -236,10 +240,7 @@ class BakedSnow:
         else:
             white = self.place_light.irradiance(x, normal, contact) / math.pi
         deep = torch.tensor(albedo_of(self.snow), dtype=torch.float32, device=x.device)
-        # A side shows the snow behind it, however thin the layer is there.
-        side = ((LEVEL_Z - normal[:, 2]) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
-        behind = SIDE * min((self.snow.depth or 0.0) / DUSTING[1], 1.0)  # a dusting has no sides
-        slab = slab_reflectance(height + behind * side, self.snow.grain)[:, None]
+        slab = slab_reflectance(self._seen_through(normal, height), self.snow.grain)[:, None]
         reflectance = torch.minimum(slab, deep)
         opaque = OPAQUE if float(deep.max()) < OPAQUE else CLEAN_OPAQUE
         thin = (slab[:, 0] < opaque).nonzero()[:, 0]
@@ -252,6 +253,25 @@ class BakedSnow:
             ground = (seen / white[thin].clamp_min(1e-6)).clamp(0, 1)
             reflectance[thin] = over_ground(slab[thin], deep, ground)
         return reflectance * white
+
+    def _seen_through(
+        self, normal: Float[Tensor, "n 3"], height: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n"]:
+        """Thickness of the snow (m) that is seen at heights (m) over the ground below.
+
+        A side shows the snow behind it, however thin the layer is there. So does a rim, where the
+        lattice lets the layer end in a slope: it is tilted, and lower than what fell on a slope.
+        """
+        depth, up = self.snow.depth or 0.0, normal[:, 2]
+        share = slope_share(to_numpy(up), self.snow).astype(np.float32)
+        usual = depth * to_device(share, up.device).clamp_min(RIM_SHARE)
+        tilt = ((RIM_Z[0] - up) / (RIM_Z[0] - RIM_Z[1])).clamp(0, 1)
+        # 1e-6: without depth 0/0.
+        lacks = (RIM_HEIGHT[0] - height / usual.clamp_min(1e-6)) / (RIM_HEIGHT[0] - RIM_HEIGHT[1])
+        thick = torch.lerp(height, height.clamp_min(depth), tilt * lacks.clamp(0, 1))
+        side = ((LEVEL_Z - up) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
+        behind = SIDE * min(depth / DUSTING[1], 1.0)  # a dusting has no sides
+        return thick + behind * side
 
     def glints(
         self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
@@ -391,8 +411,13 @@ class SnowEntity:
             relief=asked.relief,
         )
         floor = max((surface.level for surface in world.surfaces), default=None)
+        light = self._grown.light
+        if world.light is not None and weather.sky.kind != "captured":
+            white = to_numpy(world.light.open_irradiance()).astype(np.float64) / math.pi
+            light = light._replace(irradiance_over_pi=white)
         snow = replace(
             self._grown.above(floor),
+            light=light,
             snow=look,
             place_light=world.light,
             ground=world.field,

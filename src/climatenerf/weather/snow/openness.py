@@ -26,7 +26,7 @@ SNOWY = 0.9  # that of ground, which carries the same snow
 ON_GROUND = 0.12  # m above the terrain, up to which a ray ends on the ground
 DARKEST = 0.05  # openness; less is inside of matter
 INSIDE = 0.15  # light; less is found inside of matter alone
-MIN_OPENNESS = 0.2  # of that ratio; less comes from rays that start inside of matter
+MIN_RATIO = 0.2  # of that ratio; less comes from rays that start inside of matter
 CHUNK = 1 << 16
 
 
@@ -71,7 +71,7 @@ def contact_shade(
     own = np.zeros(coarse.shape)
     own[coarse] = light
     # Where no node is near nothing is used.
-    ratio = np.where(coarse, np.clip(own / np.maximum(around, INSIDE), MIN_OPENNESS, 1), 1.0)
+    ratio = np.where(coarse, np.clip(own / np.maximum(around, INSIDE), MIN_RATIO, 1), 1.0)
     # Between nodes: linear, over nodes with snow alone.
     at = np.mgrid[:rows, :columns] / step
     held = coarse.astype(np.float64)

@@ -39,7 +39,7 @@ def slopes(
     number = (2 * math.pi / length)[:, None] * torch.stack([angle.cos(), angle.sin()], dim=-1)
     # Heights c l of wavelength l: half the sum of their squares is the variance.
     slope = 2 * math.pi * height * math.sqrt(2 / float(length.square().sum()))
-    phase = x[:, :2] @ number.T + 2 * math.pi * ((k * GOLDEN**2) % 1)
+    phase = x[:, :2] @ number.T + 2 * math.pi * ((k * math.sqrt(2)) % 1)
     flat = d[:, :2] / d[:, :2].norm(dim=-1, keepdim=True).clamp_min(1e-6)  # 0/0 straight down
     along = (flat @ number.T) / d[:, 2:].abs().clamp_min(FLATTEST)
     across = torch.stack([-flat[:, 1], flat[:, 0]], dim=-1) @ number.T
