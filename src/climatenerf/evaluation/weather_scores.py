@@ -136,7 +136,7 @@ def snow_scores(
         `thickness_error_cm`, the median error of the thickness; `thickness_cm` and
         `true_thickness_cm`, medians. `snow_iou` of the snowy pixels on ground and roofs.
         `snowy_CLASS` and `true_snowy_CLASS`: the fractions of a class's pixels within that
-        distance that show snow.
+        distance that show snow; both leave out what is thinner than `MIN_SNOW`.
     """
     shares = {name: [0, 0, 0] for name in SNOWY_CLASSES}  # snowy, truly snowy, all
     distance, error, thickness, true_thickness, intersection, union = [], [], [], [], 0, 0
@@ -152,13 +152,14 @@ def snow_scores(
         error.append(np.abs(rendered["snow_thickness"] - thick)[true_snow])
         thickness.append(rendered["snow_thickness"][true_snow])
         true_thickness.append(thick[true_snow])
-        snowy = level & (rendered["mask_snow"] > 0.5)
+        snow_seen = (rendered["mask_snow"] > 0.5) & (rendered["snow_thickness"] > MIN_SNOW)
+        snowy = level & snow_seen
         intersection += (snowy & true_snow).sum()
         union += (snowy | true_snow).sum()
         label = MERGED[truth.label]
         for name, counts in shares.items():
             own = (label == CLASS_NAMES.index(name)) & (truth.depth < MAX_SNOW_DISTANCE)
-            counts[0] += int((own & (rendered["mask_snow"] > 0.5)).sum())
+            counts[0] += int((own & snow_seen).sum())
             counts[1] += int((own & (thick > MIN_SNOW)).sum())
             counts[2] += int(own.sum())
     by_class = {}
