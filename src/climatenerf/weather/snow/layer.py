@@ -262,16 +262,17 @@ class BakedSnow:
         A side shows the snow behind it, however thin the layer is there. So does a rim, where the
         lattice lets the layer end in a slope: it is tilted, and lower than what fell on a slope.
         """
-        depth, up = self.snow.depth or 0.0, normal[:, 2]
+        bent = (normal[:, 2] < RIM_Z[0]).nonzero()[:, 0]
+        depth, up, low = self.snow.depth or 0.0, normal[bent, 2], height[bent]
         share = slope_share(to_numpy(up), self.snow).astype(np.float32)
         usual = depth * to_device(share, up.device).clamp_min(RIM_SHARE)
-        tilt = ((RIM_Z[0] - up) / (RIM_Z[0] - RIM_Z[1])).clamp(0, 1)
+        tilt = ((RIM_Z[0] - up) / (RIM_Z[0] - RIM_Z[1])).clamp(max=1)
         # 1e-6: without depth 0/0.
-        lacks = (RIM_HEIGHT[0] - height / usual.clamp_min(1e-6)) / (RIM_HEIGHT[0] - RIM_HEIGHT[1])
-        thick = torch.lerp(height, height.clamp_min(depth), tilt * lacks.clamp(0, 1))
+        lacks = (RIM_HEIGHT[0] - low / usual.clamp_min(1e-6)) / (RIM_HEIGHT[0] - RIM_HEIGHT[1])
+        thick = torch.lerp(low, low.clamp_min(depth), tilt * lacks.clamp(0, 1))
         side = ((LEVEL_Z - up) / (LEVEL_Z - SIDE_Z)).clamp(0, 1)
         behind = SIDE * min(depth / DUSTING[1], 1.0)  # a dusting has no sides
-        return thick + behind * side
+        return height.index_copy(0, bent, thick + behind * side)
 
     def glints(
         self, x: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"], width: Float[Tensor, "n"]
