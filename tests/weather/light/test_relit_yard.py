@@ -206,6 +206,9 @@ def test_snow_is_neither_grey_nor_overexposed_under_a_new_sky(overcast, monkeypa
     assert white > 0.9
     assert exposures() * white < 0.95
     assert exposures(exposure="fixed") == pytest.approx(1.0, rel=1e-5)
+    monkeypatch.setattr(entity, "SUNLIT_RADIANCE", 0.3)
+    assert exposures() * white == pytest.approx(0.3, rel=0.15)
+    monkeypatch.setattr(entity, "SUNLIT_RADIANCE", 9.0)
     monkeypatch.setattr(entity, "SNOW_RADIANCE", (0.1, 0.4))
     assert exposures() * white == pytest.approx(0.4, rel=0.15)  # this ground is the brightest
     monkeypatch.setattr(entity, "SNOW_RADIANCE", (1.5, 4.0))

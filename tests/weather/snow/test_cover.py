@@ -187,6 +187,19 @@ def test_snow_of_a_narrow_table_slides_to_its_foot():
     assert found.sum() == pytest.approx(0.3 * base.size)
 
 
+def test_what_slides_over_steep_sides_does_not_stay_on_them():
+    """A stair of 60 degrees that keeps nothing is free but for the heap that rises at its foot."""
+    base = np.tile(np.maximum(2.0 - 1.75 * H * np.arange(40), 0.0), (5, 1))
+    base[:, :5] = base[:, 5:6]
+    fell = np.where((base > 0) & (base < base[0, 0]), 0.0, 0.3)
+    found = settled(base, fell, REPOSE * H)
+    assert found.sum() == pytest.approx(fell.sum())
+    top, heap = base + found, (base + found)[2, base[2] == 0].max()
+    side = (fell == 0) & (base > heap + 0.3)
+    assert side.any() and found[side].max() < 1e-3
+    assert found[:, 0].min() > 0.2 and top.max() < base.max() + 0.31
+
+
 def test_gaps_in_the_ground_are_bridged_up_to_some_metres():
     surface = np.zeros((200, 200))
     surface[50:70, 50:70] = np.nan

@@ -56,6 +56,7 @@ DEFAULT_ELEVATION = math.radians(40)  # of a sun that neither photos nor paramet
 EXPOSED = 3  # of what photos show, one pixel in so many counts for the exposure
 DARKEST = 1e-3  # luminance whose logarithm is taken
 SNOW_RADIANCE = 0.5, 0.85  # limits of the median radiance of snow on level ground; 1 is white
+SUNLIT_RADIANCE = 1.2  # limit of the radiance of the brightest tenth of it: sun between shadows
 LEVEL = 0.7  # z of normals of level ground
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
@@ -311,6 +312,8 @@ class LightEntity:
         # 1e-6: without light 0/0.
         white_at_one = max(float(white.median()), 1e-6) / math.pi / gain
         least, most = (radiance / white_at_one for radiance in SNOW_RADIANCE)
+        sunlit_at_one = max(float(white.quantile(0.9)), 1e-6) / math.pi / gain
+        most = min(most, SUNLIT_RADIANCE / sunlit_at_one)
         return kept * (min(max(kept, least), most) / kept) ** cover
 
     def check(self, moments: tuple[Weather, ...]) -> None:

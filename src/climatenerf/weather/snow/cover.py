@@ -233,8 +233,9 @@ def settled(
     """Thickness of snow whose surface nowhere falls more steeply than the angle of repose.
 
     The surface over a node is at most `rise` for each cell above that over any neighbour, or above
-    the node's own base where that is higher: snow on a roof ends in a slope at its eaves. What
-    slides off goes to that neighbour, and makes a heap at the foot of a wall or a car.
+    the node's own base where that is higher: snow on a roof ends in a slope at its eaves. There no
+    more stays than fell, so that the sides of a car stay free. What slides off goes to that
+    neighbour, and makes a heap at the foot of a wall or a car.
 
     Args:
         base: height of what the snow lies on, m; NaN where nothing is.
@@ -271,7 +272,10 @@ def settled(
                         if math.isnan(other):
                             continue
                         length = math.sqrt(dj * dj + di * di)
-                        highest = max(other, base[j, i]) + rise * length
+                        slack = rise * length
+                        if other < base[j, i]:  # nothing below supports more than what fell here
+                            slack = min(slack, thickness[j, i])
+                        highest = max(other, base[j, i]) + slack
                         if highest < limit or (highest == limit and other < lower):
                             limit, lower, to_j, to_i = highest, other, jj, ii
                 if limit < own - tolerance:
