@@ -53,7 +53,7 @@ def test_no_place_is_special():
     x = torch.cartesian_prod(near, near, torch.zeros(1))
     found = slopes(x, DOWN.expand_as(x), torch.zeros(len(x)), HEIGHT)
     usual = slopes(x + 300.0, DOWN.expand_as(x), torch.zeros(len(x)), HEIGHT)
-    assert found.norm(dim=-1).max() < 3.5 * usual.square().sum(-1).mean().sqrt()
+    assert found.norm(dim=-1).max() < 2.8 * usual.square().sum(-1).mean().sqrt()
 
 
 def test_far_snow_is_smooth():
