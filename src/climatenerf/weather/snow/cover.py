@@ -44,8 +44,8 @@ MAX_SWEEPS = 20_000  # of `settled`; 2 m of snow on walls of 6 m need some thous
 def slope_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarray, "*n"]:
     """Fraction of the depth that slopes keep, from the cosine of the slope.
 
-    All up to 30 degrees, none from 60 (EN 1991-1-3, 5.3); or the paper's logistic over its value on
-    level ground, if `Snow.slope` says where half of it stays.
+    Of roofs and objects: all up to 30 degrees, none from 60 (EN 1991-1-3, 5.3); or the paper's
+    logistic over its value on level ground, if `Snow.slope` says where half of it stays.
     """
     if snow.slope is None:
         slope = np.arccos(np.clip(cosine, 0, 1))

@@ -40,7 +40,7 @@ from climatenerf.weather.snow.fall_rays import (
     cast,
     fall_directions,
     inner_side,
-    seen_from_above,
+    trace_shelter,
 )
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Catch, Deposits, SnowGrid
 from climatenerf.weather.snow.openness import contact_shade
@@ -106,7 +106,7 @@ def find_deposits(
         shelter = None
         if snow.drift > 0:
             step = max(SHELTER_SPACING, SHELTER_CELLS * grid.spacing_of(k))
-            shelter = seen_from_above(field, grid, grid.half_side(k) + REACH, step, seed)
+            shelter = trace_shelter(field, grid, grid.half_side(k) + REACH, step, seed)
         for p in range(passes[k]):
 
             def pass_progress(fraction: float, done: int = done) -> None:

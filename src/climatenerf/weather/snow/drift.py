@@ -20,7 +20,7 @@ SMOOTH = 0.3  # m, standard deviation; drifts have no sharper edge
 
 
 class Shelter(NamedTuple):
-    """Heights of all that stands in the wind, as seen from above."""
+    """Height map of what shelters from the wind."""
 
     height: Float[np.ndarray, "y x"]
     """World z, m; NaN where nothing is. Rows lie along +y, columns along +x."""
@@ -37,7 +37,7 @@ def upwind_slope(
 
     Args:
         position: points on the surface, m; NaN where nothing is.
-        shelter: what stands there, hedges included.
+        shelter: what stands upwind, hedges included.
         wind_direction: where the wind comes from, clockwise from +y, rad.
 
     Returns:

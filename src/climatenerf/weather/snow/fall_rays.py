@@ -131,10 +131,10 @@ def cast(
     return FallRays(direction, crossing, middle, leaves, surface, opacity, reached)
 
 
-def seen_from_above(
+def trace_shelter(
     field: RadianceField, grid: SnowGrid, half_side: float, spacing: float, seed: int
 ) -> Shelter:
-    """Heights at which vertical rays end, over a square around the grid's centre.
+    """Trace the height map of a square around the grid's centre by vertical rays.
 
     Args:
         field: the fitted field.

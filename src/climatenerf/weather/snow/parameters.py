@@ -26,7 +26,7 @@ class Snow:
     light: Annotated[str, choice("scene", "paper")] = "scene"
     """scene: the light that falls on each place. paper: that of the open, with wrap lighting."""
     slope: Annotated[float | None, quantity(ANGLE, 0.0, math.pi / 2, optional=True)] = None
-    """Slope that keeps half, the paper's rule. none: all to 30 deg, none from 60 deg (EN 1991)."""
+    """Slope that keeps half, as in the paper. none: as roofs (EN 1991) and rough ground do."""
     slope_sharpness: Annotated[float, number(1.0, 1000.0)] = 50.0
     """Steepness a' of the logistic in cos(slope), with a `slope`."""
     grain: Annotated[float, quantity(LENGTH, 3e-5, 2e-3)] = 1e-4
