@@ -2,8 +2,9 @@
 
 The code shares nothing with the program's own snow. It fills a height field flake by flake. A flake
 stays on a bare surface with the probability that roofs of that pitch keep their snow (EN 1991-1-3,
-5.3: all up to 30 degrees, none from 60), and on snow up to the angle of repose. Otherwise it moves
-to the lowest neighbour, also over an edge. Flakes never reach surfaces under a roof or a table.
+5.3: all up to 30 degrees, none from 60), and on snow unless its side is too steep for its depth.
+Otherwise it moves to the lowest neighbour. What falls over an edge lands scattered, and what slid
+off a surface is packed. Flakes never reach surfaces under a roof or a table.
 Leaves keep a fraction of the flakes that depends on their pitch, up to what a crown can hold; the
 rest falls through. Snow in a crown does not follow single leaves: it bridges them in cushions.
 """
@@ -20,9 +21,15 @@ from tools.reference_street.geometry import Mesh
 # (half width in x, half width in y, cell) in m: finest around the test views.
 RINGS = ((16.0, 24.0, 0.03), (40.0, 60.0, 0.12), (200.0, 200.0, 0.8))
 FLAKES = 60  # per cell
-REPOSE = np.tan(np.deg2rad(50.0))  # slope of the angle of repose of fresh snow
+# Snow stands the steeper the thinner it is: slopes of 30, 45, 60 and 75 degrees hold 3.08, 1.11,
+# .45 and .15 m (Bernhardt and Schulz 2010, SnowSlide), which an exponential fits.
+HELD_AT_30, STEEPER, STEEPEST = 3.08, 0.0671, 80.0  # m, 1/degree, degrees
+# Deposits of slides are twice as dense as the snow that slid (Sovilla and others 2001).
+PACKED = 0.5
+SCATTER, FROM_DROP = 0.2, 0.2  # standard deviation of where it lands over the drop; least drop, m
 KEEPS, SHEDS = 30.0, 60.0  # degrees of pitch up to which all, and from which no snow stays
 MAX_MOVES = 400  # of one flake
+LEVEL = 1e-9  # m a cell; by less a flake would move to and fro forever
 MAX_RISE = 2.5  # height difference of neighbours on one surface, cells
 MIN_DEPTH = 0.002  # m, thinner snow is removed
 # A crown intercepts some 5 kg/m2 of snow for each unit of leaf area that it shows to the sky
@@ -77,7 +84,7 @@ def snow_cover(meshes: list[Mesh], depth: float, ring: int, seed: int = 3) -> tu
     crown, holds, most = cushions(crown, holds, depth, cell)
     rng = np.random.default_rng(seed)
     steepest = MAX_RISE * cell
-    lying, held = _settle(ground, keeps, crown, holds, most, depth / FLAKES, REPOSE * cell, rng)
+    lying, held = _settle(ground, keeps, crown, holds, most, depth / FLAKES, cell, rng)
     covers = []
     for top, snow, times in ((ground, lying, 4), (crown, held, round(8 * CUSHION / cell))):
         for _ in range(times):  # removes the bumps of single flakes
@@ -207,7 +214,14 @@ def _from_above(triangles, x0, y0, cell, ground, level):
 
 
 @numba.njit(cache=True)
-def _settle(ground, keeps, crown, holds, most, flake, steepest, rng):
+def _steepest_side(depth):
+    """Rise over run up to which snow of a depth (m) stands."""
+    degrees = 30.0 + np.log(HELD_AT_30 / max(depth, 1e-6)) / STEEPER
+    return np.tan(np.deg2rad(min(degrees, STEEPEST)))
+
+
+@numba.njit(cache=True)
+def _settle(ground, keeps, crown, holds, most, flake, cell, rng):
     """Drop all flakes one by one; return the depths of snow on surfaces and in crowns.
 
     Crowns keep the fraction `holds` of the flakes until their depth is `most`.
@@ -218,7 +232,7 @@ def _settle(ground, keeps, crown, holds, most, flake, steepest, rng):
     depth, held = np.zeros_like(ground), np.zeros_like(ground)
     for _ in range(FLAKES * rows * columns):
         j, i = int(rng.random() * rows), int(rng.random() * columns)
-        slides = False
+        slides, slid = False, False
         if held[j, i] < most[j, i] and rng.random() < holds[j, i]:
             held[j, i] += flake
             continue
@@ -226,22 +240,36 @@ def _settle(ground, keeps, crown, holds, most, flake, steepest, rng):
             continue
         for _ in range(MAX_MOVES):
             own = ground[j, i] + depth[j, i]
-            best, best_j, best_i = 0.0, j, i
+            best, best_j, best_i, rise = LEVEL, j, i, 0.0
             first = int(rng.random() * 8)
             for k in range(8):
                 dj, di = _STEPS[(first + k) % 8]
                 jj, ii = j + dj, i + di
                 if jj < 0 or ii < 0 or jj >= rows or ii >= columns or ground[jj, ii] == -np.inf:
                     continue
-                fall = (own - ground[jj, ii] - depth[jj, ii]) / np.sqrt(float(dj * dj + di * di))
+                length = np.sqrt(float(dj * dj + di * di))
+                fall = (own - ground[jj, ii] - depth[jj, ii]) / length
+                # Snow at an edge stands on its own surface.
+                rise = max(rise, min(fall, depth[j, i] / length))
                 if fall > best:
                     best, best_j, best_i = fall, jj, ii
             slides = keeps[j, i] < 1.0 and (slides or rng.random() >= keeps[j, i])
-            # The angle of repose applies to snow; `keeps` applies to bare surfaces.
-            lies = depth[j, i] < MIN_DEPTH or best <= steepest
-            if best <= 0.0 or (lies and not slides):
-                depth[j, i] += flake
+            slid = slid or slides
+            # The steepest side is that of snow; `keeps` applies to bare surfaces.
+            lies = depth[j, i] < MIN_DEPTH or rise <= _steepest_side(depth[j, i]) * cell
+            if best <= LEVEL or (lies and not slides):
+                depth[j, i] += flake * PACKED if slid else flake
                 break
+            drop = own - ground[best_j, best_i] - depth[best_j, best_i]
+            if drop > FROM_DROP:
+                dj, di = rng.normal(), rng.normal()
+                for outwards in (1, -1):  # what would land on a wall lands before it
+                    jj = best_j + round(outwards * dj * SCATTER * drop / cell)
+                    ii = best_i + round(outwards * di * SCATTER * drop / cell)
+                    inside = 0 <= jj < rows and 0 <= ii < columns and np.isfinite(ground[jj, ii])
+                    if inside and ground[jj, ii] + depth[jj, ii] < own - FROM_DROP:
+                        best_j, best_i = jj, ii
+                        break
             j, i = best_j, best_i
     return depth, held
 

@@ -1,4 +1,4 @@
-"""Where snow stays: crowns, lumps and gaps of a fitted field, what slides, the angle of repose."""
+"""Where snow stays: crowns, lumps and gaps of a fitted field, what slides."""
 
 import dataclasses
 import math
@@ -16,19 +16,16 @@ from climatenerf.render.integrator import trace
 from climatenerf.scene.terrain import Terrain
 from climatenerf.weather.snow.cover import (
     CROWN_HOLDS,
-    REPOSE,
     bridged,
     cushions,
     eaves,
     ground_share,
     held_by_crowns,
     mean_within,
-    settled,
-    slid,
     slope_share,
 )
 from climatenerf.weather.snow.deposition import surfaces_and_leaves
-from climatenerf.weather.snow.lattice import Catch, SnowGrid, _columns
+from climatenerf.weather.snow.lattice import SnowGrid
 from climatenerf.weather.snow.layer import bake_snow
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.world import World
@@ -121,85 +118,6 @@ def test_the_steep_side_of_a_hedge_carries_no_cushion():
     assert found.keeps[30, 10] == 1
 
 
-def test_what_slides_arrives_below_and_nothing_is_invented():
-    """A slope of 50 degrees between two level grounds."""
-    x = np.arange(80) * H
-    height = np.broadcast_to(np.clip((x - 1.5) * math.tan(math.radians(50)), 0, 1.5), (40, 80))
-    slope = (height > 0.01) & (height < 1.49)
-    share = np.where(slope, 1 / 3, 1.0)
-    arrived = slid(1 - share, share, height, H)
-    assert arrived.sum() == pytest.approx((2 / 3) * slope.sum(), rel=0.05)
-    assert arrived[:, :31].sum() > 0.98 * arrived.sum(), "at the foot"
-    assert not arrived[slope].any()
-    assert slid(np.zeros((20, 20)), np.ones((20, 20)), np.zeros((20, 20)), H).max() == 0
-    holed = height.copy()
-    holed[10:14, 5:9] = np.nan
-    assert np.isfinite(slid(1 - share, share, holed, H)).all()
-
-
-def test_what_slides_passes_over_hollows_of_a_rough_roof():
-    x = np.arange(120) * H
-    across = np.abs(x - 3.0)
-    plane = np.clip(1.5 - np.maximum(*np.meshgrid(across, across)), 0, None)  # a pyramid
-    roof = plane > 0.01
-    rough = plane + roof * 0.1 * np.random.default_rng(0).normal(size=plane.shape)
-    share = np.where(roof, 0.5, 1.0)
-    arrived = slid(1 - share, share, rough, H)
-    assert arrived[~roof].sum() == pytest.approx(0.5 * roof.sum(), rel=0.05)
-
-
-def test_settled_snow_is_nowhere_steeper_than_repose_and_none_is_lost():
-    rng = np.random.default_rng(1)
-    base = 0.3 * rng.random((50, 50)) * (rng.random((50, 50)) < 0.2)
-    base[:, 40:] = np.nan
-    thickness = np.where(np.isnan(base), 0.0, 0.8)
-    found = settled(base, thickness, REPOSE * H)
-    assert np.all(found[:, :40] >= 0)
-    assert found[:, :40].sum() == pytest.approx(0.8 * 50 * 40)
-    top = base + found
-    for axis in (0, 1):
-        step = np.diff(top[:, :40], axis=axis)
-        higher = np.maximum(np.delete(base[:, :40], 0, axis), np.delete(base[:, :40], -1, axis))
-        lower = np.minimum(np.delete(top[:, :40], 0, axis), np.delete(top[:, :40], -1, axis))
-        steepest = np.maximum(higher - lower, 0) + REPOSE * H + 1e-4
-        assert np.all(np.abs(step) <= steepest)
-
-
-def test_snow_that_slides_onto_bare_nodes_stays_there():
-    """What falls on half a raster alone heaps up on the other half as well, and none is lost."""
-    x, y = np.meshgrid(H * np.arange(9), H * np.arange(9))
-    position = np.stack([x, y, 0 * x], -1).astype(np.float32)
-    one = np.ones((9, 9), np.float32)
-    fall = one * (x < 0.22)
-    catch = Catch(position, fall, 0 * one, 0 * one, one, one)
-    thickness = _columns((catch,), 0.6, H)[3]
-    assert thickness.sum() == pytest.approx(0.6 * fall.sum(), rel=1e-3)
-    assert len(thickness) == 81
-
-
-def test_snow_of_a_narrow_table_slides_to_its_foot():
-    base = np.zeros((40, 40))
-    base[15:25, 18:22] = 1.0
-    found = settled(base, np.full(base.shape, 0.3), REPOSE * H)
-    table = base > 0
-    assert found[table].max() == pytest.approx(2 * REPOSE * H, abs=1e-3)
-    assert found[~table].max() > 0.33 and found[:10].max() == pytest.approx(0.3)
-    assert found.sum() == pytest.approx(0.3 * base.size)
-
-
-def test_what_slides_over_steep_sides_does_not_stay_on_them():
-    """A stair of 60 degrees that keeps nothing is free but for the heap that rises at its foot."""
-    base = np.tile(np.maximum(2.0 - 1.75 * H * np.arange(40), 0.0), (5, 1))
-    base[:, :5] = base[:, 5:6]
-    fell = np.where((base > 0) & (base < base[0, 0]), 0.0, 0.3)
-    found = settled(base, fell, REPOSE * H)
-    assert found.sum() == pytest.approx(fell.sum())
-    top, heap = base + found, (base + found)[2, base[2] == 0].max()
-    side = (fell == 0) & (base > heap + 0.3)
-    assert side.any() and found[side].max() < 1e-3
-    assert found[:, 0].min() > 0.2 and top.max() < base.max() + 0.31
-
-
 def test_gaps_in_the_ground_are_bridged_up_to_some_metres():
     surface = np.zeros((200, 200))
     surface[50:70, 50:70] = np.nan
@@ -247,23 +165,6 @@ def test_flat_roofs_walls_and_small_slopes_have_no_eaves():
     assert not np.isfinite(eaves(narrow, narrow > 1.0, H).overhang).any()
 
 
-def test_what_falls_deep_is_scattered():
-    """The same snow that slides from edges 3 and 9 m high; a ledge of one node builds no tower."""
-    highest = []
-    for high in (3.0, 9.0):
-        height = np.zeros((120, 120))
-        height[:, :40] = high + 1.2 * H * np.arange(40)[::-1]
-        share = np.where(height > 0, 0.5, 1.0)
-        arrived = slid(1 - share, share, height, H)
-        assert arrived.sum() == pytest.approx((1 - share).sum(), rel=0.05)
-        highest.append(arrived.max())
-    assert highest[1] < 0.3 * highest[0]
-    height = 9.0 - 1.2 * H * np.broadcast_to(np.arange(60.0), (60, 60))
-    share = np.full((60, 60), 0.5)
-    share[30, 30] = 1.0
-    assert slid(1 - share, share, height, H).max() < 5
-
-
 def test_means_within_a_mask_leave_out_what_is_outside():
     mask = np.zeros((40, 40), bool)
     mask[10:30, 5:20] = True
@@ -271,21 +172,6 @@ def test_means_within_a_mask_leave_out_what_is_outside():
     assert found[mask] == pytest.approx(0.7)
     assert np.all(np.isfinite(found))
     assert found[39, 39] == 0
-
-
-def test_heaps_do_not_depend_on_the_spacing():
-    """A heap of .25 m2 before a wall: a wedge at the angle of repose, .77 m high."""
-    heights = []
-    for spacing in (0.06, 0.03):
-        nodes = round(2.4 / spacing)
-        heap = np.zeros((5, nodes))
-        heap[:, : round(0.12 / spacing)] = 0.25 / 0.12
-        lying = settled(np.zeros_like(heap), heap, REPOSE * spacing)
-        assert lying.sum() * spacing / 5 == pytest.approx(0.25, rel=1e-6)
-        slope = np.abs(np.diff(lying, axis=1)) / spacing
-        assert slope.max() < 1.02 * REPOSE
-        heights.append(lying.max())
-    assert heights == pytest.approx([math.sqrt(2 * REPOSE * 0.25)] * 2, rel=0.12)
 
 
 def test_lumps_of_the_ground_are_ignored_and_holes_filled():
@@ -559,31 +445,3 @@ def test_snow_on_a_steep_slope_hides_it_without_gaps():
     samples = baked.march(feet - 0.5 * d, d, torch.zeros(500), torch.full((500,), 0.5))
     depth = torch.zeros(500).index_add_(0, samples.ray_index(), samples.sigma * samples.dt)
     assert (torch.exp(-depth) < 0.5).float().mean() > 0.99
-
-
-def test_deep_snow_on_an_overhang_ends_in_a_slope():
-    """Snow of .6 m on eaves two nodes wide is no higher there than the angle of repose allows."""
-    position = np.full((9, 9, 3), np.nan, np.float32)
-    position[2:7, 4:6] = [0.0, 0.0, 3.0]
-    weight = np.zeros((9, 9), np.float32)
-    weight[2:7, 4:6] = 1
-    one, none = np.ones((9, 9), np.float32), np.zeros((9, 9), np.float32)
-    thickest = []
-    for ends in (True, False):
-        catch = Catch(position, one, none, none, weight, none, ends)
-        thickest.append(float(_columns((catch,), 0.6, H)[3].max()))
-    assert thickest[0] == pytest.approx(REPOSE * H, rel=0.01)
-    assert thickest[1] == pytest.approx(0.6)
-
-
-def test_deep_snow_on_a_high_block_settles_to_the_angle_of_repose():
-    """A block of 6 m under 2 m of snow, on a lattice of 3 cm, ends in slopes of repose."""
-    spacing = 0.03
-    base = np.zeros((3, 400))
-    base[:, :200] = 6.0
-    found = settled(base, np.full(base.shape, 2.0), REPOSE * spacing)
-    assert found.sum() == pytest.approx(2.0 * base.size)
-    foot = np.diff((base + found)[1, 200:]) / spacing
-    assert np.abs(foot).max() < 1.01 * REPOSE
-    block = np.diff(found[1, :200]) / spacing
-    assert np.abs(block).max() < 1.01 * REPOSE and found[1, 199] < 1.01 * REPOSE * spacing

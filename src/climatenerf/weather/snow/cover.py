@@ -1,15 +1,13 @@
-"""Where snow stays, and how much of it: slopes, crowns, lumps of a fitted field, angle of repose.
+"""Where snow stays, and how much of it: slopes, crowns, eaves, lumps of a fitted field.
 
 Rasters have one node for each fall ray of a pass; heights are world z, m, NaN where nothing is.
 """
 
-import heapq
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from numba import njit
 from scipy import ndimage
 
 from climatenerf.weather.snow.parameters import Snow
@@ -17,7 +15,6 @@ from climatenerf.weather.snow.parameters import Snow
 WALL = math.cos(math.radians(75))  # cosine of the slope from which on snow only passes by
 LEVEL, STEEPEST = math.radians(30), math.radians(60)  # slopes that keep all snow, and none
 BANK, CLIFF = math.radians(50), math.radians(75)  # the same of natural ground
-REPOSE = math.tan(math.radians(50))  # slope of the angle of repose of fresh snow
 CROWN_HOLDS = 0.08  # m of snow that a crown can hold
 CROWN_RETAINS = 0.678  # fraction of it that stays for hours (Hedstrom and Pomeroy 1998)
 CUSHION = 0.1  # m, standard deviation of the smoothing of crowns
@@ -32,13 +29,6 @@ MIN_DROP = 0.5  # m below the eaves of a roof, of what lies there
 MAX_ROUNDING = 0.3  # m between a roof's plane and its rounded rim
 WIDE = 1.0  # m, the least side of a roof
 GAP = 5.0  # m from ground, up to which a gap in it is bridged
-KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
-PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
-SCATTERS, DROPS = 0.2, (0.0, 4.0, 8.0)  # of the drop (m), by which what falls deep is spread
-LEDGE = 0.1  # share of level nodes within reach of what arrives
-DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
-SETTLED = 1e-3  # of the rise over a cell; what is steeper by less stays
-MAX_SWEEPS = 20_000  # of `settled`; 2 m of snow on walls of 6 m need some thousands
 
 
 def slope_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarray, "*n"]:
@@ -60,8 +50,8 @@ def ground_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarra
     """Fraction of the depth that slopes of the ground keep; arguments as of `slope_share`.
 
     Grass and soil are rough: slopes of 45, 60 and 75 degrees hold 1.1, .45 and .15 m of snow
-    (Bernhardt and Schulz 2010, SnowSlide). So the angle of repose limits it, and none stays from 75
-    degrees on; or by the paper's logistic, if `Snow.slope` is given.
+    (Bernhardt and Schulz 2010, SnowSlide). So `sliding.steepest_side` limits it, and none stays
+    from 75 degrees on; or by the paper's logistic, if `Snow.slope` is given.
     """
     if snow.slope is not None:
         return slope_share(cosine, snow)
@@ -107,190 +97,6 @@ def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
     slope = np.hypot(*np.gradient(height, spacing))  # NaN at the rim
     keeps = (CROWN_SHEDS - slope) / (CROWN_SHEDS - CROWN_KEEPS)
     return Cushions(height, closed * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
-
-
-def slid(
-    lost: Float[np.ndarray, "h w"],
-    share: Float[np.ndarray, "h w"],
-    height: Float[np.ndarray, "h w"],
-    spacing: float,
-) -> Float[np.ndarray, "h w"]:
-    """Depth that arrives from steeper surfaces above, over the depth that falls.
-
-    What a slope does not keep slides down, over edges as well, to the first surface that keeps all
-    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m, and over
-    `SCATTERS` of its drop from higher edges, so that no spires stand below crowns of a wrong class.
-    What slides passes over depressions of a slope, which are roughness of the field.
-
-    Args:
-        lost: depth that slides off each node, over the depth that falls.
-        share: fraction of the fall that stays.
-        height: of the surface, m; NaN without one.
-        spacing: of the raster, m.
-    """
-    known = np.isfinite(height)
-    weight = ndimage.gaussian_filter(known.astype(np.float64), 1.0)
-    smooth = ndimage.gaussian_filter(np.where(known, height, 0.0), 1.0)
-    smooth = np.where(known, smooth / np.maximum(weight, 1e-6), np.nan)
-    # Roughness would catch what slides; at edges the surfaces stay apart.
-    smooth = np.where(np.abs(smooth - height) < spacing, smooth, height)
-    filled = _depressions_filled(smooth, share > KEEPS_ALL)
-    order = np.argsort(np.where(known, -filled, np.inf), axis=None, kind="stable")
-    arrived, drop = _routed(lost, share, filled, order[: int(known.sum())])
-    level = (share > KEEPS_ALL).astype(np.float64)
-    heaps = np.zeros_like(level)
-    for low, high in zip(DROPS, (*DROPS[1:], math.inf), strict=True):
-        part = np.where((drop >= low) & (drop < high), arrived, 0.0)
-        if part.any():
-            sigma = max(PILE, SCATTERS * low) / spacing
-            # What finds no more than a ledge to lie on is lost, and builds no tower there.
-            reach = np.maximum(ndimage.gaussian_filter(level, sigma), LEDGE)
-            heaps += level * ndimage.gaussian_filter(part / reach, sigma)
-    return heaps
-
-
-@njit(cache=True)
-def _depressions_filled(
-    height: Float[np.ndarray, "h w"], outlet: Bool[np.ndarray, "h w"]
-) -> Float[np.ndarray, "h w"]:
-    """Fill depressions: each node has a descending way to an outlet or to the raster's border.
-
-    The priority flood of Barnes, Lehman and Mulla (2014), algorithm 3. Nodes that no way joins to
-    an outlet keep their height.
-
-    Args:
-        height: of the surface, m; NaN without one.
-        outlet: where what slides may come to rest.
-    """
-    rows, columns = height.shape
-    filled = height.copy()
-    reached = np.isnan(height)
-    queue: Any = [(0.0, 0)]
-    queue.pop()  # Numba takes the type of an empty list from what was in it
-    for j in range(rows):
-        for i in range(columns):
-            border = j == 0 or i == 0 or j == rows - 1 or i == columns - 1
-            if (outlet[j, i] or border) and not reached[j, i]:
-                reached[j, i] = True
-                heapq.heappush(queue, (height[j, i], j * columns + i))
-    while len(queue) > 0:
-        level, q = heapq.heappop(queue)
-        j, i = q // columns, q % columns
-        for dj in range(-1, 2):
-            for di in range(-1, 2):
-                jj, ii = j + dj, i + di
-                if jj < 0 or ii < 0 or jj >= rows or ii >= columns or reached[jj, ii]:
-                    continue
-                reached[jj, ii] = True
-                filled[jj, ii] = max(height[jj, ii], level + DESCENT)
-                heapq.heappush(queue, (filled[jj, ii], jj * columns + ii))
-    return filled
-
-
-@njit(cache=True)
-def _routed(
-    lost: Float[np.ndarray, "h w"],
-    share: Float[np.ndarray, "h w"],
-    height: Float[np.ndarray, "h w"],
-    order: Int[np.ndarray, "n"],
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Carry what does not stay to the lowest neighbours, from the highest node to the lowest.
-
-    Returns:
-        What arrives at nodes that keep all, over the depth that falls, and the highest step that it
-        has dropped, m.
-    """
-    rows, columns = share.shape
-    carried = np.zeros((rows, columns))
-    arrived = np.zeros((rows, columns))
-    drop = np.zeros((rows, columns))
-    for q in order:
-        j, i = q // columns, q % columns
-        if share[j, i] > KEEPS_ALL:
-            arrived[j, i] = carried[j, i]
-            continue
-        best, to_j, to_i = 0.0, -1, -1
-        for dj in range(-1, 2):
-            for di in range(-1, 2):
-                jj, ii = j + dj, i + di
-                if jj < 0 or ii < 0 or jj >= rows or ii >= columns or (dj == 0 and di == 0):
-                    continue
-                fall = (height[j, i] - height[jj, ii]) / math.sqrt(dj * dj + di * di)
-                if fall > best:  # NaN compares False
-                    best, to_j, to_i = fall, jj, ii
-        if to_j >= 0:
-            carried[to_j, to_i] += carried[j, i] + lost[j, i]
-            if carried[j, i] + lost[j, i] > 0:
-                step = height[j, i] - height[to_j, to_i]
-                drop[to_j, to_i] = max(drop[to_j, to_i], drop[j, i], step)
-    return arrived, drop
-
-
-@njit(cache=True)
-def settled(
-    base: Float[np.ndarray, "h w"], thickness: Float[np.ndarray, "h w"], rise: float
-) -> Float[np.ndarray, "h w"]:
-    """Thickness of snow whose surface nowhere falls more steeply than the angle of repose.
-
-    The surface over a node is at most `rise` for each cell above that over any neighbour, or above
-    the node's own base where that is higher: snow on a roof ends in a slope at its eaves. There no
-    more stays than fell, so that the sides of a car stay free. What slides off goes to that
-    neighbour, and makes a heap at the foot of a wall or a car.
-
-    Args:
-        base: height of what the snow lies on, m; NaN where nothing is.
-        thickness: of the snow before it slides, m.
-        rise: of the surface over one cell at the angle of repose, m.
-    """
-    rows, columns = base.shape
-    top = base + thickness
-    tolerance = SETTLED * rise
-    waiting = np.ones((rows, columns), np.bool_)  # nodes near a change since they were looked at
-    busy = np.ones(rows, np.bool_)  # rows of such nodes
-    for sweep in range(MAX_SWEEPS):
-        changed = False
-        for a in range(rows):
-            j = a if sweep % 2 == 0 else rows - 1 - a
-            if not busy[j]:
-                continue
-            busy[j] = False
-            for b in range(columns):
-                i = b if sweep % 4 < 2 else columns - 1 - b
-                if not waiting[j, i]:
-                    continue
-                waiting[j, i] = False
-                own = top[j, i]
-                if not own - base[j, i] > 1e-6:  # NaN compares False
-                    continue
-                limit, lower, to_j, to_i = own, own, -1, -1
-                for dj in range(-1, 2):
-                    for di in range(-1, 2):
-                        jj, ii = j + dj, i + di
-                        if jj < 0 or ii < 0 or jj >= rows or ii >= columns:
-                            continue
-                        other = top[jj, ii]
-                        if math.isnan(other):
-                            continue
-                        length = math.sqrt(dj * dj + di * di)
-                        slack = rise * length
-                        if other < base[j, i]:  # nothing below supports more than what fell here
-                            slack = min(slack, thickness[j, i])
-                        highest = max(other, base[j, i]) + slack
-                        if highest < limit or (highest == limit and other < lower):
-                            limit, lower, to_j, to_i = highest, other, jj, ii
-                if limit < own - tolerance:
-                    # The neighbour rises by as much as this falls; below an edge it may.
-                    moved = (own - limit) * (0.5 if lower >= base[j, i] else 1.0)
-                    top[j, i] = own - moved
-                    top[to_j, to_i] += moved
-                    changed = True
-                    for jj in range(max(min(j, to_j) - 1, 0), min(max(j, to_j) + 2, rows)):
-                        busy[jj] = True
-                        for ii in range(max(min(i, to_i) - 1, 0), min(max(i, to_i) + 2, columns)):
-                            waiting[jj, ii] = True
-        if not changed:
-            break
-    return np.maximum(top - base, 0.0)
 
 
 class Eaves(NamedTuple):

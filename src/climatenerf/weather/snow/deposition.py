@@ -29,7 +29,6 @@ from climatenerf.weather.snow.cover import (
     ground_share,
     lumps,
     mean_within,
-    slid,
     slope_share,
 )
 from climatenerf.weather.snow.drift import REACH, Shelter, drifted
@@ -45,6 +44,7 @@ from climatenerf.weather.snow.fall_rays import (
 from climatenerf.weather.snow.lattice import SHADE_UNIT, Catch, Deposits, SnowGrid
 from climatenerf.weather.snow.openness import contact_shade
 from climatenerf.weather.snow.parameters import Snow
+from climatenerf.weather.snow.sliding import PACKED, slid
 from climatenerf.weather.snow.surface_fit import smooth_ground
 
 LEAF = int(SOLID_OF[VEGETATION])
@@ -180,7 +180,7 @@ def _caught(
     # nor at its foot, which is a bend of the raster since slopes are measured over `base` nodes.
     stops = wall if upright else ndimage.binary_dilation(wall, iterations=base // 2)
     lost = np.where(stops, 0.0, 1 - share)
-    arrived = slid(lost, share, smooth[..., 2].astype(np.float64), h)
+    arrived = PACKED * slid(lost, share, smooth[..., 2].astype(np.float64), h)
     moved = np.ones(share.shape)
     if shelter is not None:
         moved = drifted(smooth, shelter, snow.drift, snow.wind_direction, h)

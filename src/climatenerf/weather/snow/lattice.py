@@ -21,7 +21,8 @@ from climatenerf.ops.cpu.metaballs import (
     Lattice,
     occupied_cells,
 )
-from climatenerf.weather.snow.cover import REPOSE, held_by_crowns, settled
+from climatenerf.weather.snow.cover import held_by_crowns
+from climatenerf.weather.snow.sliding import settled
 
 _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 # A column that extends below the ground by the supports of kernel and prefilter gives the same
@@ -197,7 +198,7 @@ def _columns(
         nothing = -1e3 if catch.overhangs else np.nan  # far below; beside NaN snow stays
         base = np.where(surface, catch.position[..., 2].astype(np.float64), nothing)
         thickness = np.where(surface, np.maximum(thickness, 0.0), 0.0)
-        thickness = settled(base, thickness, REPOSE * spacing)
+        thickness = settled(base, thickness, spacing)
         used = surface & (thickness > _THINNEST)
         parts.append(
             [each[used] for each in (catch.position, catch.weight, catch.shade, thickness)]
