@@ -406,7 +406,7 @@ def test_a_rough_roof_carries_an_even_layer():
     assert catch.of_fall[roof].mean() == pytest.approx(25 / 30, abs=0.08)
 
 
-def test_deep_snow_on_a_post_and_a_bench_slopes_at_the_angle_of_repose():
+def test_deep_snow_on_a_post_and_a_bench_ends_in_steep_slopes():
     post = Box((-0.05, -0.05, -1.0), (0.05, 0.05, 0.8))
     bench = Box((0.6, -0.4, -1.0), (1.4, 0.4, 0.5))
     snow = bake([ground(), post, bench], 0.6, SnowGrid((0.013, 0.027), (-1.0, 2.0), 0.05, 48))
