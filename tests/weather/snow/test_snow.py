@@ -371,8 +371,8 @@ def test_a_steep_roof_sheds_its_snow_to_the_ground_below():
     arrived = float(np.trapezoid(before - 0.1, xs.numpy()))
     assert arrived == pytest.approx(PACKED * 2 / 3 * 0.1 * 1.0, rel=0.2)
     # It lies at the foot of the wall, no steeper than snow stands, not spread over the ground.
-    assert before[:4].mean() > 0.18
-    assert np.all(before[xs.numpy() > 1.5] < 0.12)
+    assert before[:4].mean() > 0.15
+    assert np.all(before[xs.numpy() > 1.6] < 0.12)
     assert np.abs(np.diff(before) / np.diff(xs.numpy())).max() < steepest_side(0.2)
     behind = depth_over(snow, on_plane(ground(), 40, 0.2) - torch.tensor([2.5, 0.0, 0.0]))
     assert behind.numpy() == pytest.approx(0.1, rel=0.1)

@@ -5,6 +5,7 @@ Rasters as of `weather.snow.cover`: heights are world z, m, NaN where nothing is
 
 import heapq
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -57,10 +58,11 @@ def slid(
     arrived, drop = _routed(lost, share, filled, order[: int(known.sum())])
     level = (share > KEEPS_ALL).astype(np.float64)
     heaps = np.zeros_like(level)
-    for low, high in zip(DROPS, (*DROPS[1:], math.inf), strict=True):
+    for low, high in pairwise((*DROPS, math.inf)):
         part = np.where((drop >= low) & (drop < high), arrived, 0.0)
         if part.any():
-            sigma = max(PILE, SCATTERS * low) / spacing
+            typical = (low + min(high, 2 * low)) / 2
+            sigma = max(PILE, SCATTERS * typical) / spacing
             # What finds no more than a ledge to lie on is lost, and builds no tower there.
             reach = np.maximum(ndimage.gaussian_filter(level, sigma), LEDGE)
             heaps += level * ndimage.gaussian_filter(part / reach, sigma)
