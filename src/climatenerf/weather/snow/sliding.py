@@ -5,7 +5,6 @@ Rasters as of `weather.snow.cover`: heights are world z, m, NaN where nothing is
 
 import heapq
 import math
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,18 +12,22 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 from scipy import ndimage
 
-HELD_AT_30, STEEPER = 3.08, 0.0671  # m on a slope of 30 degrees; 1/degree, of `steepest_side`
+HELD_AT_30, PER_DEGREE = 3.08, 0.0671  # m on a slope of 30 degrees; decay, of `steepest_side`
 STEEPEST_SIDE = 80.0  # degrees of the sides of thin snow
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
-SCATTERS, DROPS = 0.2, (0.0, 1.0, 2.0, 4.0, 8.0)  # of the drop (m), by which what falls is spread
+SCATTERS = 0.2  # of the drop: standard deviation, along each axis, of where what falls lands
 PACKED = 0.5  # volume of what slid over that before it did
 FALLS_FROM = 0.2  # m of a drop over an edge, from which what falls is scattered
-PARCELS, GOLDEN = 64, math.pi * (3 - math.sqrt(5))  # of what falls off a node; radian
-MAX_FALLS = 20  # edges one below the other
+EDGE = 3.0  # cells of a drop, from which coarse rasters know an edge from a bank
+PARCELS = 64  # of what falls off a node
+SPREAD = 256  # parcels of what slid to a node
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # radian, between parcels
 LEDGE = 0.1  # share of level nodes within reach of what arrives
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
-SETTLED = 1e-3  # of the rise over a cell; what is steeper by less stays
+SETTLED = 1e-3  # of the spacing; what is higher by less stays
+FILM = 1e-6  # m; less would slide on and on
+LOOSELY = 10.0  # times `SETTLED`, while snow falls over edges
 MAX_SWEEPS = 20_000  # of `settled`; 2 m of snow on walls of 6 m need some thousands
 
 
@@ -37,8 +40,8 @@ def slid(
     """Depth that arrives from steeper surfaces above, over the depth that falls.
 
     What a slope does not keep slides down, over edges as well, to the first surface that keeps all
-    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m, and over
-    `SCATTERS` of its drop from higher edges, so that no spires stand below crowns of a wrong class.
+    snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m and over
+    `SCATTERS` of its drop, so that no spires stand below crowns of a wrong class.
     What slides passes over depressions of a slope, which are roughness of the field.
 
     Args:
@@ -56,17 +59,49 @@ def slid(
     filled = _depressions_filled(smooth, share > KEEPS_ALL)
     order = np.argsort(np.where(known, -filled, np.inf), axis=None, kind="stable")
     arrived, drop = _routed(lost, share, filled, order[: int(known.sum())])
-    level = (share > KEEPS_ALL).astype(np.float64)
-    heaps = np.zeros_like(level)
-    for low, high in pairwise((*DROPS, math.inf)):
-        part = np.where((drop >= low) & (drop < high), arrived, 0.0)
-        if part.any():
-            typical = (low + min(high, 2 * low)) / 2
-            sigma = max(PILE, SCATTERS * typical) / spacing
-            # What finds no more than a ledge to lie on is lost, and builds no tower there.
-            reach = np.maximum(ndimage.gaussian_filter(level, sigma), LEDGE)
-            heaps += level * ndimage.gaussian_filter(part / reach, sigma)
-    return heaps
+    level = share > KEEPS_ALL
+    piled = _piled(arrived, drop, smooth, level, spacing)
+    # What finds no more than a ledge to lie on is lost, and builds no tower there.
+    reach = np.maximum(ndimage.gaussian_filter(level.astype(np.float64), PILE / spacing), LEDGE)
+    return level * ndimage.gaussian_filter(piled / reach, PILE / spacing)
+
+
+@njit(cache=True)
+def _piled(
+    arrived: Float[np.ndarray, "h w"],
+    drop: Float[np.ndarray, "h w"],
+    height: Float[np.ndarray, "h w"],
+    level: Bool[np.ndarray, "h w"],
+    spacing: float,
+) -> Float[np.ndarray, "h w"]:
+    """What arrived, normally distributed over the level nodes around, but not on the roof above.
+
+    It lands in parcels. Where fewer than `LEDGE` of them find a place, the others are lost.
+    """
+    rows, columns = arrived.shape
+    piled = np.zeros((rows, columns))
+    to = np.zeros((SPREAD, 2), np.int64)
+    for j in range(rows):
+        for i in range(columns):
+            if arrived[j, i] <= 0:
+                continue
+            reach = SCATTERS * drop[j, i] / spacing
+            highest = height[j, i] + max(drop[j, i] / 2, FALLS_FROM)
+            found = 0
+            for k in range(SPREAD):
+                radius = reach * math.sqrt(-2 * math.log(1 - (k + 0.5) / SPREAD))
+                angle = GOLDEN_ANGLE * (k + SPREAD * (j * columns + i))
+                dj, di = radius * math.cos(angle), radius * math.sin(angle)
+                for side in (1, -1):  # what would land on a wall lands before it
+                    jj, ii = j + round(side * dj), i + round(side * di)
+                    inside = 0 <= jj < rows and 0 <= ii < columns
+                    if inside and level[jj, ii] and height[jj, ii] < highest:
+                        to[found, 0], to[found, 1] = jj, ii
+                        found += 1
+                        break
+            for k in range(found):
+                piled[to[k, 0], to[k, 1]] += arrived[j, i] / max(found, LEDGE * SPREAD)
+    return piled
 
 
 @njit(cache=True)
@@ -153,10 +188,11 @@ def steepest_side(depth: float) -> float:
     Slopes of 30, 45, 60 and 75 degrees hold 3.08, 1.11, .45 and .15 m of snow (Bernhardt and Schulz
     2010, SnowSlide); an exponential fits these.
     """
-    degrees = 30 + math.log(HELD_AT_30 / max(depth, 1e-6)) / STEEPER  # no snow: log of infinity
-    return math.tan(math.radians(min(degrees, STEEPEST_SIDE)))
+    degrees = 30 + math.log(HELD_AT_30 / max(depth, 1e-6)) / PER_DEGREE  # no snow: 3.08 / 0
+    return math.tan(math.radians(min(max(degrees, 0.0), STEEPEST_SIDE)))
 
 
+@njit(cache=True)
 def settled(
     base: Float[np.ndarray, "h w"], thickness: Float[np.ndarray, "h w"], spacing: float
 ) -> Float[np.ndarray, "h w"]:
@@ -172,27 +208,15 @@ def settled(
         thickness: of the snow before it slides, m.
         spacing: of the nodes, m.
     """
-    top = base + thickness
-    for _ in range(MAX_FALLS):
-        fell = _come_to_rest(top, base, thickness, spacing)
-        if not fell.any():
-            break
-        top = _scattered(top, base, fell, spacing)
-    return np.maximum(top - base, 0.0)
-
-
-@njit(cache=True)
-def _come_to_rest(
-    top: Float[np.ndarray, "h w"],
-    base: Float[np.ndarray, "h w"],
-    thickness: Float[np.ndarray, "h w"],
-    spacing: float,
-) -> Float[np.ndarray, "h w"]:
-    """Let snow slide until it rests, in place; return what fell off each node over an edge, m."""
     rows, columns = base.shape
+    top = base + thickness
+    tolerance = LOOSELY * SETTLED * spacing  # until no more falls
+    edge = max(FALLS_FROM, EDGE * spacing)
+    fell = np.zeros((rows, columns))  # off each node and not yet landed, m
+    received = np.zeros((rows, columns))  # the same at its foot
+    falls = False
     waiting = np.ones((rows, columns), np.bool_)  # nodes near a change since they were looked at
     busy = np.ones(rows, np.bool_)  # rows of such nodes
-    fell = np.zeros((rows, columns))
     for sweep in range(MAX_SWEEPS):
         changed = False
         for a in range(rows):
@@ -206,10 +230,10 @@ def _come_to_rest(
                     continue
                 waiting[j, i] = False
                 own = top[j, i]
-                if not own - base[j, i] > 1e-6:  # NaN compares False
+                if not own - base[j, i] > FILM:  # NaN compares False
                     continue
                 rise = spacing * steepest_side(own - base[j, i])
-                limit, lower, to_j, to_i = own, own, -1, -1
+                limit, lower, to_j, to_i, part = own, own, -1, -1, 0.5
                 for dj in range(-1, 2):
                     for di in range(-1, 2):
                         jj, ii = j + dj, i + di
@@ -219,39 +243,74 @@ def _come_to_rest(
                         if math.isnan(other):
                             continue
                         slack = rise * math.sqrt(dj * dj + di * di)
-                        if other < base[j, i]:  # nothing below supports more than what fell here
-                            slack = min(slack, thickness[j, i])
+                        # Nothing below supports more than what fell here.
+                        free = other < base[j, i] and slack > thickness[j, i]
+                        if free:
+                            slack = thickness[j, i]
                         highest = max(other, base[j, i]) + slack
                         if highest < limit or (highest == limit and other < lower):
                             limit, lower, to_j, to_i = highest, other, jj, ii
-                if limit < own - SETTLED * rise:
-                    # By half: a neighbour rises by as much, and thinner snow stands more steeply.
-                    moved = 0.5 * (own - limit)
-                    top[j, i] = own - moved
-                    if lower < base[j, i] - FALLS_FROM:
+                            # Else by half: a neighbour rises by as much, and thinner snow stands
+                            # more steeply.
+                            part = 1.0 if free else 0.5
+                if limit < own - (FILM if part == 1.0 else tolerance):
+                    drop, moved = base[j, i] - lower, part * (own - limit)
+                    if drop > edge:
+                        if received[to_j, to_i] > drop and (
+                            received[to_j, to_i]
+                            > drop * _width(top, base[j, i], to_j, to_i, spacing)
+                        ):
+                            continue  # the gap below is full when that has landed
                         fell[j, i] += moved
+                        received[to_j, to_i] += moved
+                        falls = True
                     else:
                         top[to_j, to_i] += moved
+                        _wake(waiting, busy, to_j, to_i)
+                    top[j, i] = own - moved
+                    _wake(waiting, busy, j, i)
                     changed = True
-                    for jj in range(max(min(j, to_j) - 1, 0), min(max(j, to_j) + 2, rows)):
-                        busy[jj] = True
-                        for ii in range(max(min(i, to_i) - 1, 0), min(max(i, to_i) + 2, columns)):
-                            waiting[jj, ii] = True
-        if not changed:
+        if changed:
+            continue
+        if falls:
+            _land(top, base, fell, waiting, busy, spacing)
+            fell[:], received[:], falls = 0, 0, False
+        elif tolerance > SETTLED * spacing:
+            tolerance = SETTLED * spacing
+            waiting[:], busy[:] = True, True
+        else:
             break
-    return fell
+    if falls:
+        _land(top, base, fell, waiting, busy, spacing)
+    return np.maximum(top - base, 0.0)
 
 
 @njit(cache=True)
-def _scattered(
+def _wake(
+    waiting: Bool[np.ndarray, "h w"], busy: Bool[np.ndarray, "h"], row: int, column: int
+) -> None:
+    """Note that a node has changed, for itself and its neighbours."""
+    for j in range(max(row - 1, 0), min(row + 2, waiting.shape[0])):
+        busy[j] = True
+        for i in range(max(column - 1, 0), min(column + 2, waiting.shape[1])):
+            waiting[j, i] = True
+
+
+@njit(cache=True)
+def _land(
     top: Float[np.ndarray, "h w"],
     base: Float[np.ndarray, "h w"],
     fell: Float[np.ndarray, "h w"],
+    waiting: Bool[np.ndarray, "h w"],
+    busy: Bool[np.ndarray, "h"],
     spacing: float,
-) -> Float[np.ndarray, "h w"]:
-    """The surface with what fell over edges: in parcels normally distributed around their feet."""
-    rows, columns = base.shape
-    risen = top.copy()
+) -> None:
+    """Add what fell off nodes to the surface, in place, normally distributed around their feet.
+
+    It lands in parcels. What would land on a wall lands before it, on the other side of the foot.
+    """
+    rows, columns = top.shape
+    before = top.copy()
     for j in range(rows):
         for i in range(columns):
             if fell[j, i] <= 0:
@@ -259,19 +318,45 @@ def _scattered(
             foot_j, foot_i = j, i
             for jj in range(max(j - 1, 0), min(j + 2, rows)):
                 for ii in range(max(i - 1, 0), min(i + 2, columns)):
-                    if top[jj, ii] < top[foot_j, foot_i]:  # NaN compares False
+                    if before[jj, ii] < before[foot_j, foot_i]:  # NaN compares False
                         foot_j, foot_i = jj, ii
-            reach = SCATTERS * (base[j, i] - top[foot_j, foot_i]) / spacing
+            reach = SCATTERS * max(base[j, i] - before[foot_j, foot_i], 0.0) / spacing
             for k in range(PARCELS):
-                radius = reach * math.sqrt(-2 * math.log(1 - (k + 0.5) / PARCELS))
-                angle = GOLDEN * (k + PARCELS * (j * columns + i))
-                dj, di = radius * math.cos(angle), radius * math.sin(angle)
-                to_j, to_i = foot_j, foot_i
-                for outwards in (1, -1):  # what would land on a wall lands before it
-                    jj, ii = foot_j + round(outwards * dj), foot_i + round(outwards * di)
-                    inside = 0 <= jj < rows and 0 <= ii < columns
-                    if inside and top[jj, ii] < base[j, i] - FALLS_FROM:  # NaN compares False
-                        to_j, to_i = jj, ii
-                        break
-                risen[to_j, to_i] += fell[j, i] / PARCELS
-    return risen
+                turn = k + PARCELS * (j * columns + i)
+                to_j, to_i = _landing(before, base[j, i], foot_j, foot_i, reach, k, turn)
+                top[to_j, to_i] += fell[j, i] / PARCELS
+                _wake(waiting, busy, to_j, to_i)
+
+
+@njit(cache=True)
+def _landing(
+    top: Float[np.ndarray, "h w"],
+    high: float,
+    foot_j: int,
+    foot_i: int,
+    reach: float,
+    k: int,
+    turn: int,
+) -> tuple[int, int]:
+    """The node at which parcel k lands that fell from a height (m), `reach` nodes from the foot."""
+    radius = reach * math.sqrt(-2 * math.log(1 - (k + 0.5) / PARCELS))
+    dj = radius * math.cos(GOLDEN_ANGLE * turn)
+    di = radius * math.sin(GOLDEN_ANGLE * turn)
+    for side in (1, -1):
+        j, i = foot_j + round(side * dj), foot_i + round(side * di)
+        inside = 0 <= j < top.shape[0] and 0 <= i < top.shape[1]
+        if inside and top[j, i] < high - FALLS_FROM:  # NaN compares False
+            return j, i
+    return foot_j, foot_i
+
+
+@njit(cache=True)
+def _width(
+    top: Float[np.ndarray, "h w"], high: float, foot_j: int, foot_i: int, spacing: float
+) -> float:
+    """Nodes across an edge over which what falls from it is spread; 1 in a pit."""
+    reach = SCATTERS * (high - top[foot_j, foot_i]) / spacing
+    stays = 0
+    for k in range(PARCELS):
+        stays += _landing(top, high, foot_j, foot_i, reach, k, k) == (foot_j, foot_i)
+    return 1 / max(stays / PARCELS, 1 / (1 + math.sqrt(2 * math.pi) * reach))
