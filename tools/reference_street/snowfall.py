@@ -23,7 +23,7 @@ RINGS = ((16.0, 24.0, 0.03), (40.0, 60.0, 0.12), (200.0, 200.0, 0.8))
 FLAKES = 60  # per cell
 # Snow stands the steeper the thinner it is: slopes of 30, 45, 60 and 75 degrees hold 3.08, 1.11,
 # .45 and .15 m (Bernhardt and Schulz 2010, SnowSlide), which an exponential fits.
-HELD_AT_30, STEEPER, STEEPEST = 3.08, 0.0671, 80.0  # m, 1/degree, degrees
+HELD_AT_30, PER_DEGREE, STEEPEST = 3.08, 0.0671, 80.0  # m, 1/degree, degrees
 # Deposits of slides are twice as dense as the snow that slid (Sovilla and others 2001).
 PACKED = 0.5
 SCATTER, FROM_DROP = 0.2, 0.2  # standard deviation of where it lands over the drop; least drop, m
@@ -216,7 +216,7 @@ def _from_above(triangles, x0, y0, cell, ground, level):
 @numba.njit(cache=True)
 def _steepest_side(depth):
     """Rise over run up to which snow of a depth (m) stands."""
-    degrees = 30.0 + np.log(HELD_AT_30 / max(depth, 1e-6)) / STEEPER
+    degrees = 30.0 + np.log(HELD_AT_30 / max(depth, 1e-6)) / PER_DEGREE
     return np.tan(np.deg2rad(min(degrees, STEEPEST)))
 
 

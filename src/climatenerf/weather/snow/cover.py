@@ -50,8 +50,8 @@ def ground_share(cosine: Float[np.ndarray, "*n"], snow: Snow) -> Float[np.ndarra
     """Fraction of the depth that slopes of the ground keep; arguments as of `slope_share`.
 
     Grass and soil are rough: slopes of 45, 60 and 75 degrees hold 1.1, .45 and .15 m of snow
-    (Bernhardt and Schulz 2010, SnowSlide). So `sliding.steepest_side` limits it, and none stays
-    from 75 degrees on; or by the paper's logistic, if `Snow.slope` is given.
+    (Bernhardt and Schulz 2010, SnowSlide). All stays up to 50 degrees and none from 75;
+    `sliding.settled` thins deep snow further. Or by the paper's logistic, if `Snow.slope` is given.
     """
     if snow.slope is not None:
         return slope_share(cosine, snow)

@@ -251,7 +251,8 @@ def surfaces_and_leaves(
     """
     low = height < ground + UNDERGROWTH  # NaN compares False
     tall = np.isfinite(height) & ~low
-    # Single leaves on a cairn are wrong classes of its stones, and would carry cushions.
+    # Single leaves on a cairn are wrong classes of its stones, and would carry cushions; thin
+    # posts in a hedge become leaves.
     leaf = tall & (mean_within(tall & (kind == LEAF), tall, MAJORITY / spacing) > 0.5)
     surface = np.where(leaf, np.nan, height)
     astray = lumps(surface, np.isin(kind, GROUND_KINDS), ground, ASTRAY)
