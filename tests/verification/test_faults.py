@@ -106,7 +106,7 @@ def never_nothing(original):
 
 
 def dry_bottom(original):
-    return lambda dry, irradiance, ior: dry
+    return lambda dry, *light, **water: dry
 
 
 def gamma(original):
@@ -166,10 +166,16 @@ FAULTS = {
         lambda original: lambda asked: tuple(1.05 * each for each in original(asked)),
         {"water absorption"},
     ),
-    "the dry bottom": (optics, "bottom_radiance", dry_bottom, {"water wet bottom"}),
+    # The bottom of the absorption's check is wet as well.
+    "the dry bottom": (
+        optics,
+        "bottom_radiance",
+        dry_bottom,
+        {"water absorption", "water wet bottom"},
+    ),
     "a flipped mirror": (optics, "mirror", flipped, {"mirror image"}),
     "mud that is darker": (optics, "body_colour", scaled(0.9), {"white furnace water"}),
-    "snow that is darker": (snow.BakedSnow, "colour", scaled(0.95), {"white furnace snow"}),
+    "snow that is darker": (snow.BakedSnow, "_shaded", scaled(0.95), {"white furnace snow"}),
     "a fifth more snow": (
         snow,
         "grow",
