@@ -21,14 +21,14 @@ PACKED = 0.5  # volume of what slid over that before it did
 FALLS_FROM = 0.2  # m of a drop over an edge, from which what falls is scattered
 EDGE = 3.0  # cells of a drop, from which coarse rasters know an edge from a bank
 PARCELS = 64  # of what falls off a node
-SPREAD = 256  # parcels of what slid to a node
+SLID_PARCELS = 256  # of what slid to a node
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # radian, between parcels
 LEDGE = 0.1  # share of level nodes within reach of what arrives
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
-SETTLED = 1e-3  # of the spacing; what is higher by less stays
+SETTLED = 3e-3  # of the spacing; what is higher by less stays
 FILM = 1e-6  # m; less would slide on and on
-LOOSELY = 10.0  # times `SETTLED`, while snow falls over edges
-MAX_SWEEPS = 20_000  # of `settled`; 2 m of snow on walls of 6 m need some thousands
+LOOSELY = 30.0  # times `SETTLED`, while snow falls over edges
+MAX_SWEEPS = 100_000  # of `settled`; 2 m of snow on walls of 6 m need some 30 000
 
 
 def slid(
@@ -80,7 +80,7 @@ def _piled(
     """
     rows, columns = arrived.shape
     piled = np.zeros((rows, columns))
-    to = np.zeros((SPREAD, 2), np.int64)
+    to = np.zeros((SLID_PARCELS, 2), np.int64)
     for j in range(rows):
         for i in range(columns):
             if arrived[j, i] <= 0:
@@ -88,10 +88,8 @@ def _piled(
             reach = SCATTERS * drop[j, i] / spacing
             highest = height[j, i] + max(drop[j, i] / 2, FALLS_FROM)
             found = 0
-            for k in range(SPREAD):
-                radius = reach * math.sqrt(-2 * math.log(1 - (k + 0.5) / SPREAD))
-                angle = GOLDEN_ANGLE * (k + SPREAD * (j * columns + i))
-                dj, di = radius * math.cos(angle), radius * math.sin(angle)
+            for k in range(SLID_PARCELS):
+                dj, di = _parcel(k, SLID_PARCELS, j * columns + i, reach)
                 for side in (1, -1):  # what would land on a wall lands before it
                     jj, ii = j + round(side * dj), i + round(side * di)
                     inside = 0 <= jj < rows and 0 <= ii < columns
@@ -100,8 +98,19 @@ def _piled(
                         found += 1
                         break
             for k in range(found):
-                piled[to[k, 0], to[k, 1]] += arrived[j, i] / max(found, LEDGE * SPREAD)
+                piled[to[k, 0], to[k, 1]] += arrived[j, i] / max(found, LEDGE * SLID_PARCELS)
     return piled
+
+
+@njit(cache=True)
+def _parcel(k: int, count: int, source: int, sigma: float) -> tuple[float, float]:
+    """Offset of parcel k of `count` from a normal distribution, in the unit of `sigma`.
+
+    A spiral of equal parts by the golden angle, turned from source to source.
+    """
+    radius = sigma * math.sqrt(-2 * math.log(1 - (k + 0.5) / count))
+    angle = GOLDEN_ANGLE * (k + count * source)
+    return radius * math.cos(angle), radius * math.sin(angle)
 
 
 @njit(cache=True)
@@ -320,10 +329,11 @@ def _land(
                 for ii in range(max(i - 1, 0), min(i + 2, columns)):
                     if before[jj, ii] < before[foot_j, foot_i]:  # NaN compares False
                         foot_j, foot_i = jj, ii
+            _wake(waiting, busy, foot_j, foot_i)  # nodes above a full gap go on
             reach = SCATTERS * max(base[j, i] - before[foot_j, foot_i], 0.0) / spacing
             for k in range(PARCELS):
-                turn = k + PARCELS * (j * columns + i)
-                to_j, to_i = _landing(before, base[j, i], foot_j, foot_i, reach, k, turn)
+                source = j * columns + i
+                to_j, to_i = _landing(before, base[j, i], foot_j, foot_i, reach, k, source)
                 top[to_j, to_i] += fell[j, i] / PARCELS
                 _wake(waiting, busy, to_j, to_i)
 
@@ -336,12 +346,10 @@ def _landing(
     foot_i: int,
     reach: float,
     k: int,
-    turn: int,
+    source: int,
 ) -> tuple[int, int]:
     """The node at which parcel k lands that fell from a height (m), `reach` nodes from the foot."""
-    radius = reach * math.sqrt(-2 * math.log(1 - (k + 0.5) / PARCELS))
-    dj = radius * math.cos(GOLDEN_ANGLE * turn)
-    di = radius * math.sin(GOLDEN_ANGLE * turn)
+    dj, di = _parcel(k, PARCELS, source, reach)
     for side in (1, -1):
         j, i = foot_j + round(side * dj), foot_i + round(side * di)
         inside = 0 <= j < top.shape[0] and 0 <= i < top.shape[1]
@@ -358,5 +366,5 @@ def _width(
     reach = SCATTERS * (high - top[foot_j, foot_i]) / spacing
     stays = 0
     for k in range(PARCELS):
-        stays += _landing(top, high, foot_j, foot_i, reach, k, k) == (foot_j, foot_i)
+        stays += _landing(top, high, foot_j, foot_i, reach, k, 0) == (foot_j, foot_i)
     return 1 / max(stays / PARCELS, 1 / (1 + math.sqrt(2 * math.pi) * reach))
