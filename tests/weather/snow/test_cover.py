@@ -181,26 +181,11 @@ def test_lumps_of_the_ground_are_ignored_and_holes_filled():
     height = np.array([[0.02, 0.6, nan, -1.0, 3.0, 0.2, 2.0, 5.0]])
     kind = np.array([[road, road, -1, road, leaf, leaf, wall, road]])
     ground = np.zeros(height.shape)
-    surface, leaves = surfaces_and_leaves(height, kind, ground, 5.0)
+    surface, leaves = surfaces_and_leaves(height, kind, ground)
     assert surface[0] == pytest.approx([0.02, 0, 0, 0, 0, 0.2, 2.0, 5.0])
     assert np.isfinite(leaves[0]).tolist() == [False] * 4 + [True] + [False] * 3
-    surface, leaves = surfaces_and_leaves(height, kind, np.full(height.shape, nan), 5.0)
+    surface, leaves = surfaces_and_leaves(height, kind, np.full(height.shape, nan))
     assert surface[0] == pytest.approx([0.02, 0.6, nan, -1, nan, nan, 2, 5], nan_ok=True)
-
-
-def test_single_leaves_on_a_cairn_are_stones_and_stones_in_a_hedge_are_leaves():
-    wall, leaf = int(SOLID_OF[BUILDING]), int(SOLID_OF[VEGETATION])
-    ground = np.zeros((40, 80))
-    height = np.where(np.arange(80) % 40 < 30, 1.0, 0.0) + ground
-    for most, few in ((wall, leaf), (leaf, wall)):
-        kind = np.full(height.shape, most)
-        kind[18:21, 12:15] = few
-        kind[:, 40:] = few
-        surface, leaves = surfaces_and_leaves(height, kind, ground, H)
-        tall = height > 0.5
-        assert np.all(np.isfinite(leaves[:, :40]) == (tall & (most == leaf))[:, :40])
-        assert np.all(np.isfinite(leaves[:, 40:]) == (tall & (few == leaf))[:, 40:])
-        assert surface[19, 13] == (1.0 if most == wall else 0.0)
 
 
 BOX = ((-4.0, -4.0, -1.0), (4.0, 4.0, 3.0))

@@ -52,7 +52,6 @@ GROUND_KINDS = SOLID_OF[list(GROUND)]
 UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
 STEPS = 8  # towards the ground below a slanted ray
 SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
-MAJORITY = 0.15  # m, standard deviation of the neighbourhood whose majority is leaf or solid
 ASTRAY = 0.2  # m between field and terrain, from which the terrain carries the snow
 SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are noise
 ROOF_SMOOTHING, ROOF_PASSES = 0.3, 6  # m and passes; fitted roofs are planes with roughness
@@ -147,7 +146,7 @@ def _caught(
     h = grid.spacing_of(cascade)
     normal_z, kind = _seen_from_above(field, rays)
     ground = _ground_below(field, rays)
-    surface, leaves = surfaces_and_leaves(rays.surface, kind, ground, h)
+    surface, leaves = surfaces_and_leaves(rays.surface, kind, ground)
     on_ground = np.isin(kind, GROUND_KINDS) | (surface == ground)
     surface = bridged(surface, on_ground, rays.reached, h)
     crown = cushions(np.where(np.isfinite(leaves), rays.leaves, np.nan), h)
@@ -233,10 +232,7 @@ def _catch(
 
 
 def surfaces_and_leaves(
-    height: Float[np.ndarray, "h w"],
-    kind: Int[np.ndarray, "h w"],
-    ground: Float[np.ndarray, "h w"],
-    spacing: float,
+    height: Float[np.ndarray, "h w"], kind: Int[np.ndarray, "h w"], ground: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
     """Separate leaves from what lies below, and put the terrain where the field has veils or holes.
 
@@ -244,16 +240,12 @@ def surfaces_and_leaves(
         height: world z at which fall rays end, m; NaN without an end.
         kind: class there, as an index in `core.classes.SOLID`; -1: unknown, which is solid.
         ground: height of the terrain, m; NaN where it is unknown.
-        spacing: of the raster, m.
 
     Returns:
         Heights of solid surfaces and of leaves, m; NaN without one.
     """
     low = height < ground + UNDERGROWTH  # NaN compares False
-    tall = np.isfinite(height) & ~low
-    # Single leaves on a cairn are wrong classes of its stones, and would carry cushions; thin
-    # posts in a hedge become leaves.
-    leaf = tall & (mean_within(tall & (kind == LEAF), tall, MAJORITY / spacing) > 0.5)
+    leaf = (kind == LEAF) & ~low
     surface = np.where(leaf, np.nan, height)
     astray = lumps(surface, np.isin(kind, GROUND_KINDS), ground, ASTRAY)
     surface = np.where((astray | leaf) & np.isfinite(ground), ground, surface)

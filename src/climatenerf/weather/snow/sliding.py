@@ -28,7 +28,7 @@ DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of th
 SETTLED = 3e-3  # of the spacing; what is higher by less stays
 FILM = 1e-6  # m; less would slide on and on
 LOOSELY = 30.0  # times `SETTLED`, while snow falls over edges
-MAX_SWEEPS = 100_000  # of `settled`; 2 m of snow on walls of 6 m need some 30 000
+MAX_SWEEPS = 100_000  # of `settled`; 2 m of snow on walls of 6 m need tens of thousands
 
 
 def slid(
