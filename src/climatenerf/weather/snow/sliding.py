@@ -19,7 +19,6 @@ PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
 SCATTERS = 0.2  # of the drop: standard deviation, along each axis, of where what falls lands
 PACKED = 0.5  # volume of what slid over that before it did
 FALLS_FROM = 0.2  # m of a drop over an edge, from which what falls is scattered
-EDGE = 3.0  # cells of a drop, from which coarse rasters know an edge from a bank
 PARCELS = 64  # of what falls off a node
 SLID_PARCELS = 256  # of what slid to a node
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # radian, between parcels
@@ -220,7 +219,6 @@ def settled(
     rows, columns = base.shape
     top = base + thickness
     tolerance = LOOSELY * SETTLED * spacing  # until no more falls
-    edge = max(FALLS_FROM, EDGE * spacing)
     fell = np.zeros((rows, columns))  # off each node and not yet landed, m
     received = np.zeros((rows, columns))  # the same at its foot
     falls = False
@@ -264,7 +262,7 @@ def settled(
                             part = 1.0 if free else 0.5
                 if limit < own - (FILM if part == 1.0 else tolerance):
                     drop, moved = base[j, i] - lower, part * (own - limit)
-                    if drop > edge:
+                    if drop > FALLS_FROM:
                         if received[to_j, to_i] > drop and (
                             received[to_j, to_i]
                             > drop * _width(top, base[j, i], to_j, to_i, spacing)
