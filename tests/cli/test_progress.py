@@ -78,6 +78,26 @@ def test_terminal_shows_a_bar_with_its_columns(monkeypatch, width):
     assert "preview saved [here]" in text
 
 
+@pytest.mark.parametrize("bars", [lambda: progress.Bar("fit", 1.0), progress.StageBars])
+def test_an_interruption_within_a_print_shows_the_cursor_again(monkeypatch, bars):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    progress._console.cache_clear()
+    try:
+        with pytest.raises(KeyboardInterrupt), bars() as bar:
+            if isinstance(bar, progress.StageBars):
+                bar("bake", 0.5)
+            progress._console().__enter__()  # as `print` begins
+            raise KeyboardInterrupt
+    finally:
+        progress._console.cache_clear()
+    shown = terminal.getvalue()
+    assert "\x1b[?25l" in shown, "the bar hides the cursor"
+    assert shown.rfind("\x1b[?25h") > shown.rfind("\x1b[?25l")
+    assert sys.stderr is terminal
+
+
 def test_each_stage_has_a_bar_that_ends_before_the_next(clock, capsys):
     with progress.StageBars("flood: ") as bars:
         bars("light", 0.0)

@@ -15,9 +15,11 @@ from climatenerf.field.analytic import AnalyticField, HalfSpace
 from climatenerf.field.compositing import RenderCancelled
 from climatenerf.render.session import RenderSession
 from climatenerf.verification.setting import protocol_of
+from climatenerf.viewer import live
 from climatenerf.viewer.live import MOMENTS, LiveView, Wanted, _moments
 from climatenerf.viewer.measure import measure
 from climatenerf.viewer.overlays import LAYERS, legend, picture_of
+from climatenerf.viewer.warp import warped
 from climatenerf.weather.description import KeyframedWeather
 from climatenerf.weather.flood.parameters import Flood
 from climatenerf.weather.snow.parameters import Snow
@@ -264,6 +266,34 @@ def test_pictures_go_on_while_weather_is_prepared(place):
         assert not slow.cancelled, "the same weather in another pose is no reason to begin again"
         assert not np.array_equal(found.picture, before)
     finally:
+        viewer.live.close()
+
+
+def test_no_warped_picture_follows_a_rendered_one_of_the_same_pose(place, monkeypatch):
+    slow = SlowSession(RenderSession(place.field, place.scene, Weather()))
+    viewer = Viewer(slow)
+    moved = flooded(0.4, pose((0.4, 1.0, -0.1)))
+    late = threading.Event()
+
+    def rendered():
+        return [each.state for each in viewer.pictures if each.wanted.same_place(moved)]
+
+    def warped_late(*given):
+        viewer.until(lambda: "coarse" in rendered())
+        late.set()
+        return warped(*given)
+
+    monkeypatch.setattr(live, "warped", warped_late)
+    try:
+        dry = Wanted(CAMERA, HERE, Weather())
+        viewer.live.ask(dry)
+        viewer.full_of(dry)
+        viewer.live.ask(moved)  # in other weather, which is not prepared: the coarse one stays
+        assert late.wait(60)
+        time.sleep(0.5)
+        assert set(rendered()) == {"coarse"}
+    finally:
+        slow.released.set()
         viewer.live.close()
 
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 LINE_EVERY = 10.0
 """Seconds between two lines if standard error is no terminal."""
 
+SHOW_CURSOR = "\x1b[?25h"
+
 Item = TypeVar("Item")
 
 
@@ -69,7 +71,11 @@ class Bar:
     ) -> None:
         """Leave the bar as it is, and end its line."""
         if self._progress is not None:
-            self._progress.stop()
+            try:
+                self._progress.stop()
+            finally:
+                if error is not None:
+                    _show_cursor(self._progress.console)
         elif not self._quiet:
             self._line(last=True)
 
@@ -139,9 +145,14 @@ class StageBars:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None = None,
+        error: BaseException | None = None,
+        trace: TracebackType | None = None,
+    ) -> None:
         if self._bar is not None:
-            self._bar.__exit__(None, None, None)  # shows the terminal's cursor again
+            self._bar.__exit__(kind, error, trace)  # shows the terminal's cursor again
             self._bar = None
 
     def __call__(self, stage: str, fraction: float) -> None:
@@ -210,6 +221,18 @@ def rate(per_second: float) -> str:
         if per_second >= size:
             return f"{per_second / size:.3g}{letter}"
     return f"{per_second:.3g}"
+
+
+def _show_cursor(console: "Console") -> None:
+    """Show the cursor of a terminal, past the console's buffer.
+
+    An interruption within rich's `Console.print` leaves that buffer open, and what is printed
+    afterwards, such as the sign that shows the cursor, stays in it.
+    """
+    if not console.legacy_windows:  # it takes no control sequences
+        with contextlib.suppress(OSError, ValueError):
+            console.file.write(SHOW_CURSOR)
+            console.file.flush()
 
 
 @functools.cache

@@ -411,7 +411,9 @@ class LiveView:
                 given = finished.picture, finished.depth, finished.camera, finished.c2w
                 picture = warped(*given, to, wanted.c2w)
                 with self._sending:
-                    if self._open and self._wanted is wanted and self._sent is not wanted:
+                    sent = self._sent  # a rendered picture of this pose is better
+                    there = sent is not None and sent.same_place(wanted)
+                    if self._open and self._wanted is wanted and not there:
                         self._sent = wanted
                         self._show(Shown(picture, wanted, "warped", self.session.weather))
             last = wanted
