@@ -24,7 +24,7 @@ from climatenerf.weather.snow.cover import (
     mean_within,
     slope_share,
 )
-from climatenerf.weather.snow.deposition import surfaces_and_leaves
+from climatenerf.weather.snow.deposition import among_leaves, surfaces_and_leaves
 from climatenerf.weather.snow.lattice import SnowGrid
 from climatenerf.weather.snow.layer import bake_snow
 from climatenerf.weather.snow.parameters import Snow
@@ -186,6 +186,44 @@ def test_lumps_of_the_ground_are_ignored_and_holes_filled():
     assert np.isfinite(leaves[0]).tolist() == [False] * 4 + [True] + [False] * 3
     surface, leaves = surfaces_and_leaves(height, kind, np.full(height.shape, nan))
     assert surface[0] == pytest.approx([0.02, 0.6, nan, -1, nan, nan, 2, 5], nan_ok=True)
+
+
+def test_single_solid_nodes_among_leaves_are_leaves():
+    road, leaf, wall = (int(SOLID_OF[kind]) for kind in (ROAD, VEGETATION, BUILDING))
+    random = np.random.default_rng(3)
+    inside = np.zeros((80, 80), bool)
+    inside[8:-8, 8:-8] = True
+    for solid, most, some in ((wall, 0.5, 0.9), (road, 0.35, 0.7)):
+        noise = random.uniform(size=inside.shape)
+        for share, wrong in ((most, 1.0), (some, 0.0)):
+            kind = np.where(noise < share, solid, leaf)
+            found = among_leaves(kind, H)[inside & (kind == solid)].mean()
+            assert found == pytest.approx(wrong, abs=0.02), (solid, share)
+    # Near half a metre of leaves the edge of a roof is lost, and no more of it.
+    kind = np.full((80, 80), wall)
+    kind[:, 40:50], kind[10, 10] = leaf, leaf
+    lost = among_leaves(kind, H)
+    assert not lost[:, :37].any() and lost[5:-5, 39].all() and not lost[kind == leaf].any()
+    post = np.full((80, 80), road)
+    post[40, 40] = wall
+    assert not among_leaves(post, H).any()
+    thin = np.full((80, 80), -1)  # a bush that stops few rays
+    thin[::5, ::5], thin[40, 40] = leaf, wall
+    assert among_leaves(thin, H)[40, 40] and among_leaves(thin, H).sum() == 1
+
+
+def test_a_solid_speck_on_a_hedge_builds_no_tower():
+    hedge, speck = (
+        Box((-1.0, -0.5, 0.0), (1.0, 0.5, 1.5)),
+        Box((-0.05, -0.05, 1.4), (0.05, 0.05, 1.55)),
+    )
+    baked = snow_on([HalfSpace(), hedge, speck], [ROAD, VEGETATION, BUILDING], depth=0.3)
+    z = torch.linspace(1.5, 2.0, 101)
+    x = torch.stack([0 * z, 0 * z, z], -1)
+    highest = z[baked.density(x) > 1.0].max()
+    assert highest < 1.5 + held_by_crowns(0.3) + 0.06
+    post = snow_on([HalfSpace(), speck], [ROAD, BUILDING], depth=0.3)
+    assert z[post.density(x) > 1.0].max() > 1.62, "what stands alone carries a cap"
 
 
 BOX = ((-4.0, -4.0, -1.0), (4.0, 4.0, 3.0))

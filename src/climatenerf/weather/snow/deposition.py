@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from scipy import ndimage
 from torch import Tensor
 
@@ -49,6 +49,8 @@ from climatenerf.weather.snow.surface_fit import smooth_ground
 
 LEAF = int(SOLID_OF[VEGETATION])
 GROUND_KINDS = SOLID_OF[list(GROUND)]
+AROUND = 0.15  # m, standard deviation of what counts as around a node
+MANY_LEAVES = 0.5  # of the solid nodes around, from which on these are leaves as well
 UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
 STEPS = 8  # towards the ground below a slanted ray
 SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
@@ -146,6 +148,7 @@ def _caught(
     h = grid.spacing_of(cascade)
     normal_z, kind = _seen_from_above(field, rays)
     ground = _ground_below(field, rays)
+    kind = np.where(among_leaves(kind, h), LEAF, kind)
     surface, leaves = surfaces_and_leaves(rays.surface, kind, ground)
     on_ground = np.isin(kind, GROUND_KINDS) | (surface == ground)
     surface = bridged(surface, on_ground, rays.reached, h)
@@ -229,6 +232,27 @@ def _catch(
     single = np.float32
     parts = of_fall.astype(single), of_held.astype(single), hidden.astype(single)
     return Catch(position, *parts, weight.astype(single), shade)
+
+
+def among_leaves(kind: Int[np.ndarray, "h w"], spacing: float) -> Bool[np.ndarray, "h w"]:
+    """Where solid nodes are leaves of a wrong class, because most nodes around are leaves.
+
+    The classes of fitted foliage are noisy, and a single solid node would carry all the snow that
+    falls on it: foliage would be full of white lumps. Ground between stems is more often right.
+
+    Args:
+        kind: class, as an index in `core.classes.SOLID`; -1: unknown.
+        spacing: of the raster, m.
+    """
+
+    def around(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        return ndimage.gaussian_filter(mask.astype(np.float64), AROUND / spacing)
+
+    leaves = around(kind == LEAF)
+    ground = np.isin(kind, GROUND_KINDS)
+    other = (kind >= 0) & (kind != LEAF) & ~ground
+    wrong_ground = ground & (leaves > around(ground))
+    return wrong_ground | (other & (leaves > MANY_LEAVES * around(other)))
 
 
 def surfaces_and_leaves(
