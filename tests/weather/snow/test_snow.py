@@ -347,6 +347,8 @@ def test_thin_snow_on_slopes_has_no_ripples():
     points = points[opacity > 0.9].numpy()
     rough = metaballs.evaluate(points, snow.lattice)[2][:, 0]
     normals, heights = metaballs.smooth_surface(points, snow.lattice)
+    alone, zero = metaballs.smooth_surface(points, snow.lattice, False)
+    assert np.array_equal(alone, normals) and not zero.any()
     assert heights.mean() == pytest.approx(0.03 * 2 / 3, rel=0.1)
     assert heights.std() < 0.75 * rough.std()
     assert np.quantile(normals @ np.array(plane.normal), 0.02) > 0.998

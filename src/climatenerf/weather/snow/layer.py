@@ -148,7 +148,7 @@ class BakedSnow:
 
     def normal(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Outward unit normal, from the gradient of the sum; up where there is none."""
-        return to_device(metaballs.smooth_surface(_array(x), self.lattice)[0], x.device)
+        return to_device(metaballs.smooth_surface(_array(x), self.lattice, False)[0], x.device)
 
     def colour(self, x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Linear radiance of the snow at points (m), the same in all directions.
