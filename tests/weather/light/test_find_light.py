@@ -9,6 +9,7 @@ import torch
 from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import AnalyticField, Box, HalfSpace
 from climatenerf.weather.light import find_light as finding
+from climatenerf.weather.light import sky_fit
 from climatenerf.weather.light.captured import (
     COLUMNS,
     ROWS,
@@ -20,12 +21,12 @@ from climatenerf.weather.light.file import load_light, save_light
 from climatenerf.weather.light.find_light import (
     MIN_SUN,
     Pairs,
-    fit_sky,
     gather_light,
     glow_share,
     hard_sun,
     sun_strength,
 )
+from climatenerf.weather.light.sky_fit import fit_sky
 from climatenerf.weather.light.spherical import sphere_directions
 
 BLOCKS = [Box((-1.0, -1.0, 0.0), (1.0, 1.0, 3.0)), Box((4.0, 2.0, 0.0), (6.0, 3.0, 2.0))]
@@ -114,6 +115,22 @@ def test_suns_that_explain_both_halves_do_not_contradict():
         assert (halves is None) == (name == "agree")
 
 
+def test_noise_does_not_contradict_one_sun():
+    """The best of many candidates seems to explain each half, but no pairs it was not chosen by."""
+    random = np.random.default_rng(5)
+    candidates = random.standard_normal((180, 3))
+    candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
+    late, seemed = np.arange(320) >= 160, 0
+    for _ in range(40):
+        none = np.abs(random.normal(1.0, 0.3, 320))
+        found = none[:, None] + random.normal(0.0, 0.4, (320, 180))
+        gains = [1 - found[half].mean(0) / none[half].mean() for half in (~late, late)]
+        a, b = (int(gain.argmax()) for gain in gains)
+        seemed += min(gains[0][a], gains[1][b]) > finding.CLEAR_GAIN
+        assert finding._contradiction(candidates, found, none, late) is None
+    assert seemed == 40
+
+
 def lobe_sky(d, elevation=35.0, azimuth=100.0, width=20.0, peak=4.0):
     base = 0.6 * (1 + 0.2 * d[:, 2])
     angle = np.degrees(np.arccos(np.clip(d @ direction(elevation, azimuth), -1, 1)))
@@ -157,7 +174,7 @@ def test_clouds_over_the_horizon_brighten_the_zenith_less_beside_a_sun(monkeypat
     level = float((cloudy(up)[:, 0] * up[:, 2]).sum() * 4 / 6000)
     given = low, np.minimum(cloudy(low), 1.0), 0.18 * level
     held = fit_sky(*given, lobe=True)
-    monkeypatch.setattr(finding, "LOBE_RATIO_SPREAD", 100.0)
+    monkeypatch.setattr(sky_fit, "LOBE_RATIO_SPREAD", 100.0)
     carried_on = fit_sky(*given, lobe=True)
     excess, before = (float(model.zenith[0]) - 0.65 for model in (held, carried_on))
     assert 0 < excess < 0.8 * before

@@ -430,7 +430,7 @@ def test_the_light_is_kept_with_the_run(tmp_path):
     assert (tmp_path / "light.json").read_bytes() == written
     for old, new in (
         (b'"checkpoint": "a"', b'"checkpoint": "b"'),
-        (b'_version": 4', b'_version": 1'),
+        (b'_version": 5', b'_version": 1'),
     ):
         assert old in written
         (tmp_path / "light.json").write_bytes(written.replace(old, new))
