@@ -118,6 +118,17 @@ def test_the_steep_side_of_a_hedge_carries_no_cushion():
     assert found.keeps[30, 10] == 1
 
 
+@pytest.mark.parametrize(("share", "keeps"), [(0.95, 1.0), (0.7, 0.5), (0.4, 0.0)])
+def test_leaves_far_below_the_highest_tell_of_a_face(share, keeps):
+    """Rays that graze a blurred face end on all heights of it, and the mean of these is level."""
+    random = np.random.default_rng(4)
+    crown = 2.0 + 0.02 * random.normal(size=(200, 200))
+    crown[random.random(crown.shape) > share] -= 1.0
+    found = cushions(crown, H).keeps[20:-20, 20:-20]
+    assert found.mean() == pytest.approx(keeps, abs=0.06)
+    assert cushions(crown, H).height[100, 100] == pytest.approx(2.0, abs=0.05)
+
+
 def test_gaps_in_the_ground_are_bridged_up_to_some_metres():
     surface = np.zeros((200, 200))
     surface[50:70, 50:70] = np.nan

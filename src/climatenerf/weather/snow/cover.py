@@ -20,7 +20,8 @@ CROWN_RETAINS = 0.678  # fraction of it that stays for hours (Hedstrom and Pomer
 CUSHION = 0.1  # m, standard deviation of the smoothing of crowns
 ONE_LAYER = 0.6  # m below the highest leaf nearby; deeper leaves carry no part of a cushion
 CROWN_KEEPS, CROWN_SHEDS = 0.9, 2.0  # slopes (rise over run) of crowns that keep all and nothing
-CLOSED = (0.2, 0.45)  # fraction covered by leaves at which a cushion begins, and is complete
+CLOSED = (0.15, 0.4)  # fraction covered by leaves at which a cushion begins, and is complete
+FACE = (0.55, 0.85)  # of the leaves around, those of the highest layer: fewer lie at a steep face
 HIGHEST_VEIL = 2.0  # m above the ground; what hangs higher may be a roof of a wrong class
 EAVES = 0.1  # m, by which snow overhangs the lower edge of a roof
 DRAWN_BACK = 0.15  # m from the edge of a fitted roof, within which it is rounded
@@ -96,7 +97,10 @@ def cushions(crown: Float[np.ndarray, "h w"], spacing: float) -> Cushions:
     height = np.where(closed > 0, moment / np.maximum(weight, 1e-6), np.nan)
     slope = np.hypot(*np.gradient(height, spacing))  # NaN at the rim
     keeps = (CROWN_SHEDS - slope) / (CROWN_SHEDS - CROWN_KEEPS)
-    return Cushions(height, closed * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
+    leaves = ndimage.gaussian_filter(leaf.astype(np.float64), sigma)
+    upper = weight / np.maximum(leaves, 1e-6)  # without leaves 0/0
+    level = np.clip((upper - FACE[0]) / (FACE[1] - FACE[0]), 0, 1)
+    return Cushions(height, closed * level * np.clip(np.nan_to_num(keeps, nan=1.0), 0, 1))
 
 
 class Eaves(NamedTuple):
