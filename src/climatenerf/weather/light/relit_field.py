@@ -11,16 +11,19 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.classes import SOLID_OF, VEGETATION
+from climatenerf.core.colour import luma
 from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.normals import normals_at
 from climatenerf.field.wrapped import RecolouredField
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
-from climatenerf.weather.light.scene_light import MOST, SceneLight
+from climatenerf.weather.light.scene_light import DARKEST, MOST, SceneLight
 
 LEAVES = int(SOLID_OF[VEGETATION])
 HORIZON = -0.05  # sine of the elevation above which a ray may have sky behind it
 DARK = 0.02  # radiance; less is no sky by day
 LIKE_SKY = 0.4  # of the logarithms of a colour over the sky's
+REFLECTED = 0.9  # of the light that falls on it, what any surface reflects at most: white paint
+BY_LEAVES = 0.5  # the same of leaves; autumn's yellow ones reflect about so much
 SHARED = 0.4  # m along a ray, within which samples share the change of their light
 
 
@@ -85,7 +88,7 @@ class RelitField(RecolouredField):
         normal: Float[Tensor, "s 3"],
         kind: Int[Tensor, "s"],
     ) -> Float[Tensor, "s 3"]:
-        """New over old irradiance.
+        """New over old irradiance; less where the result is more than a surface can reflect.
 
         Args:
             radiance: of the samples in the photos.
@@ -96,7 +99,7 @@ class RelitField(RecolouredField):
         old, new = SceneLight.shaded((self.old, self.new), x, normal)
         if self.old.sun is None:
             new = new + self.new.direct(x, normal)
-            return (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
+            return self._bounded(new, old, radiance, kind)
         lit, full = self.old.visibility(x, normal), self.old.full_sun(normal)
         if self.albedo is None:
             direct = lit[:, None] * full
@@ -108,7 +111,26 @@ class RelitField(RecolouredField):
             new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
         else:
             new = new + self.new.direct(x, normal)
-        return (new / (old + direct)).clamp(self.brighter / MOST, self.brighter * MOST)
+        return self._bounded(new, old + direct, radiance, kind)
+
+    def _bounded(
+        self,
+        new: Float[Tensor, "s 3"],
+        old: Float[Tensor, "s 3"],
+        radiance: Float[Tensor, "s 3"],
+        kind: Int[Tensor, "s"],
+    ) -> Float[Tensor, "s 3"]:
+        """New over old irradiance, so that no surface sends more than it can reflect.
+
+        Far trees in a sun that was not found would glow under an overcast sky. Under the sky of the
+        photos these are right, whatever light was found.
+        """
+        ratio = (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
+        if not self.new_sky:
+            return ratio
+        most = torch.where(kind == LEAVES, BY_LEAVES, REFLECTED) * luma(new) / torch.pi
+        sent = luma(radiance * ratio).clamp_min(DARKEST)  # what is black sends nothing: 0/0
+        return ratio * (most / sent).clamp(max=1)[:, None]
 
     def _mended(
         self,
