@@ -98,6 +98,35 @@ def test_an_interruption_within_a_print_shows_the_cursor_again(monkeypatch, bars
     assert sys.stderr is terminal
 
 
+def test_after_an_interruption_within_a_print_lines_appear(monkeypatch):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    progress._console.cache_clear()
+    try:
+        with pytest.raises(KeyboardInterrupt), progress.Bar("fit", 1.0):
+            progress._console().__enter__()
+            raise KeyboardInterrupt
+        progress.say("Stopped early")
+    finally:
+        progress._console.cache_clear()
+    assert "Stopped early" in terminal.getvalue()
+
+
+@pytest.mark.parametrize("term", ["xterm", "dumb"])
+def test_a_bar_that_ends_shows_the_cursor_where_it_was_hidden(monkeypatch, term):
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", term)
+    progress._console.cache_clear()
+    try:
+        with progress.Bar("fit", 1.0) as bar:
+            bar.update(0.5)
+    finally:
+        progress._console.cache_clear()
+    assert ("\x1b[?25h" in terminal.getvalue()) == (term == "xterm")
+
+
 def test_each_stage_has_a_bar_that_ends_before_the_next(clock, capsys):
     with progress.StageBars("flood: ") as bars:
         bars("light", 0.0)

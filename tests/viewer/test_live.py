@@ -284,6 +284,7 @@ def test_no_warped_picture_follows_a_rendered_one_of_the_same_pose(place, monkey
         return warped(*given)
 
     monkeypatch.setattr(live, "warped", warped_late)
+    monkeypatch.setattr(live, "STILL", 30.0)  # for the thread that warps to begin in time
     try:
         dry = Wanted(CAMERA, HERE, Weather())
         viewer.live.ask(dry)

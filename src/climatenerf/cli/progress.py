@@ -74,8 +74,9 @@ class Bar:
             try:
                 self._progress.stop()
             finally:
+                _show_cursor(self._progress.console)
                 if error is not None:
-                    _show_cursor(self._progress.console)
+                    _console.cache_clear()  # what is printed next would stay in its open buffer
         elif not self._quiet:
             self._line(last=True)
 
@@ -229,7 +230,7 @@ def _show_cursor(console: "Console") -> None:
     An interruption within rich's `Console.print` leaves that buffer open, and what is printed
     afterwards, such as the sign that shows the cursor, stays in it.
     """
-    if not console.legacy_windows:  # it takes no control sequences
+    if not (console.legacy_windows or console.is_dumb_terminal):  # these take no such signs
         with contextlib.suppress(OSError, ValueError):
             console.file.write(SHOW_CURSOR)
             console.file.flush()

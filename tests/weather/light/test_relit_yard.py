@@ -27,7 +27,7 @@ from climatenerf.weather.light import entity
 from climatenerf.weather.light import find_light as finding
 from climatenerf.weather.light import sun_map as sun_maps
 from climatenerf.weather.light.captured import UnknownLight, elevation_azimuth
-from climatenerf.weather.light.relit_field import BY_LEAVES, REFLECTED, RelitField
+from climatenerf.weather.light.relit_field import MAX_ALBEDO, MAX_LEAF_ALBEDO, RelitField
 from climatenerf.weather.light.sun_map import sun_map
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.world import Kept
@@ -127,23 +127,33 @@ class OfWalls(OfOneClass):
     kind = BUILDING
 
 
-def test_nothing_reflects_more_than_it_receives_under_a_new_sky(overcast):
+def test_no_surface_sends_more_than_it_can_reflect_under_a_new_sky(overcast):
     """Far trees in a sun that was not found, or a lamp, do not glow; darker surfaces stay."""
     relit = replace(overcast.world(0.0).field, albedo=None)
-    x = torch.tensor([[-6.0, -5.0, 2.0]]).expand(4, 3)
-    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3)
-    kind = torch.tensor([int(SOLID_OF[each]) for each in (VEGETATION, BUILDING)]).repeat(2)
-    received = luma(relit.new.irradiance(x, up)) / math.pi
-    old = relit.old.irradiance(x, up)
-    albedo = torch.tensor([0.8, 1.4, 0.3, 0.85])
-    radiance = albedo[:, None] * old / math.pi
-    sent = luma(radiance * relit.ratio(radiance, x, up, kind)) / received
-    assert sent.tolist() == pytest.approx([BY_LEAVES, REFLECTED, 0.3, 0.85], rel=0.02)
-    black = relit.ratio(torch.zeros(4, 3), x, up, kind)
-    assert bool(black.isfinite().all()) and black.min() > 0
-    photographed = replace(relit, new_sky=False)
-    same = luma(radiance * photographed.ratio(radiance, x, up, kind)) / received
-    assert same.tolist() == pytest.approx(albedo.tolist(), rel=0.02)
+    assert relit.white == pytest.approx(float(luma(relit.new.open_irradiance())) / math.pi)
+    d = torch.tensor([[1.0, 0.0, -0.5]]) / math.sqrt(1.25)
+    x = torch.tensor([[-6.0, -5.0, 2.0]]).expand(5, 3) + 0.01 * torch.arange(5)[:, None]
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand(5, 3)
+    white = luma(relit.new.irradiance(x, up)) / math.pi
+    assert float(white.min()) > relit.white / 3
+    ray = torch.zeros(5, dtype=torch.long)  # the samples share the change of their light
+    wanted = torch.tensor([0.0, 0.3, 2.0, 0.45, 0.6]) * white
+    for kind, most in ((OfOneClass, MAX_LEAF_ALBEDO), (OfWalls, MAX_ALBEDO)):
+        field = replace(relit, field=kind(relit.field))
+        photographed = replace(field, new_sky=False)
+        plain = luma(photographed.recoloured(torch.ones(5, 3), x, d, ray))
+        colour = (wanted / plain)[:, None].expand(5, 3)
+        for given in ((colour, x, d, ray), (colour, x, d.expand(5, 3), None)):
+            found = luma(field.recoloured(*given))
+            bound = torch.minimum(wanted, most * white)
+            torch.testing.assert_close(found, bound, rtol=0.03, atol=1e-6)
+            same = photographed.recoloured(*given)
+            assert float(luma(same).max()) == pytest.approx(2 * float(white[2]), rel=0.03)
+    # Where probes know of no light, a third of that in the open counts.
+    night = replace(relit.new, coefficients=0 * relit.new.coefficients, sun=None)
+    dark = replace(relit, field=OfWalls(relit.field), new=night, brighter=16.0)
+    found = luma(dark.recoloured(torch.ones(5, 3), x, d, ray))
+    assert float(found.max()) <= MAX_ALBEDO * relit.white / 3 + 1e-6
 
 
 def test_haze_of_the_old_sky_around_leaves_shows_the_new_sky(overcast):
@@ -162,9 +172,10 @@ def test_haze_of_the_old_sky_around_leaves_shows_the_new_sky(overcast):
     leaves, same_light = shown(OfOneClass), shown(OfOneClass, new_sky=False)
     torch.testing.assert_close(leaves[0], relit.new.radiance(d[:1])[0], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(leaves[1], same_light[1], rtol=1e-3, atol=1e-4)
-    up, kind = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([int(SOLID_OF[VEGETATION])])
-    other_light = colour[2:] * relit.ratio(colour[2:], x[2:], up, kind)
-    torch.testing.assert_close(leaves[2:], other_light, rtol=1e-3, atol=1e-4)
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    bound = MAX_LEAF_ALBEDO * float(luma(relit.new.irradiance(x[2:], up))) / math.pi
+    bound = min(bound / float(luma(same_light[2])), 1.0)
+    torch.testing.assert_close(leaves[2], same_light[2] * bound, rtol=1e-3, atol=1e-4)
     assert (leaves[0] - same_light[0]).abs().max() > 0.02
     assert torch.equal(shown(OfWalls), shown(OfWalls, new_sky=False))
 

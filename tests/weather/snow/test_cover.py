@@ -8,7 +8,7 @@ import pytest
 import torch
 from support.holed_ground import LabelledField
 
-from climatenerf.core.classes import BUILDING, ROAD, SOLID_OF, TERRAIN, VEGETATION
+from climatenerf.core.classes import BUILDING, ROAD, SOLID_OF, TERRAIN, VEGETATION, VEHICLE
 from climatenerf.field.analytic import Box, HalfSpace
 from climatenerf.field.capabilities import CLASSES, DENSITY, OBSERVED
 from climatenerf.render.completed_ground import CompletedField
@@ -199,28 +199,41 @@ def test_lumps_of_the_ground_are_ignored_and_holes_filled():
     assert surface[0] == pytest.approx([0.02, 0.6, nan, -1, nan, nan, 2, 5], nan_ok=True)
 
 
-def test_single_solid_nodes_among_leaves_are_leaves():
+def test_solid_nodes_among_leaves_count_as_leaves():
     road, leaf, wall = (int(SOLID_OF[kind]) for kind in (ROAD, VEGETATION, BUILDING))
     random = np.random.default_rng(3)
-    inside = np.zeros((80, 80), bool)
+    level, inside = np.full((80, 80), 2.0), np.zeros((80, 80), bool)
     inside[8:-8, 8:-8] = True
-    for solid, most, some in ((wall, 0.5, 0.9), (road, 0.35, 0.7)):
+    for solid, most, some in ((wall, 0.5, 0.9), (road, 0.35, 0.7), (-1, 0.5, 0.9)):
         noise = random.uniform(size=inside.shape)
         for share, wrong in ((most, 1.0), (some, 0.0)):
             kind = np.where(noise < share, solid, leaf)
-            found = among_leaves(kind, H)[inside & (kind == solid)].mean()
+            found = among_leaves(level, kind, H)[inside & (kind == solid)].mean()
             assert found == pytest.approx(wrong, abs=0.02), (solid, share)
     # Near half a metre of leaves the edge of a roof is lost, and no more of it.
     kind = np.full((80, 80), wall)
     kind[:, 40:50], kind[10, 10] = leaf, leaf
-    lost = among_leaves(kind, H)
+    lost = among_leaves(level, kind, H)
     assert not lost[:, :37].any() and lost[5:-5, 39].all() and not lost[kind == leaf].any()
     post = np.full((80, 80), road)
     post[40, 40] = wall
-    assert not among_leaves(post, H).any()
+    assert not among_leaves(level, post, H).any()
     thin = np.full((80, 80), -1)  # a bush that stops few rays
     thin[::5, ::5], thin[40, 40] = leaf, wall
-    assert among_leaves(thin, H)[40, 40] and among_leaves(thin, H).sum() == 1
+    found = among_leaves(np.where(thin >= 0, level, np.nan), thin, H)
+    assert found[40, 40] and found.sum() == 1
+    speck = np.full((40, 40), leaf)  # of a coarse raster
+    speck[20, 20] = wall
+    assert among_leaves(level[:40, :40], speck, 0.96)[20, 20]
+
+
+def test_what_lies_far_below_leaves_is_none_of_them():
+    """A car, and ground, that are seen through a crown keep their class."""
+    road, leaf, car = (int(SOLID_OF[kind]) for kind in (ROAD, VEGETATION, VEHICLE))
+    crown = np.random.default_rng(1).uniform(size=(80, 80)) < 0.7
+    for kind, height in ((car, 1.5), (road, 0.0)):
+        below = among_leaves(np.where(crown, 4.0, height), np.where(crown, leaf, kind), H)
+        assert not below.any()
 
 
 def test_a_solid_speck_on_a_hedge_builds_no_tower():

@@ -212,9 +212,10 @@ class LightEntity:
         new = self._in_step(weather, old, step, seasonal)
         if part > 0:
             new = between(new, self._in_step(weather, old, step + 1, seasonal), part)
-        brighter = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
+        received, before = (float(luma(light.open_irradiance())) for light in (new, old))
         shown = new_sky or seasonal
-        field = RelitField(world.field, old, new, shown, brighter, self._albedo(old))
+        brighter, white = received / before, received / math.pi
+        field = RelitField(world.field, old, new, shown, brighter, white, self._albedo(old))
         return replace(world, field=field, light=new)
 
     def _in_step(self, weather: Weather, old: SceneLight, step: int, seasonal: bool) -> SceneLight:
@@ -302,7 +303,7 @@ class LightEntity:
         # What photos show keeps its log-average luminance, as photographers expose (Reinhard et al.
         # 2002, Eq. 1): unlike the mean it does not follow a few places in the sun.
         radiance, x, normal, kind = (each[::EXPOSED] for each in self._shown)
-        shown = RelitField(self._given.field, old, new, True, 1.0, self._albedo(old))
+        shown = RelitField(self._given.field, old, new, True, albedo=self._albedo(old))
         shining = radiance * shown.ratio(radiance, x, normal, kind)
         before, after = (luma(each).clamp_min(DARKEST).log().mean() for each in (radiance, shining))
         kept = gain * math.exp(float(before - after))

@@ -4,6 +4,7 @@ Diffuse surfaces send light in proportion to the light that they receive, so the
 albedo. It is wrong for what is glossy, and for what photos clip.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -22,8 +23,9 @@ LEAVES = int(SOLID_OF[VEGETATION])
 HORIZON = -0.05  # sine of the elevation above which a ray may have sky behind it
 DARK = 0.02  # radiance; less is no sky by day
 LIKE_SKY = 0.4  # of the logarithms of a colour over the sky's
-REFLECTED = 0.9  # of the light that falls on it, what any surface reflects at most: white paint
-BY_LEAVES = 0.5  # the same of leaves; autumn's yellow ones reflect about so much
+MAX_ALBEDO = 0.9  # white paint
+MAX_LEAF_ALBEDO = 0.5  # yellow leaves in autumn
+SHADIEST = 1 / 3  # of the light in the open; what is known of places is less certain
 SHARED = 0.4  # m along a ray, within which samples share the change of their light
 
 
@@ -37,6 +39,7 @@ class RelitField(RecolouredField):
         new: the light that it is shown in.
         new_sky: whether the sky is the new light's; else the photographed one.
         brighter: the new light in the open over the old one, by luma. Changes are bounded about it.
+        white: luma of perfectly white, level ground in the open under the new light.
         albedo: the usual albedo of surfaces, by which photos tell the sun's light from its shadow;
             None: geometry alone tells.
     """
@@ -45,6 +48,7 @@ class RelitField(RecolouredField):
     new: SceneLight
     new_sky: bool
     brighter: float = 1.0
+    white: float = 0.0
     albedo: ReferenceAlbedo | None = None
 
     def recoloured(
@@ -56,12 +60,14 @@ class RelitField(RecolouredField):
     ) -> Float[Tensor, "s 3"]:
         """Linear radiance under the new light."""
         if ray is None:
-            return colour * self.ratio(colour, x, *normals_at(self.field, x, d))
+            normal, kind = normals_at(self.field, x, d)
+            ratio, most = self._change(colour, x, normal, kind)
+            return _bounded(colour * ratio, most)
         middle, group = shared_lookups(x, d, ray, SHARED)
         place, along = x[middle], d[ray[middle]]
         normal, kind = normals_at(self.field, place, along)
-        ratio = self.ratio(colour[middle], place, normal, kind)
-        relit = colour * ratio[group]
+        ratio, most = self._change(colour[middle], place, normal, kind)
+        relit = _bounded(colour * ratio[group], most[group])
         if not self.new_sky:
             return relit
         leaves = ((kind == LEAVES)[group] & (d[ray, 2] > HORIZON)).nonzero()[:, 0]
@@ -88,7 +94,7 @@ class RelitField(RecolouredField):
         normal: Float[Tensor, "s 3"],
         kind: Int[Tensor, "s"],
     ) -> Float[Tensor, "s 3"]:
-        """New over old irradiance; less where the result is more than a surface can reflect.
+        """New over old irradiance.
 
         Args:
             radiance: of the samples in the photos.
@@ -96,10 +102,43 @@ class RelitField(RecolouredField):
             normal: unit.
             kind: classes, as indices in `core.classes.SOLID`.
         """
+        old, new = self._irradiance(radiance, x, normal, kind)
+        return (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
+
+    def _change(
+        self,
+        radiance: Float[Tensor, "s 3"],
+        x: Float[Tensor, "s 3"],
+        normal: Float[Tensor, "s 3"],
+        kind: Int[Tensor, "s"],
+    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s"]]:
+        """New over old irradiance, and the luma that surfaces reflect at most in the new light.
+
+        Far trees in a sun that was not found would glow under an overcast sky. Under the sky of the
+        photos they are right, whatever light was found.
+        """
+        old, new = self._irradiance(radiance, x, normal, kind)
+        ratio = (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
+        if not self.new_sky:
+            return ratio, torch.full_like(ratio[:, 0], math.inf)
+        # Normals err. A surface receives as much as level ground, or more.
+        up = torch.zeros_like(normal)
+        up[:, 2] = 1.0
+        light = torch.maximum(luma(new), luma(self.new.irradiance(x, up)))
+        albedo = torch.where(kind == LEAVES, MAX_LEAF_ALBEDO, MAX_ALBEDO)
+        return ratio, albedo * light.clamp_min(SHADIEST * self.white * math.pi) / math.pi
+
+    def _irradiance(
+        self,
+        radiance: Float[Tensor, "s 3"],
+        x: Float[Tensor, "s 3"],
+        normal: Float[Tensor, "s 3"],
+        kind: Int[Tensor, "s"],
+    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s 3"]]:
+        """Old and new irradiance."""
         old, new = SceneLight.shaded((self.old, self.new), x, normal)
         if self.old.sun is None:
-            new = new + self.new.direct(x, normal)
-            return self._bounded(new, old, radiance, kind)
+            return old, new + self.new.direct(x, normal)
         lit, full = self.old.visibility(x, normal), self.old.full_sun(normal)
         if self.albedo is None:
             direct = lit[:, None] * full
@@ -111,26 +150,7 @@ class RelitField(RecolouredField):
             new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
         else:
             new = new + self.new.direct(x, normal)
-        return self._bounded(new, old + direct, radiance, kind)
-
-    def _bounded(
-        self,
-        new: Float[Tensor, "s 3"],
-        old: Float[Tensor, "s 3"],
-        radiance: Float[Tensor, "s 3"],
-        kind: Int[Tensor, "s"],
-    ) -> Float[Tensor, "s 3"]:
-        """New over old irradiance, so that no surface sends more than it can reflect.
-
-        Far trees in a sun that was not found would glow under an overcast sky. Under the sky of the
-        photos these are right, whatever light was found.
-        """
-        ratio = (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
-        if not self.new_sky:
-            return ratio
-        most = torch.where(kind == LEAVES, BY_LEAVES, REFLECTED) * luma(new) / torch.pi
-        sent = luma(radiance * ratio).clamp_min(DARKEST)  # what is black sends nothing: 0/0
-        return ratio * (most / sent).clamp(max=1)[:, None]
+        return old + direct, new
 
     def _mended(
         self,
@@ -155,3 +175,8 @@ class RelitField(RecolouredField):
     ) -> Float[Tensor, "n 3"]:
         """Linear radiance of the sky."""
         return self.new.radiance(d) if self.new_sky else self.field.sky(d, appearance)
+
+
+def _bounded(radiance: Float[Tensor, "s 3"], most: Float[Tensor, "s"]) -> Float[Tensor, "s 3"]:
+    """Radiance whose luma is not above a bound."""
+    return radiance * (most / luma(radiance).clamp_min(DARKEST)).clamp(max=1)[:, None]  # black: 0/0

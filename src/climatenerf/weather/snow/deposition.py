@@ -50,7 +50,8 @@ from climatenerf.weather.snow.surface_fit import smooth_ground
 LEAF = int(SOLID_OF[VEGETATION])
 GROUND_KINDS = SOLID_OF[list(GROUND)]
 AROUND = 0.15  # m, standard deviation of what counts as around a node
-MANY_LEAVES = 0.5  # of the solid nodes around, from which on these are leaves as well
+MANY_LEAVES = 0.5  # over the solid nodes around, from which on these count as leaves
+ONE_PLANT = 1.5  # m between the leaves around and what counts as one of them
 UNDERGROWTH = 0.3  # m above the ground; lower leaves carry snow as grass does
 STEPS = 8  # towards the ground below a slanted ray
 SLANTED = np.cos(np.radians(10.0))  # downward part of a slanted fall's direction, at most
@@ -148,7 +149,7 @@ def _caught(
     h = grid.spacing_of(cascade)
     normal_z, kind = _seen_from_above(field, rays)
     ground = _ground_below(field, rays)
-    kind = np.where(among_leaves(kind, h), LEAF, kind)
+    kind = np.where(among_leaves(rays.surface, kind, h), LEAF, kind)
     surface, leaves = surfaces_and_leaves(rays.surface, kind, ground)
     on_ground = np.isin(kind, GROUND_KINDS) | (surface == ground)
     surface = bridged(surface, on_ground, rays.reached, h)
@@ -234,25 +235,35 @@ def _catch(
     return Catch(position, *parts, weight.astype(single), shade)
 
 
-def among_leaves(kind: Int[np.ndarray, "h w"], spacing: float) -> Bool[np.ndarray, "h w"]:
-    """Where solid nodes are leaves of a wrong class, because most nodes around are leaves.
+def among_leaves(
+    height: Float[np.ndarray, "h w"], kind: Int[np.ndarray, "h w"], spacing: float
+) -> Bool[np.ndarray, "h w"]:
+    """Where ends of rays count as leaves, whatever their class, since they lie among leaves.
 
-    The classes of fitted foliage are noisy, and a single solid node would carry all the snow that
-    falls on it: foliage would be full of white lumps. Ground between stems is more often right.
+    The classes of fitted foliage are noisy, and each solid node would carry all the snow that falls
+    on it: foliage would be full of white lumps. A node counts as a leaf if it lies about as high as
+    the leaves around, and these are more than half as many as other solid nodes, or more than those
+    of the ground: ground between stems is more often right.
 
     Args:
-        kind: class, as an index in `core.classes.SOLID`; -1: unknown.
+        height: world z at which fall rays end, m; NaN without an end.
+        kind: class there, as an index in `core.classes.SOLID`; -1: unknown, which is solid.
         spacing: of the raster, m.
     """
+    sigma = max(AROUND / spacing, 1.0)  # neighbours of a coarse raster count, too
 
-    def around(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-        return ndimage.gaussian_filter(mask.astype(np.float64), AROUND / spacing)
+    def around(values: np.ndarray) -> Float[np.ndarray, "h w"]:
+        return ndimage.gaussian_filter(values.astype(np.float64), sigma)
 
-    leaves = around(kind == LEAF)
+    leaf, hit = kind == LEAF, np.isfinite(height)
+    leaves = around(leaf & hit)
+    # Without leaves 0/0; 1e-6 of them are none.
+    middle = around(np.where(leaf & hit, height, 0.0)) / np.maximum(leaves, 1e-6)
+    level = np.abs(height - middle) < ONE_PLANT  # NaN compares False
     ground = np.isin(kind, GROUND_KINDS)
-    other = (kind >= 0) & (kind != LEAF) & ~ground
+    other = hit & ~leaf & ~ground
     wrong_ground = ground & (leaves > around(ground))
-    return wrong_ground | (other & (leaves > MANY_LEAVES * around(other)))
+    return level & (wrong_ground | (other & (leaves > MANY_LEAVES * around(other))))
 
 
 def surfaces_and_leaves(

@@ -16,9 +16,9 @@ HELD_AT_30, PER_DEGREE = 3.08, 0.0671  # m on a slope of 30 degrees; decay, of `
 STEEPEST_SIDE = 80.0  # degrees of the sides of thin snow
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
-SCATTERS = 0.2  # of the drop: standard deviation, along each axis, of where what falls lands
+SCATTER = 0.2  # of the drop: standard deviation, along each axis, of where what falls lands
 PACKED = 0.5  # volume of what slid over that before it did
-FALLS_FROM = 0.2  # m of a drop over an edge, from which what falls is scattered
+MIN_FALL = 0.2  # m of a drop over an edge, from which what falls is scattered
 PARCELS = 64  # of what falls off a node
 SLID_PARCELS = 256  # of what slid to a node
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # radian, between parcels
@@ -26,7 +26,7 @@ LEDGE = 0.1  # share of level nodes within reach of what arrives
 DESCENT = 1e-6  # m a node, of filled depressions, so that a way leads out of them
 SETTLED = 3e-3  # of the spacing; what is higher by less stays
 FILM = 1e-6  # m; less would slide on and on
-LOOSELY = 30.0  # times `SETTLED`, while snow falls over edges
+COARSE = 30.0  # times `SETTLED`, while snow falls over edges
 MAX_SWEEPS = 100_000  # of `settled`; 2 m of snow on walls of 6 m need tens of thousands
 
 
@@ -40,7 +40,7 @@ def slid(
 
     What a slope does not keep slides down, over edges as well, to the first surface that keeps all
     snow: below a steep roof lies what the roof sheds. It spreads there over `PILE` m and over
-    `SCATTERS` of its drop, so that no spires stand below crowns of a wrong class.
+    `SCATTER` of its highest step, so that no spires stand below crowns of a wrong class.
     What slides passes over depressions of a slope, which are roughness of the field.
 
     Args:
@@ -84,8 +84,8 @@ def _piled(
         for i in range(columns):
             if arrived[j, i] <= 0:
                 continue
-            reach = SCATTERS * drop[j, i] / spacing
-            highest = height[j, i] + max(drop[j, i] / 2, FALLS_FROM)
+            reach = SCATTER * drop[j, i] / spacing
+            highest = height[j, i] + max(drop[j, i] / 2, MIN_FALL)
             found = 0
             for k in range(SLID_PARCELS):
                 dj, di = _parcel(k, SLID_PARCELS, j * columns + i, reach)
@@ -194,7 +194,8 @@ def steepest_side(depth: float) -> float:
     """Rise over run up to which snow of a depth (m) stands: the thinner, the steeper.
 
     Slopes of 30, 45, 60 and 75 degrees hold 3.08, 1.11, .45 and .15 m of snow (Bernhardt and Schulz
-    2010, SnowSlide); an exponential fits these.
+    2010, SnowSlide); an exponential fits these. There depths are normal to the slope; taken as
+    vertical ones, as here, deep snow stands less steeply.
     """
     degrees = 30 + math.log(HELD_AT_30 / max(depth, 1e-6)) / PER_DEGREE  # no snow: 3.08 / 0
     return math.tan(math.radians(min(max(degrees, 0.0), STEEPEST_SIDE)))
@@ -208,8 +209,8 @@ def settled(
 
     That holds for the surface over a node above that over any neighbour, or above the node's own
     base where that is higher: snow on a roof ends in a slope at its eaves. There no more stays than
-    fell, so that the sides of a car stay free. What slides goes to that neighbour; over an edge it
-    falls, and lands scattered around the foot.
+    was deposited, so that the sides of a car stay free. What slides goes to that neighbour; over an
+    edge it falls, and lands scattered around the foot.
 
     Args:
         base: height of what the snow lies on, m; NaN where nothing is.
@@ -218,8 +219,8 @@ def settled(
     """
     rows, columns = base.shape
     top = base + thickness
-    tolerance = LOOSELY * SETTLED * spacing  # until no more falls
-    fell = np.zeros((rows, columns))  # off each node and not yet landed, m
+    tolerance = COARSE * SETTLED * spacing  # until no more falls
+    falling = np.zeros((rows, columns))  # off each node and not yet landed, m
     received = np.zeros((rows, columns))  # the same at its foot
     falls = False
     waiting = np.ones((rows, columns), np.bool_)  # nodes near a change since they were looked at
@@ -250,7 +251,7 @@ def settled(
                         if math.isnan(other):
                             continue
                         slack = rise * math.sqrt(dj * dj + di * di)
-                        # Nothing below supports more than what fell here.
+                        # Nothing below supports more than what was deposited here.
                         free = other < base[j, i] and slack > thickness[j, i]
                         if free:
                             slack = thickness[j, i]
@@ -262,13 +263,13 @@ def settled(
                             part = 1.0 if free else 0.5
                 if limit < own - (FILM if part == 1.0 else tolerance):
                     drop, moved = base[j, i] - lower, part * (own - limit)
-                    if drop > FALLS_FROM:
+                    if drop > MIN_FALL:
                         if received[to_j, to_i] > drop and (
                             received[to_j, to_i]
                             > drop * _width(top, base[j, i], to_j, to_i, spacing)
                         ):
                             continue  # the gap below is full when that has landed
-                        fell[j, i] += moved
+                        falling[j, i] += moved
                         received[to_j, to_i] += moved
                         falls = True
                     else:
@@ -280,15 +281,15 @@ def settled(
         if changed:
             continue
         if falls:
-            _land(top, base, fell, waiting, busy, spacing)
-            fell[:], received[:], falls = 0, 0, False
+            _land(top, base, falling, waiting, busy, spacing)
+            falling[:], received[:], falls = 0, 0, False
         elif tolerance > SETTLED * spacing:
             tolerance = SETTLED * spacing
             waiting[:], busy[:] = True, True
         else:
             break
     if falls:
-        _land(top, base, fell, waiting, busy, spacing)
+        _land(top, base, falling, waiting, busy, spacing)
     return np.maximum(top - base, 0.0)
 
 
@@ -307,7 +308,7 @@ def _wake(
 def _land(
     top: Float[np.ndarray, "h w"],
     base: Float[np.ndarray, "h w"],
-    fell: Float[np.ndarray, "h w"],
+    falling: Float[np.ndarray, "h w"],
     waiting: Bool[np.ndarray, "h w"],
     busy: Bool[np.ndarray, "h"],
     spacing: float,
@@ -320,7 +321,7 @@ def _land(
     before = top.copy()
     for j in range(rows):
         for i in range(columns):
-            if fell[j, i] <= 0:
+            if falling[j, i] <= 0:
                 continue
             foot_j, foot_i = j, i
             for jj in range(max(j - 1, 0), min(j + 2, rows)):
@@ -328,11 +329,11 @@ def _land(
                     if before[jj, ii] < before[foot_j, foot_i]:  # NaN compares False
                         foot_j, foot_i = jj, ii
             _wake(waiting, busy, foot_j, foot_i)  # nodes above a full gap go on
-            reach = SCATTERS * max(base[j, i] - before[foot_j, foot_i], 0.0) / spacing
+            reach = SCATTER * max(base[j, i] - before[foot_j, foot_i], 0.0) / spacing
             for k in range(PARCELS):
                 source = j * columns + i
                 to_j, to_i = _landing(before, base[j, i], foot_j, foot_i, reach, k, source)
-                top[to_j, to_i] += fell[j, i] / PARCELS
+                top[to_j, to_i] += falling[j, i] / PARCELS
                 _wake(waiting, busy, to_j, to_i)
 
 
@@ -351,7 +352,7 @@ def _landing(
     for side in (1, -1):
         j, i = foot_j + round(side * dj), foot_i + round(side * di)
         inside = 0 <= j < top.shape[0] and 0 <= i < top.shape[1]
-        if inside and top[j, i] < high - FALLS_FROM:  # NaN compares False
+        if inside and top[j, i] < high - MIN_FALL:  # NaN compares False
             return j, i
     return foot_j, foot_i
 
@@ -361,7 +362,7 @@ def _width(
     top: Float[np.ndarray, "h w"], high: float, foot_j: int, foot_i: int, spacing: float
 ) -> float:
     """Nodes across an edge over which what falls from it is spread; 1 in a pit."""
-    reach = SCATTERS * (high - top[foot_j, foot_i]) / spacing
+    reach = SCATTER * (high - top[foot_j, foot_i]) / spacing
     stays = 0
     for k in range(PARCELS):
         stays += _landing(top, high, foot_j, foot_i, reach, k, 0) == (foot_j, foot_i)
