@@ -37,7 +37,7 @@ from climatenerf.weather.light.sky_fit import (
 )
 
 PAIRS = 12000  # of neighbouring surface points
-GATHERED_PAIRS = 800  # whose difference is explained by candidates for the sun
+GATHERED_PAIRS = 2400  # whose difference is explained by candidates for the sun
 SHADOW_PAIRS, MIN_SHADOW_PAIRS = 200, 8  # which a shadow's edge parts, for the sun's strength
 MIN_PAIRS = 300
 TRIES = 4  # for each pair; most random pixels do not show one plane
