@@ -14,6 +14,7 @@ from scipy import ndimage
 
 HELD_AT_30, PER_DEGREE = 3.08, 0.0671  # m on a slope of 30 degrees; decay, of `steepest_side`
 STEEPEST_SIDE = 80.0  # degrees of the sides of thin snow
+EDGE_SIDE = math.tan(math.radians(60))  # rise over run of sides above a drop of `MIN_FALL`
 KEEPS_ALL = 0.99  # share of a surface on which sliding snow comes to rest
 PILE = 0.12  # m, standard deviation of the heap of what slid, before it settles
 SCATTER = 0.2  # of the drop: standard deviation, along each axis, of where what falls lands
@@ -209,8 +210,9 @@ def settled(
 
     That holds for the surface over a node above that over any neighbour, or above the node's own
     base where that is higher: snow on a roof ends in a slope at its eaves. There no more stays than
-    was deposited, so that the sides of a car stay free. What slides goes to that neighbour; over an
-    edge it falls, and lands scattered around the foot.
+    was deposited, so that the sides of a car stay free; and above a drop of `MIN_FALL` no more than
+    `EDGE_SIDE` allows, so that a thin rail carries no ball. What slides goes to that neighbour;
+    over an edge it falls, and lands scattered around the foot.
 
     Args:
         base: height of what the snow lies on, m; NaN where nothing is.
@@ -255,6 +257,8 @@ def settled(
                         free = other < base[j, i] and slack > thickness[j, i]
                         if free:
                             slack = thickness[j, i]
+                        if other < base[j, i] - MIN_FALL:
+                            slack = min(slack, EDGE_SIDE * spacing * math.sqrt(dj * dj + di * di))
                         highest = max(other, base[j, i]) + slack
                         if highest < limit or (highest == limit and other < lower):
                             limit, lower, to_j, to_i = highest, other, jj, ii
