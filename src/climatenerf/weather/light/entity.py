@@ -29,7 +29,7 @@ from climatenerf.weather.light.file import light_of_photos_in
 from climatenerf.weather.light.parameters import Sun
 from climatenerf.weather.light.probes import GatheredLight, gather
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo, estimate
-from climatenerf.weather.light.relit_field import RelitField
+from climatenerf.weather.light.relit_field import RelitField, bounded
 from climatenerf.weather.light.scene_light import (
     Radiance,
     SceneLight,
@@ -303,8 +303,10 @@ class LightEntity:
         # What photos show keeps its log-average luminance, as photographers expose (Reinhard et al.
         # 2002, Eq. 1): unlike the mean it does not follow a few places in the sun.
         radiance, x, normal, kind = (each[::EXPOSED] for each in self._shown)
-        shown = RelitField(self._given.field, old, new, True, albedo=self._albedo(old))
-        shining = radiance * shown.ratio(radiance, x, normal, kind)
+        sheet = float(luma(new.open_irradiance())) / math.pi
+        shown = RelitField(self._given.field, old, new, True, 1.0, sheet, self._albedo(old))
+        ratio, most = shown.change(radiance, x, normal, kind)
+        shining = bounded(radiance * ratio, most)
         before, after = (luma(each).clamp_min(DARKEST).log().mean() for each in (radiance, shining))
         kept = gain * math.exp(float(before - after))
         # For snow that is neither grey nor without relief, photographers correct the exposure.

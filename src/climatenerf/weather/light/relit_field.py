@@ -61,13 +61,13 @@ class RelitField(RecolouredField):
         """Linear radiance under the new light."""
         if ray is None:
             normal, kind = normals_at(self.field, x, d)
-            ratio, most = self._change(colour, x, normal, kind)
-            return _bounded(colour * ratio, most)
+            ratio, most = self.change(colour, x, normal, kind)
+            return bounded(colour * ratio, most)
         middle, group = shared_lookups(x, d, ray, SHARED)
         place, along = x[middle], d[ray[middle]]
         normal, kind = normals_at(self.field, place, along)
-        ratio, most = self._change(colour[middle], place, normal, kind)
-        relit = _bounded(colour * ratio[group], most[group])
+        ratio, most = self.change(colour[middle], place, normal, kind)
+        relit = bounded(colour * ratio[group], most[group])
         if not self.new_sky:
             return relit
         leaves = ((kind == LEAVES)[group] & (d[ray, 2] > HORIZON)).nonzero()[:, 0]
@@ -87,25 +87,7 @@ class RelitField(RecolouredField):
         like = torch.exp(-off / (2 * LIKE_SKY**2))[:, None]
         return relit + like * (self.new.radiance(d) - relit)
 
-    def ratio(
-        self,
-        radiance: Float[Tensor, "s 3"],
-        x: Float[Tensor, "s 3"],
-        normal: Float[Tensor, "s 3"],
-        kind: Int[Tensor, "s"],
-    ) -> Float[Tensor, "s 3"]:
-        """New over old irradiance.
-
-        Args:
-            radiance: of the samples in the photos.
-            x: positions, world m.
-            normal: unit.
-            kind: classes, as indices in `core.classes.SOLID`.
-        """
-        old, new = self._irradiance(radiance, x, normal, kind)
-        return (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
-
-    def _change(
+    def change(
         self,
         radiance: Float[Tensor, "s 3"],
         x: Float[Tensor, "s 3"],
@@ -115,9 +97,29 @@ class RelitField(RecolouredField):
         """New over old irradiance, and the luma that surfaces reflect at most in the new light.
 
         Far trees in a sun that was not found would glow under an overcast sky. Under the sky of the
-        photos they are right, whatever light was found.
+        photos they are right, whatever light was found, and the bound is infinite.
+
+        Args:
+            radiance: of the samples in the photos.
+            x: positions, world m.
+            normal: unit.
+            kind: classes, as indices in `core.classes.SOLID`.
         """
-        old, new = self._irradiance(radiance, x, normal, kind)
+        old, new = SceneLight.shaded((self.old, self.new), x, normal)
+        if self.old.sun is None:
+            new = new + self.new.direct(x, normal)
+        else:
+            lit, full = self.old.visibility(x, normal), self.old.full_sun(normal)
+            direct = lit[:, None] * full
+            if self.albedo is not None:
+                beam = self.old.sun_irradiance
+                direct, wrong = self.albedo.sunlight(radiance, x, kind, old, full, beam, lit)
+                normal, (old, new) = self._mended(x, normal, wrong, (old, new))
+            if self.new.sun is self.old.sun:  # the sun of the photos keeps its shadows
+                new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
+            else:
+                new = new + self.new.direct(x, normal)
+            old = old + direct
         ratio = (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
         if not self.new_sky:
             return ratio, torch.full_like(ratio[:, 0], math.inf)
@@ -127,30 +129,6 @@ class RelitField(RecolouredField):
         light = torch.maximum(luma(new), luma(self.new.irradiance(x, up)))
         albedo = torch.where(kind == LEAVES, MAX_LEAF_ALBEDO, MAX_ALBEDO)
         return ratio, albedo * light.clamp_min(SHADIEST * self.white * math.pi) / math.pi
-
-    def _irradiance(
-        self,
-        radiance: Float[Tensor, "s 3"],
-        x: Float[Tensor, "s 3"],
-        normal: Float[Tensor, "s 3"],
-        kind: Int[Tensor, "s"],
-    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s 3"]]:
-        """Old and new irradiance."""
-        old, new = SceneLight.shaded((self.old, self.new), x, normal)
-        if self.old.sun is None:
-            return old, new + self.new.direct(x, normal)
-        lit, full = self.old.visibility(x, normal), self.old.full_sun(normal)
-        if self.albedo is None:
-            direct = lit[:, None] * full
-        else:
-            beam = self.old.sun_irradiance
-            direct, wrong = self.albedo.sunlight(radiance, x, kind, old, full, beam, lit)
-            normal, (old, new) = self._mended(x, normal, wrong, (old, new))
-        if self.new.sun is self.old.sun:  # the sun of the photos keeps its shadows
-            new = new + direct * (self.new.sun_irradiance / self.old.sun_irradiance)
-        else:
-            new = new + self.new.direct(x, normal)
-        return old + direct, new
 
     def _mended(
         self,
@@ -177,6 +155,6 @@ class RelitField(RecolouredField):
         return self.new.radiance(d) if self.new_sky else self.field.sky(d, appearance)
 
 
-def _bounded(radiance: Float[Tensor, "s 3"], most: Float[Tensor, "s"]) -> Float[Tensor, "s 3"]:
-    """Radiance whose luma is not above a bound."""
+def bounded(radiance: Float[Tensor, "s 3"], most: Float[Tensor, "s"]) -> Float[Tensor, "s 3"]:
+    """The same radiance, but for its luma where that is above a bound."""
     return radiance * (most / luma(radiance).clamp_min(DARKEST)).clamp(max=1)[:, None]  # black: 0/0
