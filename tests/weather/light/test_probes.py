@@ -18,6 +18,7 @@ from climatenerf.weather.light.scene_light import (
     SATURATION,
     SceneLight,
     Surfaces,
+    camera_balance,
     light_of_photos,
     plausible_surfaces,
     relit,
@@ -187,6 +188,19 @@ def test_surfaces_keep_part_of_their_tint_and_are_no_whiter_than_usual(gathered)
     blue = torch.tensor([0.5, 1.0, 1.5])
     grey = replace(gathered, radiance=gathered.radiance * blue)
     torch.testing.assert_close(plausible_surfaces(grey, white * blue).radiance, grey.radiance)
+
+
+def test_the_tint_of_the_photos_light_is_bounded_as_cameras_balance_it():
+    """A blue sky between leaves keeps a part of its tint; that of an open sky stays."""
+    blue = torch.tensor([0.61, 0.93, 1.31])
+    found = camera_balance(blue) * blue
+    assert float(luma(found)) == pytest.approx(float(luma(blue)), rel=1e-5)
+    assert 0.7 < float(found[0] / found[2]) < 0.8
+    assert found[0] < found[1] < found[2]
+    pale = torch.tensor([1.06, 1.10, 1.14])
+    assert camera_balance(pale).tolist() == pytest.approx([1, 1, 1], abs=0.003)
+    red = torch.tensor([0.9, 0.5, 0.3])
+    assert 1.3 < float((camera_balance(red) * red)[0] / (camera_balance(red) * red)[2]) < 1.4
 
 
 def test_a_new_light_is_balanced_among_red_walls(gathered):

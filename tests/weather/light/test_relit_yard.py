@@ -27,7 +27,13 @@ from climatenerf.weather.light import entity
 from climatenerf.weather.light import find_light as finding
 from climatenerf.weather.light import sun_map as sun_maps
 from climatenerf.weather.light.captured import UnknownLight, elevation_azimuth
-from climatenerf.weather.light.relit_field import MAX_ALBEDO, MAX_LEAF_ALBEDO, RelitField
+from climatenerf.weather.light.relit_field import (
+    BRIGHTEST,
+    MAX_ALBEDO,
+    MAX_LEAF_ALBEDO,
+    RelitField,
+    bounded,
+)
 from climatenerf.weather.light.sun_map import sun_map
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.world import Kept
@@ -137,23 +143,35 @@ def test_no_surface_sends_more_than_it_can_reflect_under_a_new_sky(overcast):
     white = luma(relit.new.irradiance(x, up)) / math.pi
     assert float(white.min()) > relit.white / 3
     ray = torch.zeros(5, dtype=torch.long)  # the samples share the change of their light
-    wanted = torch.tensor([0.0, 0.3, 2.0, 0.45, 0.6]) * white
+    of_bound = torch.tensor([0.0, 0.7, BRIGHTEST, 1.0, 2.0])
+    # 1 + (1/.7 - 1) log(x/.7) / log(6/.7) of .7: what is too bright keeps its texture.
+    expected = torch.tensor([0.0, 0.7, 1.0, 0.7498, 0.8466])
     for kind, most in ((OfOneClass, MAX_LEAF_ALBEDO), (OfWalls, MAX_ALBEDO)):
+        wanted = of_bound * most * white
         field = replace(relit, field=kind(relit.field))
         photographed = replace(field, new_sky=False)
         plain = luma(photographed.recoloured(torch.ones(5, 3), x, d, ray))
         colour = (wanted / plain)[:, None].expand(5, 3)
         for given in ((colour, x, d, ray), (colour, x, d.expand(5, 3), None)):
             found = luma(field.recoloured(*given))
-            bound = torch.minimum(wanted, most * white)
-            torch.testing.assert_close(found, bound, rtol=0.03, atol=1e-6)
+            torch.testing.assert_close(found, expected * most * white, rtol=0.03, atol=1e-6)
             same = photographed.recoloured(*given)
-            assert float(luma(same).max()) == pytest.approx(2 * float(white[2]), rel=0.03)
+            assert float(luma(same).max()) == pytest.approx(float(wanted[2]), rel=0.03)
     # Where probes know of no light, a third of that in the open counts.
     night = replace(relit.new, coefficients=0 * relit.new.coefficients, sun=None)
     dark = replace(relit, field=OfWalls(relit.field), new=night, brighter=16.0)
-    found = luma(dark.recoloured(torch.ones(5, 3), x, d, ray))
+    found = luma(dark.recoloured(torch.full((5, 3), 99.0), x, d, ray))
     assert found.tolist() == pytest.approx(5 * [MAX_ALBEDO * relit.white / 3], rel=1e-3)
+
+
+def test_no_channel_of_a_saturated_surface_exceeds_the_bound():
+    brick = torch.tensor([[2.0, 0.4, 0.1], [0.3, 0.06, 0.015], [0.0, 0.0, 0.0]])
+    found = bounded(brick, torch.full((3,), 0.5))
+    assert float(found[0].max()) == pytest.approx(0.4717, abs=1e-3)
+    torch.testing.assert_close(found[0] / found[0, 0], brick[0] / brick[0, 0])
+    torch.testing.assert_close(found[1:], brick[1:])
+    far = bounded(brick, torch.full((3,), math.inf))
+    torch.testing.assert_close(far, brick)
 
 
 def test_haze_of_the_old_sky_around_leaves_shows_the_new_sky(overcast):
@@ -173,9 +191,9 @@ def test_haze_of_the_old_sky_around_leaves_shows_the_new_sky(overcast):
     torch.testing.assert_close(leaves[0], relit.new.radiance(d[:1])[0], rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(leaves[1], same_light[1], rtol=1e-3, atol=1e-4)
     up = torch.tensor([[0.0, 0.0, 1.0]])
-    bound = MAX_LEAF_ALBEDO * float(luma(relit.new.irradiance(x[2:], up))) / math.pi
-    bound = min(bound / float(luma(same_light[2])), 1.0)
-    torch.testing.assert_close(leaves[2], same_light[2] * bound, rtol=1e-3, atol=1e-4)
+    most = MAX_LEAF_ALBEDO * luma(relit.new.irradiance(x[2:], up)) / math.pi
+    torch.testing.assert_close(leaves[2:], bounded(same_light[2:], most), rtol=1e-3, atol=1e-4)
+    assert float(leaves[2].max()) <= float(most)
     assert (leaves[0] - same_light[0]).abs().max() > 0.02
     assert torch.equal(shown(OfWalls), shown(OfWalls, new_sky=False))
 
@@ -463,7 +481,7 @@ def test_the_light_is_kept_with_the_run(tmp_path):
     assert (tmp_path / "light.json").read_bytes() == written
     for old, new in (
         (b'"checkpoint": "a"', b'"checkpoint": "b"'),
-        (b'_version": 5', b'_version": 1'),
+        (b'_version": 6', b'_version": 1'),
     ):
         assert old in written
         (tmp_path / "light.json").write_bytes(written.replace(old, new))

@@ -6,12 +6,21 @@ import numpy as np
 import pytest
 import torch
 from support.analytic_fields import AnalyticField, Box, ground
+from support.holed_ground import LabelledField
 
+from climatenerf.core.classes import BUILDING, ROAD, VEGETATION
 from climatenerf.core.samples import Samples
+from climatenerf.field.analytic import HalfSpace
 from climatenerf.field.capabilities import COMPLETES
 from climatenerf.weather.snow.lattice import SnowGrid
 from climatenerf.weather.snow.layer import bake_snow
-from climatenerf.weather.snow.openness import SNOWY, contact_shade, openness_of
+from climatenerf.weather.snow.openness import (
+    LEAFY,
+    REFLECTED,
+    SNOWY,
+    contact_shade,
+    openness_of,
+)
 from climatenerf.weather.snow.parameters import Snow
 
 CAMERAS = np.array([[0.0, 0.0, 1.6]])
@@ -47,11 +56,11 @@ def test_contact_shade_at_a_dark_wall(top, least, most):
     wall = Box((1.0, -8.0, -1.0), (1.2, 8.0, top), (0.05, 0.05, 0.05))
     field = AnalyticField([ground(), wall], box=((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5)))
     x = np.array([[0.92, 0.0, 0.1], [0.7, 0.0, 0.1], [0.0, 0.0, 0.1], [-7.0, 0.0, 0.1]])
-    openness, hidden = openness_of(field, x.astype(np.float32))
+    openness, returned = openness_of(field, x.astype(np.float32))
     assert 0.4 < openness[0] < (0.65 if top > 1 else 0.7)  # above a low wall more sky is free
     assert np.all(np.diff(openness) >= 0)
     assert openness[3] == pytest.approx(1)
-    assert not hidden.any(), "a wall is no ground"
+    assert returned == pytest.approx(REFLECTED * (1 - openness), abs=1e-6), "a wall is no ground"
     grid = SnowGrid((0.0, 0.0), (-1.0, 3.2), 0.06, 64)
     snow = bake_snow(field, Snow(depth=0.1), CAMERAS, np.ones(3), grid=grid)
     assert snow is not None
@@ -60,13 +69,26 @@ def test_contact_shade_at_a_dark_wall(top, least, most):
     assert least < float(near.mean() / far.mean()) < most
 
 
+def test_a_hedge_returns_less_light_than_a_wall():
+    box = ((-8.0, -8.0, -1.0), (8.0, 8.0, 3.5))
+    wall = Box((1.0, -8.0, -1.0), (1.2, 8.0, 3.0), (0.05, 0.05, 0.05))
+    x = np.array([[0.8, 0.0, 0.1], [-7.0, 0.0, 0.1]], np.float32)
+    found = {}
+    for kind in (BUILDING, VEGETATION):
+        field = LabelledField([HalfSpace(), wall], classes=[ROAD, kind], box=box)
+        openness, found[kind] = openness_of(field, x)
+        assert openness[0] < 0.7
+    assert found[VEGETATION][0] / found[BUILDING][0] == pytest.approx(LEAFY / REFLECTED, rel=1e-3)
+    assert found[VEGETATION][1] == 0
+
+
 def test_a_hollow_of_the_ground_is_nearly_as_bright_as_the_open():
     """Half a sphere hides half of the sky everywhere: A/(1 - r (1 - A)) with A = 1/2, exactly."""
     field = Hollow([], box=((-4.0, -4.0, -1.0), (4.0, 4.0, 2.0)))
     bottom = np.array([[0.0, 0.0, 0.01 - RADIUS], [2.0, 0.0, 0.01]], np.float32)
-    openness, hidden = openness_of(field, bottom)
+    openness, returned = openness_of(field, bottom)
     assert openness == pytest.approx([0.5, 1.0], abs=0.05)
-    assert hidden == pytest.approx([0.5, 0.0], abs=0.05)
+    assert returned == pytest.approx([SNOWY * 0.5, 0.0], abs=0.05)
     x, y = np.meshgrid(np.arange(-3, 3, 0.06), np.arange(-3, 3, 0.06))
     z = -np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0))
     raster = np.stack([x, y, z], -1).astype(np.float32)

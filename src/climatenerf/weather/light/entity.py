@@ -35,6 +35,7 @@ from climatenerf.weather.light.scene_light import (
     SceneLight,
     Surfaces,
     between,
+    camera_balance,
     light_of_photos,
     plausible_surfaces,
     relit,
@@ -135,6 +136,10 @@ class LightEntity:
             if captured.hard and captured.sun is not None:
                 shadow = self._sun_map(captured.sun)
                 strength = to_device(captured.lobe.astype(np.float32), device)
+            light = light_of_photos(self._gathered, radiance, strength, shadow)
+            gain = camera_balance(light.open_irradiance())
+            radiance = functools.partial(scaled, gain, radiance)
+            strength = gain * strength
             light = light_of_photos(self._gathered, radiance, strength, shadow)
             self._surfaces = plausible_surfaces(self._gathered, light.open_irradiance())
             light = light_of_photos(self._surfaces, radiance, strength, shadow)

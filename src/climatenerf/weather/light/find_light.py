@@ -475,7 +475,7 @@ def find_light(
     if (seen.max(-1) >= CLIPPED).mean() > MIN_CLIPPED:
         flat = pairs.normal[:, 2] > 0.9
         enough = flat.sum() >= 2 * MIN_PAIRS // 3
-        ground = float((pairs.radiance[flat] @ LUMA).mean()) if enough else 0.0
+        ground = float(np.exp(np.log(pairs.radiance[flat] @ LUMA).mean())) if enough else 0.0
         model = fit_sky(sky_d, seen, ground, lobe=True)
         glowing = _assembled(model, shown, model.width / 3, almanac)
         if glow_share(glowing) >= MIN_SUN:

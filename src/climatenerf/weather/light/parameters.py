@@ -45,7 +45,7 @@ SKY = Effect(
     parameters=Sky,
     enabled_by=(),
     prepare="climatenerf.weather.light.entity:prepare",
-    version="2",
+    version="3",
     always=True,
     only_with=(("cover", "kind", ("clear",)), ("exposure", "kind", _NEW), ("ev", "kind", _NEW)),
 )

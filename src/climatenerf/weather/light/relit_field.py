@@ -25,6 +25,7 @@ DARK = 0.02  # radiance; less is no sky by day
 LIKE_SKY = 0.4  # of the logarithms of a colour over the sky's
 MAX_ALBEDO = 0.9  # white paint
 MAX_LEAF_ALBEDO = 0.5  # yellow leaves in autumn
+SHOULDER, BRIGHTEST = 0.7, 6.0  # of these bounds, see `bounded`
 SHADIEST = 1 / 3  # of the light in the open; what is known of places is less certain
 SHARED = 0.4  # m along a ray, within which samples share the change of their light
 
@@ -82,7 +83,8 @@ class RelitField(RecolouredField):
 
         A fit puts haze of the sky's colour around twigs that are finer than a pixel.
         """
-        old = self.old.radiance(d).clamp(DARK, 1.0)  # photos show no more than white
+        photographed = self.old.reflected_sky(d, self.field.sky(d))
+        old = photographed.clamp(DARK, 1.0)  # photos show no more than white
         off = (colour.clamp(DARK, 1.0) / old).log().square().sum(-1)
         like = torch.exp(-off / (2 * LIKE_SKY**2))[:, None]
         return relit + like * (self.new.radiance(d) - relit)
@@ -94,7 +96,7 @@ class RelitField(RecolouredField):
         normal: Float[Tensor, "s 3"],
         kind: Int[Tensor, "s"],
     ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s"]]:
-        """New over old irradiance, and the luma that surfaces reflect at most in the new light.
+        """New over old irradiance, and what a channel of surfaces sends at most in the new light.
 
         Far trees in a sun that was not found would glow under an overcast sky. Under the sky of the
         photos they are right, whatever light was found, and the bound is infinite.
@@ -156,5 +158,12 @@ class RelitField(RecolouredField):
 
 
 def bounded(radiance: Float[Tensor, "s 3"], most: Float[Tensor, "s"]) -> Float[Tensor, "s 3"]:
-    """The same radiance, but for its luma where that is above a bound."""
-    return radiance * (most / luma(radiance).clamp_min(DARKEST)).clamp(max=1)[:, None]  # black: 0/0
+    """The same radiance, but for its brightest channel where that is near or above a bound.
+
+    From `SHOULDER` of the bound on it rises with the logarithm, up to the bound at `BRIGHTEST` of
+    it: what was estimated too bright keeps its texture.
+    """
+    over = radiance.amax(-1).clamp_min(DARKEST) / (SHOULDER * most)  # black: log 0; infinite: 0
+    slope = (1 / SHOULDER - 1) / math.log(BRIGHTEST / SHOULDER)
+    kept = (1 + slope * over.clamp_min(1).log()).clamp(max=1 / SHOULDER) / over.clamp_min(1)
+    return radiance * kept[:, None]

@@ -21,6 +21,7 @@ from climatenerf.weather.light.sun_map import SunMap
 BOUNCES = 2  # repetitions in which surfaces are lit anew by the surfaces around them
 MAX_MEDIAN_ALBEDO = 0.3  # of the surfaces of a place
 SATURATION = 0.3  # of their colour that is kept in the light that they reflect onto others
+MOST_TINT = 0.15  # of the logarithm of a channel over luma: red over blue from .74 to 1.35
 OFF_SURFACE = 0.15  # m; where the light of a surface is looked up, clear of its own density
 DARKEST = 1e-4  # irradiance over pi; nothing real is darker, and ratios stay finite
 MOST = 16.0  # factor by which light may change at one place
@@ -193,6 +194,20 @@ def relit(
         arriving = sky + bounced.view(gathered.radiance.shape)
         light = replace(new, coefficients=gathered.coefficients(arriving))
     return light
+
+
+def camera_balance(irradiance: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Gains of the channels that bound the tint of the photos' light, which cameras balance.
+
+    A blue sky that shows between yellow leaves is not the colour of the light below them. Cameras
+    leave a part of a light's tint; the logarithm of each channel over luma is bounded smoothly.
+
+    Args:
+        irradiance: of level ground in the open, as found.
+    """
+    tint = (irradiance / luma(irradiance)).log()
+    gain = (MOST_TINT * torch.tanh(tint / MOST_TINT) - tint).exp()
+    return gain * (luma(irradiance) / luma(gain * irradiance))
 
 
 def plausible_surfaces(gathered: GatheredLight, irradiance: Float[Tensor, "3"]) -> GatheredLight:

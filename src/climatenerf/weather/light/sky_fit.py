@@ -14,7 +14,7 @@ DARK = 2e-3  # radiance; photos show nothing below
 DIRECTIONS = 384  # over the whole sphere
 CLOUDS = 60  # independent patches of the sky that photos show
 SKY_ERROR = 0.08  # of log radiance, by clouds
-GROUND_ALBEDO = 0.18  # a grey card
+GROUND_ALBEDO = 0.18  # a grey card, the log-average of photos (Reinhard et al. 2002)
 ALBEDO_SPREAD = 0.5  # of its log: asphalt and grass .1, concrete .3
 RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
 LOBE_RATIO, LOBE_RATIO_SPREAD = -0.2, 0.1  # of a sky with a bright lobe, see `fit_sky`
@@ -54,7 +54,7 @@ def fit_sky(
     Args:
         d: directions of sky in the photos.
         radiance: of the fitted sky there.
-        ground: mean luma of level ground that photos show; 0: unknown.
+        ground: log-average luma of level ground that photos show; 0: unknown.
         lobe: whether there is a lobe besides the base.
     """
     rgb = np.minimum(radiance, 1.0)

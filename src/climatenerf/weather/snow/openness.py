@@ -10,11 +10,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from scipy import ndimage
+from torch import Tensor
 
+from climatenerf.core.classes import SOLID_OF, VEGETATION
 from climatenerf.core.device import to_device, to_numpy
+from climatenerf.field.capabilities import CLASSES
+from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField, device_of, ground_height
 from climatenerf.weather.snow.surface_fit import depth_crossings
 
+LEAF = int(SOLID_OF[VEGETATION])
 RAYS = 12  # from each node
 REACH = 3.0  # m
 NODE = 0.18  # m between nodes
@@ -22,6 +27,7 @@ PROBES = 0.8  # m, standard deviation of how probes 2 m apart blur the light
 PROBE_HEIGHT = 1.0  # m above the ground, at which they find it on average
 COARSER = 2  # nodes from one place to the next, at which light is looked for up there
 REFLECTED = 0.35  # reflectance of what stands around
+LEAFY = 0.08  # that of leaves, which shade each other
 SNOWY = 0.9  # that of ground, which carries the same snow
 ON_GROUND = 0.12  # m above the terrain, up to which a ray ends on the ground
 DARKEST = 0.05  # openness; less is inside of matter
@@ -84,8 +90,7 @@ def contact_shade(
 
 def _light(field: RadianceField, x: Float32[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
     """Light that reaches level surfaces of snow among matter, over that in the open."""
-    openness, ground = openness_of(field, x)
-    returned = SNOWY * ground + REFLECTED * np.maximum(1 - openness - ground, 0)
+    openness, returned = openness_of(field, x)
     return openness / (1 - returned)
 
 
@@ -100,11 +105,12 @@ def openness_of(
         x: positions, world m. What is further away than `REACH` does not count.
 
     Returns:
-        The fraction that arrives, `DARKEST` at least, and the fraction that the ground hides.
+        The fraction that arrives, `DARKEST` at least, and the fraction that is hidden, times the
+        reflectance of what hides it.
     """
     device = device_of(field)
     directions = to_device(cosine_directions(RAYS), device)
-    total, hidden = np.zeros(len(x)), np.zeros(len(x))
+    total, returned = np.zeros(len(x)), np.zeros(len(x))
     places = to_device(np.ascontiguousarray(x, np.float32), device)
     for first in range(0, len(x), CHUNK // RAYS):
         part = places[first : first + CHUNK // RAYS]
@@ -122,11 +128,25 @@ def openness_of(
         )
         # NaN where a ray goes on.
         end = rays_o + to_device(ends.astype(np.float32), device) * rays_d
-        low = end[:, 2] < ground_height(field, end[:, :2].nan_to_num(0.0)) + ON_GROUND
         stopped = -np.expm1(-depth)
+        back = stopped * to_numpy(_reflectance(field, end, rays_d))
         total[first : first + len(part)] = 1 - stopped.reshape(-1, RAYS).mean(1)
-        hidden[first : first + len(part)] = (stopped * to_numpy(low)).reshape(-1, RAYS).mean(1)
-    return np.maximum(total, DARKEST), hidden
+        returned[first : first + len(part)] = back.reshape(-1, RAYS).mean(1)
+    return np.maximum(total, DARKEST), returned
+
+
+def _reflectance(
+    field: RadianceField, end: Float[Tensor, "n 3"], d: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n"]:
+    """Reflectance of what rays of directions d end on; `REFLECTED` where they do not (NaN)."""
+    found = torch.full_like(end[:, 2], REFLECTED)
+    ends = (~end[:, 2].isnan()).nonzero()[:, 0]
+    if CLASSES in field.capabilities:
+        _, kind = normals_at(field, end[ends], d[ends])
+        found[ends[kind == LEAF]] = LEAFY
+    low = end[ends, 2] < ground_height(field, end[ends, :2]) + ON_GROUND  # NaN compares False
+    found[ends[low]] = SNOWY
+    return found
 
 
 def cosine_directions(count: int) -> Float32[np.ndarray, "n 3"]:

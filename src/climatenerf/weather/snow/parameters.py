@@ -68,7 +68,7 @@ SNOW = Effect(
         (name, "light", ("paper",)) for name in ("albedo_offset", "wrap", "sun_share", "shade")
     ),
     after=("sky", "flood"),
-    version="3",
+    version="4",
     prepared_from=(
         "snow.fall_tilt",
         "snow.wind_direction",
