@@ -9,7 +9,6 @@ import torch
 from climatenerf.core.errors import UserError
 from climatenerf.field.analytic import AnalyticField, Box, HalfSpace
 from climatenerf.weather.light import find_light as finding
-from climatenerf.weather.light import sky_fit
 from climatenerf.weather.light.captured import (
     COLUMNS,
     ROWS,
@@ -161,7 +160,7 @@ def test_a_clipped_lobe_is_extrapolated_from_its_flank():
     assert again == pytest.approx(level, rel=0.15)
 
 
-def test_clouds_over_the_horizon_brighten_the_zenith_less_beside_a_sun(monkeypatch):
+def test_clouds_over_the_horizon_brighten_the_zenith_less_beside_a_sun():
     """The sky brightens by 12 % up to 20 degrees, and its zenith is as bright as its horizon."""
 
     def cloudy(d):
@@ -174,11 +173,22 @@ def test_clouds_over_the_horizon_brighten_the_zenith_less_beside_a_sun(monkeypat
     level = float((cloudy(up)[:, 0] * up[:, 2]).sum() * 4 / 6000)
     given = low, np.minimum(cloudy(low), 1.0), 0.18 * level
     held = fit_sky(*given, lobe=True)
-    monkeypatch.setattr(sky_fit, "LOBE_RATIO_SPREAD", 100.0)
-    carried_on = fit_sky(*given, lobe=True)
+    carried_on = fit_sky(*given, lobe=True, ratio=(0.0, 100.0))
     excess, before = (float(model.zenith[0]) - 0.65 for model in (held, carried_on))
     assert 0 < excess < 0.8 * before
     assert float(held.horizon[0]) == pytest.approx(0.65, rel=0.05)
+
+
+def test_a_few_bright_points_change_the_level_of_the_ground_little():
+    random = np.random.default_rng(1)
+    radiance = np.where(random.random((1000, 1)) < 0.05, 0.85, 0.1) * np.ones(3)
+    up = np.tile([0.0, 0.0, 1.0], (1000, 1))
+    pairs = Pairs(0 * up, up, radiance, np.zeros(1000, bool))
+    expected = 0.1 * (0.85 / 0.1) ** (radiance[:, 0] > 0.5).mean()
+    assert finding._level_ground(pairs) == pytest.approx(expected)
+    assert expected < 0.85 * radiance.mean()
+    aside = Pairs(0 * up, up[:, ::-1], radiance, np.zeros(1000, bool))
+    assert finding._level_ground(aside) == 0, "walls are no ground"
 
 
 def test_photographed_sky_is_kept_where_it_is_shown_and_not_clipped():

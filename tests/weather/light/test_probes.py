@@ -121,6 +121,23 @@ def test_light_of_photos_over_open_ground(gathered):
     assert float(mean[0, 0]) == pytest.approx((1 + 0.2) / 2, rel=0.05)
 
 
+def test_the_balance_of_cameras_is_that_of_the_skys_light_alone(gathered):
+    """Surfaces send what photos show of them, and the sky is shown as it is."""
+    gains = torch.tensor([1.2, 1.0, 0.8])
+    plain, balanced = (
+        light_of_photos(gathered, even(1.0), no_sun(), None, gain) for gain in (1.0, gains)
+    )
+    torch.testing.assert_close(balanced.open_irradiance(), gains * plain.open_irradiance())
+    x = torch.tensor([[0.3, 0.2, 1.7]])
+    above, plainly = (light.irradiance(x, UP) for light in (balanced, plain))
+    torch.testing.assert_close(above, gains * plainly, rtol=5e-3, atol=0)
+    under, before = (light.irradiance(x, -UP) for light in (balanced, plain))
+    torch.testing.assert_close(under, before, rtol=0.02, atol=0)
+    assert torch.equal(balanced.radiance(UP), plain.radiance(UP))
+    again = relit(gathered, balanced, balanced)
+    torch.testing.assert_close(again.coefficients, balanced.coefficients, rtol=1e-3, atol=1e-3)
+
+
 def test_white_ground_brightens_a_wall(gathered):
     """Even sky, ground .2 to .87: a wall receives (1 + .87)/(1 + .2) = 1.56 times the light."""
     old = light_of_photos(gathered, even(1.0), no_sun(), None)
@@ -197,6 +214,7 @@ def test_the_tint_of_the_photos_light_is_bounded_as_cameras_balance_it():
     assert float(luma(found)) == pytest.approx(float(luma(blue)), rel=1e-5)
     assert 0.7 < float(found[0] / found[2]) < 0.8
     assert found[0] < found[1] < found[2]
+    assert camera_balance(torch.tensor([0.0, 0.5, 1.0])).isfinite().all()
     pale = torch.tensor([1.06, 1.10, 1.14])
     assert camera_balance(pale).tolist() == pytest.approx([1, 1, 1], abs=0.003)
     red = torch.tensor([0.9, 0.5, 0.3])

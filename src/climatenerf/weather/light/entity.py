@@ -137,12 +137,11 @@ class LightEntity:
                 shadow = self._sun_map(captured.sun)
                 strength = to_device(captured.lobe.astype(np.float32), device)
             light = light_of_photos(self._gathered, radiance, strength, shadow)
-            gain = camera_balance(light.open_irradiance())
-            radiance = functools.partial(scaled, gain, radiance)
-            strength = gain * strength
-            light = light_of_photos(self._gathered, radiance, strength, shadow)
-            self._surfaces = plausible_surfaces(self._gathered, light.open_irradiance())
-            light = light_of_photos(self._surfaces, radiance, strength, shadow)
+            found = light.open_irradiance()
+            balance = camera_balance(found)
+            self._surfaces = plausible_surfaces(self._gathered, balance * found)
+            beam = balance * strength
+            light = light_of_photos(self._surfaces, radiance, beam, shadow, balance)
             self._lights = {key: replace(light, captured=captured)}
         return self._lights[key]
 
@@ -254,6 +253,7 @@ class LightEntity:
                 sun_irradiance=gain * direct,
                 sun=shadow,
                 captured=None,
+                balance=1.0,
             )
 
         # First as bright as the old light in the open, since changes of light are bounded.
@@ -396,7 +396,8 @@ def below_smog(weather: Weather, light: SceneLight) -> SceneLight:
     passed = sun_transmittance(weather.smog, sigma, math.asin(sine))
     beam = light.sun_irradiance
     kept = beam * beam.new_tensor(passed)
-    radiance = functools.partial(_lighter, light.radiance, (beam - kept) * sine / math.pi)
+    spread = (beam - kept) / light.balance * sine / math.pi
+    radiance = functools.partial(_lighter, light.radiance, spread)
     return replace(light, radiance=radiance, sun_irradiance=kept, captured=None)
 
 

@@ -38,7 +38,8 @@ from climatenerf.weather.light.sky_fit import (
 
 PAIRS = 12000  # of neighbouring surface points
 GATHERED_PAIRS = 2400  # whose difference is explained by candidates for the sun
-SHADOW_PAIRS, MIN_SHADOW_PAIRS = 200, 8  # which a shadow's edge parts, for the sun's strength
+TRIED_PAIRS = 200_000  # of which the few that a shadow's edge parts tell the sun's strength
+SHADOW_PAIRS, MIN_SHADOW_PAIRS = 1500, 8  # of these; each alone errs by half
 MIN_PAIRS = 300
 TRIES = 4  # for each pair; most random pixels do not show one plane
 APART = 16  # pixels of the reduced photos between the points of a pair
@@ -453,7 +454,7 @@ def find_light(
         )
     sky_d = sky_d[rng.choice(len(sky_d), min(MAX_SKY, len(sky_d)), replace=False)]
     seen = to_numpy(field.sky(_sent(sky_d, field))).astype(float)
-    plain = fit_sky(sky_d, seen, 0.0, lobe=False)
+    plain = fit_sky(sky_d, seen)
     light = _assembled(plain, shown, 0.0, almanac)
     d = _sent(gathering_directions(), field)
     sky = to_numpy(light.sky(d, field.sky(d)) * (d[:, 2:] > 0)).astype(float)
@@ -467,20 +468,26 @@ def find_light(
         known = []
     if almanac is not None and almanac[2] > LOWEST_SUN:
         known.append((almanac, ALMANAC_ERROR, MIN_SUN * level / almanac[2]))
+    many = (find_pairs(field, photos, TRIED_PAIRS, rng) if known else None) or pairs
     for direction, error, least in known:
-        strength = sun_strength(field, pairs, direction, sky)
+        strength = sun_strength(field, many, direction, sky)
         if strength.min() > 0 and strength @ LUMA > least:
             model = SkyModel(plain.horizon, plain.zenith, direction, 0.0, strength)
             return _assembled(model, shown, error, almanac)
     if (seen.max(-1) >= CLIPPED).mean() > MIN_CLIPPED:
-        flat = pairs.normal[:, 2] > 0.9
-        enough = flat.sum() >= 2 * MIN_PAIRS // 3
-        ground = float(np.exp(np.log(pairs.radiance[flat] @ LUMA).mean())) if enough else 0.0
-        model = fit_sky(sky_d, seen, ground, lobe=True)
+        model = fit_sky(sky_d, seen, _level_ground(pairs), lobe=True)
         glowing = _assembled(model, shown, model.width / 3, almanac)
         if glow_share(glowing) >= MIN_SUN:
             return glowing
     return light
+
+
+def _level_ground(pairs: Pairs) -> float:
+    """Log-average luma of level ground; 0 if photos show too little of it."""
+    flat = pairs.normal[:, 2] > 0.9
+    if flat.sum() < 2 * MIN_PAIRS // 3:
+        return 0.0
+    return float(np.exp(np.log(pairs.radiance[flat] @ LUMA).mean()))
 
 
 def glow_share(light: CapturedLight) -> float:

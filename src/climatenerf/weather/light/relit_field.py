@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from climatenerf.core.classes import SOLID_OF, VEGETATION
-from climatenerf.core.colour import luma
 from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.normals import normals_at
 from climatenerf.field.wrapped import RecolouredField
@@ -25,7 +24,7 @@ DARK = 0.02  # radiance; less is no sky by day
 LIKE_SKY = 0.4  # of the logarithms of a colour over the sky's
 MAX_ALBEDO = 0.9  # white paint
 MAX_LEAF_ALBEDO = 0.5  # yellow leaves in autumn
-SHOULDER, BRIGHTEST = 0.7, 6.0  # of these bounds, see `bounded`
+SHOULDER, BRIGHTEST = 0.8, 6.0  # of these bounds, see `bounded`
 SHADIEST = 1 / 3  # of the light in the open; what is known of places is less certain
 SHARED = 0.4  # m along a ray, within which samples share the change of their light
 
@@ -83,8 +82,7 @@ class RelitField(RecolouredField):
 
         A fit puts haze of the sky's colour around twigs that are finer than a pixel.
         """
-        photographed = self.old.reflected_sky(d, self.field.sky(d))
-        old = photographed.clamp(DARK, 1.0)  # photos show no more than white
+        old = self.old.radiance(d).clamp(DARK, 1.0)  # photos show no more than white
         off = (colour.clamp(DARK, 1.0) / old).log().square().sum(-1)
         like = torch.exp(-off / (2 * LIKE_SKY**2))[:, None]
         return relit + like * (self.new.radiance(d) - relit)
@@ -95,8 +93,8 @@ class RelitField(RecolouredField):
         x: Float[Tensor, "s 3"],
         normal: Float[Tensor, "s 3"],
         kind: Int[Tensor, "s"],
-    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s"]]:
-        """New over old irradiance, and what a channel of surfaces sends at most in the new light.
+    ) -> tuple[Float[Tensor, "s 3"], Float[Tensor, "s 3"]]:
+        """New over old irradiance, and the bound on the radiance of surfaces in the new light.
 
         Far trees in a sun that was not found would glow under an overcast sky. Under the sky of the
         photos they are right, whatever light was found, and the bound is infinite.
@@ -124,12 +122,12 @@ class RelitField(RecolouredField):
             old = old + direct
         ratio = (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
         if not self.new_sky:
-            return ratio, torch.full_like(ratio[:, 0], math.inf)
+            return ratio, torch.full_like(ratio, math.inf)
         # Normals err. A surface receives as much as level ground, or more.
         up = torch.zeros_like(normal)
         up[:, 2] = 1.0
-        light = torch.maximum(luma(new), luma(self.new.irradiance(x, up)))
-        albedo = torch.where(kind == LEAVES, MAX_LEAF_ALBEDO, MAX_ALBEDO)
+        light = torch.maximum(new, self.new.irradiance(x, up))
+        albedo = torch.where(kind == LEAVES, MAX_LEAF_ALBEDO, MAX_ALBEDO)[:, None]
         return ratio, albedo * light.clamp_min(SHADIEST * self.white * math.pi) / math.pi
 
     def _mended(
@@ -157,13 +155,13 @@ class RelitField(RecolouredField):
         return self.new.radiance(d) if self.new_sky else self.field.sky(d, appearance)
 
 
-def bounded(radiance: Float[Tensor, "s 3"], most: Float[Tensor, "s"]) -> Float[Tensor, "s 3"]:
-    """The same radiance, but for its brightest channel where that is near or above a bound.
+def bounded(radiance: Float[Tensor, "s 3"], most: Float[Tensor, "s 3"]) -> Float[Tensor, "s 3"]:
+    """The same colours, darker where a channel is near or above its bound.
 
-    From `SHOULDER` of the bound on it rises with the logarithm, up to the bound at `BRIGHTEST` of
-    it: what was estimated too bright keeps its texture.
+    From `SHOULDER` of the bound on that channel rises with the logarithm, up to the bound at
+    `BRIGHTEST` of it: what was estimated too bright keeps its texture.
     """
-    over = radiance.amax(-1).clamp_min(DARKEST) / (SHOULDER * most)  # black: log 0; infinite: 0
+    over = (radiance / (SHOULDER * most.clamp_min(DARKEST))).amax(-1)  # without light: 0/0
     slope = (1 / SHOULDER - 1) / math.log(BRIGHTEST / SHOULDER)
     kept = (1 + slope * over.clamp_min(1).log()).clamp(max=1 / SHOULDER) / over.clamp_min(1)
     return radiance * kept[:, None]

@@ -21,7 +21,7 @@ from climatenerf.weather.light.sun_map import SunMap
 BOUNCES = 2  # repetitions in which surfaces are lit anew by the surfaces around them
 MAX_MEDIAN_ALBEDO = 0.3  # of the surfaces of a place
 SATURATION = 0.3  # of their colour that is kept in the light that they reflect onto others
-MOST_TINT = 0.15  # of the logarithm of a channel over luma: red over blue from .74 to 1.35
+MAX_TINT = 0.15  # of the logarithm of a channel over luma: red over blue from .74 to 1.35
 OFF_SURFACE = 0.15  # m; where the light of a surface is looked up, clear of its own density
 DARKEST = 1e-4  # irradiance over pi; nothing real is darker, and ratios stay finite
 MOST = 16.0  # factor by which light may change at one place
@@ -38,10 +38,11 @@ class SceneLight:
     Attributes:
         grid: where the probes are.
         coefficients: of the irradiance by the sky and by surfaces, for each probe.
-        radiance: of the sky without a hard sun, by direction.
+        radiance: of the sky without a hard sun, by direction, as pictures show it.
         sun_irradiance: of a hard sun across its rays; 0 without one.
         sun: its map; None without one.
         captured: the light of the photos, if it is theirs.
+        balance: gains of the sky's channels where its light falls on surfaces.
     """
 
     grid: ProbeGrid
@@ -50,6 +51,7 @@ class SceneLight:
     sun_irradiance: Float[Tensor, "3"]
     sun: SunMap | None
     captured: CapturedLight | None = None
+    balance: float | Float[Tensor, "3"] = 1.0
 
     def irradiance(
         self,
@@ -105,7 +107,7 @@ class SceneLight:
         d = d[d[:, 2] > 0]
         sky = self.radiance(d) * d[:, 2:] * (4 * math.pi / SKY_DIRECTIONS)
         sun = 0.0 if self.sun is None else max(float(self.sun.direction[2]), 0.0)
-        return sky.sum(0) + sun * self.sun_irradiance
+        return self.balance * sky.sum(0) + sun * self.sun_irradiance
 
     def reflected_sky(
         self, d: Float[Tensor, "n 3"], sky: Float[Tensor, "n 3"]
@@ -137,12 +139,13 @@ def light_of_photos(
     radiance: Radiance,
     sun_irradiance: Float[Tensor, "3"],
     sun: SunMap | None,
+    balance: float | Float[Tensor, "3"] = 1.0,
 ) -> SceneLight:
     """The light in which the photos were taken: surfaces send what photos show of them."""
-    sky = _sky_in(gathered, radiance)
+    sky = balance * _sky_in(gathered, radiance)
     arriving = gathered.through[..., None] * sky + gathered.radiance
     coefficients = gathered.coefficients(arriving)
-    return SceneLight(gathered.grid, coefficients, radiance, sun_irradiance, sun)
+    return SceneLight(gathered.grid, coefficients, radiance, sun_irradiance, sun, balance=balance)
 
 
 @dataclass(frozen=True)
@@ -172,7 +175,7 @@ def relit(
         new: the new sky and sun; its coefficients are computed here.
         surfaces: snow on the surfaces; None: they stay as they are.
     """
-    sky = gathered.through[..., None] * _sky_in(gathered, new.radiance)
+    sky = gathered.through[..., None] * (new.balance * _sky_in(gathered, new.radiance))
     x, normal = gathered.x.reshape(-1, 3), gathered.normal.reshape(-1, 3)
     hit = (normal != 0).any(-1).nonzero()[:, 0]
     x, normal = x[hit], normal[hit]
@@ -199,14 +202,17 @@ def relit(
 def camera_balance(irradiance: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Gains of the channels that bound the tint of the photos' light, which cameras balance.
 
+    They keep its luma.
+
     A blue sky that shows between yellow leaves is not the colour of the light below them. Cameras
     leave a part of a light's tint; the logarithm of each channel over luma is bounded smoothly.
 
     Args:
         irradiance: of level ground in the open, as found.
     """
+    irradiance = irradiance.clamp_min(DARKEST * math.pi)  # a channel without light: log 0
     tint = (irradiance / luma(irradiance)).log()
-    gain = (MOST_TINT * torch.tanh(tint / MOST_TINT) - tint).exp()
+    gain = (MAX_TINT * torch.tanh(tint / MAX_TINT) - tint).exp()
     return gain * (luma(irradiance) / luma(gain * irradiance))
 
 

@@ -14,10 +14,10 @@ DARK = 2e-3  # radiance; photos show nothing below
 DIRECTIONS = 384  # over the whole sphere
 CLOUDS = 60  # independent patches of the sky that photos show
 SKY_ERROR = 0.08  # of log radiance, by clouds
-GROUND_ALBEDO = 0.18  # a grey card, the log-average of photos (Reinhard et al. 2002)
+GROUND_ALBEDO = 0.18  # a grey card; assumed of the log-average of level ground
 ALBEDO_SPREAD = 0.5  # of its log: asphalt and grass .1, concrete .3
-RATIO_SPREAD = 0.35  # of the log of zenith over horizon: clear .25 to .5, overcast 3
-LOBE_RATIO, LOBE_RATIO_SPREAD = -0.2, 0.1  # of a sky with a bright lobe, see `fit_sky`
+ANY_SKY = 0.0, 0.35  # log of zenith over horizon and its spread: clear .25 to .5, overcast 3
+GLOWING_SKY = -0.2, 0.1  # the same with a bright lobe, see `fit_sky`
 TYPICAL_WIDTH, WIDTH_SPREAD = np.radians(20.0), 0.5  # of a sun behind thin cloud; of its log
 WHITE = np.ones(3)
 
@@ -39,7 +39,11 @@ class SkyModel:
 
 
 def fit_sky(
-    d: Float[np.ndarray, "n 3"], radiance: Float[np.ndarray, "n 3"], ground: float, lobe: bool
+    d: Float[np.ndarray, "n 3"],
+    radiance: Float[np.ndarray, "n 3"],
+    ground: float = 0.0,
+    lobe: bool = False,
+    ratio: tuple[float, float] | None = None,
 ) -> SkyModel:
     """Fit base and lobe to the sky that photos show, which clip at white.
 
@@ -56,7 +60,10 @@ def fit_sky(
         radiance: of the fitted sky there.
         ground: log-average luma of level ground that photos show; 0: unknown.
         lobe: whether there is a lobe besides the base.
+        ratio: expected log of zenith over horizon, and its standard deviation; None: `GLOWING_SKY`
+            with a lobe, else `ANY_SKY`.
     """
+    middle, spread = ratio or (GLOWING_SKY if lobe else ANY_SKY)
     rgb = np.minimum(radiance, 1.0)
     brightness = np.maximum(rgb @ LUMA, DARK)
     grid = gathering_directions()
@@ -74,8 +81,7 @@ def fit_sky(
         shown = np.log(np.minimum(model(p, d), 1.0)) - np.log(brightness)
         level = (model(p, grid) * grid[:, 2]).sum() * 4 * np.pi / DIRECTIONS
         expected = np.log(level / np.pi * GROUND_ALBEDO / ground) if ground > 0 else 0.0
-        ratio = (p[1] - LOBE_RATIO) / LOBE_RATIO_SPREAD if lobe else p[1] / RATIO_SPREAD
-        prior = [ratio, expected / ALBEDO_SPREAD]
+        prior = [(p[1] - middle) / spread, expected / ALBEDO_SPREAD]
         if lobe:
             prior.append((p[4] - np.log(TYPICAL_WIDTH)) / WIDTH_SPREAD)
         return np.concatenate([share * shown, prior])

@@ -44,7 +44,8 @@ def under_season(season: Season, style: Style | None, light: SceneLight) -> Scen
     colour = light.sun_irradiance.new_tensor(palette.colour) * level
     radiance = functools.partial(_mixed, light.radiance, share, colour, palette.gradient)
     beam = (1 - share) * light.sun_irradiance
-    return replace(light, radiance=radiance, sun_irradiance=beam, captured=None)
+    balance = (1 - share) * light.balance + share  # the season's sky has the colour that it has
+    return replace(light, radiance=radiance, sun_irradiance=beam, captured=None, balance=balance)
 
 
 def _mixed(

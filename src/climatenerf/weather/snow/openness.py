@@ -21,6 +21,7 @@ from climatenerf.weather.snow.surface_fit import depth_crossings
 
 LEAF = int(SOLID_OF[VEGETATION])
 RAYS = 12  # from each node
+ENDS = 0.3  # optical depth at which what hides the sky is looked at; thin foliage counts
 REACH = 3.0  # m
 NODE = 0.18  # m between nodes
 PROBES = 0.8  # m, standard deviation of how probes 2 m apart blur the light
@@ -98,15 +99,15 @@ def _light(field: RadianceField, x: Float32[np.ndarray, "n 3"]) -> Float[np.ndar
 def openness_of(
     field: RadianceField, x: Float32[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Fractions of even light from above at level surfaces.
+    """Openness of level surfaces to even light from above, and what the rest returns.
 
     Args:
         field: the fitted field.
         x: positions, world m. What is further away than `REACH` does not count.
 
     Returns:
-        The fraction that arrives, `DARKEST` at least, and the fraction that is hidden, times the
-        reflectance of what hides it.
+        The fraction that arrives, `DARKEST` at least, and the hidden fraction times the
+        reflectance of the matter there.
     """
     device = device_of(field)
     directions = to_device(cosine_directions(RAYS), device)
@@ -124,7 +125,7 @@ def openness_of(
             to_numpy(samples.dt),
             to_numpy(samples.sigma),
             np.zeros(len(rays_o)),
-            np.array([math.log(2)]),
+            np.array([ENDS]),
         )
         # NaN where a ray goes on.
         end = rays_o + to_device(ends.astype(np.float32), device) * rays_d
