@@ -32,6 +32,26 @@ def test_overcast_irradiance_on_ground_and_wall():
     assert level == pytest.approx(0.3 + 21 * math.sin(math.radians(40)), rel=0.005), "klx"
 
 
+def test_snowy_ground_brightens_the_cloud_above_it():
+    """Bounce after bounce between ground and cloud, by hand; each comes back evenly."""
+    d, solid = half_sphere()
+    dry = skies.overcast_sky(d, math.radians(40))[:, 1].double()
+    snowy = skies.overcast_sky(d, math.radians(40), 0.8)[:, 1].double()
+    first = float((dry * d[:, 2]).sum()) * solid
+    even, arriving = 0.0, first
+    for _ in range(60):
+        arriving *= (0.8 - skies.USUAL_GROUND) * skies.CLOUD_BASE
+        even += arriving
+    level = float((snowy * d[:, 2]).sum()) * solid
+    assert level == pytest.approx(first + even, rel=0.005)
+    torch.testing.assert_close(snowy - dry, torch.full_like(dry, even / math.pi), rtol=0.01, atol=0)
+    horizon = float(snowy[d[:, 2] < 0.01].mean())
+    assert horizon / (0.9 * level / math.pi) > 0.65, "nearly as bright as the snow"
+    covered = NewSky("clear", SUN, 1.0, 0.8)
+    assert torch.equal(covered.radiance(d), NewSky("overcast", SUN, ground=0.8).radiance(d))
+    assert torch.equal(NewSky("clear", SUN, 0.0, 0.8).radiance(d), NewSky("clear", SUN).radiance(d))
+
+
 def test_general_sky_equals_its_formula():
     """CIE S 011 type 12, evaluated by hand in one direction."""
     d = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]], dtype=torch.float64)

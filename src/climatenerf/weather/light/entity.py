@@ -16,6 +16,7 @@ from torch import Tensor
 from climatenerf.core.colour import luma
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
+from climatenerf.core.srgb import LUMA
 from climatenerf.field.capabilities import NORMALS
 from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField, device_of, observed
@@ -59,6 +60,7 @@ DARKEST = 1e-3  # luminance whose logarithm is taken
 SNOW_RADIANCE = 0.5, 0.85  # limits of the median radiance of snow on level ground; 1 is white
 SUNLIT_RADIANCE = 1.2  # limit of the radiance of the brightest tenth of it: sun between shadows
 LEVEL = 0.7  # z of normals of level ground
+COUNTRY = 0.75  # of the country around, which snow covers where it covers level ground
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
 
@@ -241,7 +243,7 @@ class LightEntity:
         if weather.sky.kind == "captured":
             changed = under_season(weather.season, self._given.style, old)
             return relit(self._surfaces, old, below_smog(weather, changed), surfaces)
-        sky = self._sky(weather)
+        sky = self._sky(weather, cover)
         direct = torch.tensor(sky.sun_irradiance, device=device_of(self._given.field))
         shadow = self._sun_map(np.array(sky.sun)) if bool((direct > 0).any()) else None
 
@@ -275,7 +277,7 @@ class LightEntity:
             light, to_device(eyes.astype(np.float32), device_of(self._given.field))
         )
 
-    def _sky(self, weather: Weather) -> skies.NewSky:
+    def _sky(self, weather: Weather, cover: float) -> skies.NewSky:
         elevation, azimuth = weather.sun.elevation, weather.sun.azimuth
         captured = self.captured
         if captured is not None and captured.sun is not None:
@@ -288,7 +290,9 @@ class LightEntity:
         azimuth = 0.0 if azimuth is None else azimuth
         flat = math.cos(elevation)
         sun = (flat * math.sin(azimuth), flat * math.cos(azimuth), math.sin(elevation))
-        return skies.NewSky(weather.sky.kind, sun, weather.sky.cover)
+        white = float(np.dot(LUMA, _whiteness(weather)))
+        ground = skies.USUAL_GROUND + COUNTRY * cover * (white - skies.USUAL_GROUND)
+        return skies.NewSky(weather.sky.kind, sun, weather.sky.cover, ground)
 
     def _gain(
         self, weather: Weather, old: SceneLight, new: SceneLight, gain: float, cover: float

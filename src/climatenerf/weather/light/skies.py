@@ -27,6 +27,8 @@ SUNLIGHT = (1.05, 0.99, 0.93)  # of the sun above the air, in linear sRGB of lum
 WHITE = (1.0, 1.0, 1.0)
 STORM_TINT = (0.86, 1.0, 1.12)  # thick cloud absorbs red light first
 STORM_SHARE = 0.2  # of an overcast sky's light
+CLOUD_BASE = 0.6  # reflectance of thick cloud for light from below
+USUAL_GROUND = 0.2  # reflectance of the ground, of which the CIE's skies have the light already
 DUSK_ELEVATION = math.radians(-2.5)  # of the sun, unless another one is given
 NIGHT = math.radians(-12.0)  # elevation of the sun below which `dusk` ends
 
@@ -39,11 +41,13 @@ class NewSky:
         kind: "overcast", "clear", "storm" or "dusk".
         sun: unit vector towards the sun.
         cover: fraction of a clear sky that cloud hides, [0, 1].
+        ground: mean reflectance of the country around, whose light clouds send back.
     """
 
     kind: str
     sun: tuple[float, float, float]
     cover: float = 0.0
+    ground: float = USUAL_GROUND
 
     @property
     def sun_irradiance(self) -> tuple[float, float, float]:
@@ -62,11 +66,12 @@ class NewSky:
     def radiance(self, d: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Radiance in unit directions without the sun's disc; below the horizon as on it."""
         if self.kind == "clear":
-            clear, cloudy = clear_sky(d, self.sun), overcast_sky(d, self.elevation)
+            clear = clear_sky(d, self.sun)
+            cloudy = overcast_sky(d, self.elevation, self.ground)
             return (1 - self.cover) * clear + self.cover * cloudy
         if self.kind == "dusk":
             return dusk_sky(d, self.sun)
-        cloudy = overcast_sky(d, self.elevation)
+        cloudy = overcast_sky(d, self.elevation, self.ground)
         if self.kind == "storm":
             return STORM_SHARE * cloudy * d.new_tensor(STORM_TINT)
         return cloudy
@@ -96,15 +101,22 @@ def cie_luminance(
     return here / (gradation(up[:, 2], a, b) * indicatrix(from_sun, c, e, f))
 
 
-def overcast_sky(d: Float[Tensor, "n 3"], elevation: float) -> Float[Tensor, "n 3"]:
-    """The CIE standard overcast sky, L_z (1 + 2 sin h)/3, without colour.
+def overcast_sky(
+    d: Float[Tensor, "n 3"], elevation: float, ground: float = USUAL_GROUND
+) -> Float[Tensor, "n 3"]:
+    """The CIE standard overcast sky, L_z (1 + 2 sin h)/3, without colour, over usual ground.
 
     E = 7 pi/9 L_z is the overcast sky's illuminance, .3 + 21 sin(elevation) klx (IESNA RP-21).
+    What ground reflects beyond `USUAL_GROUND` the clouds send back evenly and many times, which
+    makes E/(1 - k) of it and adds the radiance k E/((1 - k) pi), with k the product of both
+    reflectances (Gardiner 1987).
     """
     illuminance = 0.3 + 21 * max(math.sin(elevation), 0.0)
     zenith = illuminance / (7 * math.pi / 9)
+    returned = CLOUD_BASE * (ground - USUAL_GROUND)
+    even = returned / (1 - returned) * illuminance / math.pi
     shape = (1 + 2 * d[:, 2].clamp(0, 1)) / 3
-    return zenith * shape[:, None] * d.new_tensor(WHITE)
+    return (zenith * shape + even)[:, None] * d.new_tensor(WHITE)
 
 
 def clear_sky(d: Float[Tensor, "n 3"], sun: tuple[float, float, float]) -> Float[Tensor, "n 3"]:
