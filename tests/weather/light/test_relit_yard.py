@@ -189,6 +189,18 @@ def test_a_blue_sky_lights_the_place_less_blue_than_it_is_shown():
     torch.testing.assert_close(begun.sky(up), field.sky(up), rtol=0.01, atol=1e-3)
 
 
+def test_clouds_over_snow_send_its_light_back(overcast):
+    """The horizon is a third as bright as the zenith over grass, and more than half over snow."""
+    d = torch.nn.functional.normalize(torch.tensor([[1.0, 0.0, 0.05], [0.0, 0.0, 1.0]]), dim=-1)
+    snowy = session(sunlit_yard(), sky={"kind": "overcast"}, snow={"depth": "10 cm"})
+    dry, wet = (
+        float(luma(run.world(0.0).light.radiance(d))[0] / luma(run.world(0.0).light.radiance(d))[1])
+        for run in (overcast, snowy)
+    )
+    assert dry == pytest.approx(1.1 / 3, abs=0.01)
+    assert 0.5 < wet < 0.65
+
+
 def test_haze_of_the_old_sky_around_leaves_shows_the_new_sky(overcast):
     """Leaves of their own colour, walls as white as the sky, and what is seen from above stay."""
     relit = overcast.world(0.0).field
