@@ -60,7 +60,7 @@ DARKEST = 1e-3  # luminance whose logarithm is taken
 SNOW_RADIANCE = 0.5, 0.85  # limits of the median radiance of snow on level ground; 1 is white
 SUNLIT_RADIANCE = 1.2  # limit of the radiance of the brightest tenth of it: sun between shadows
 LEVEL = 0.7  # z of normals of level ground
-COUNTRY = 0.75  # of the country around, which snow covers where it covers level ground
+COUNTRY = 0.75  # fraction of the country around that snow covers if it covers level ground
 COVER_STEPS = 20  # of the snow's cover, in which light is computed anew
 
 

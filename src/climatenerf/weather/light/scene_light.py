@@ -200,9 +200,7 @@ def relit(
 
 
 def camera_balance(irradiance: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Gains of the channels that bound the tint of the photos' light, which cameras balance.
-
-    They keep its luma.
+    """Gains of the channels that bound the tint of the photos' light and keep its luma.
 
     A blue sky that shows between yellow leaves is not the colour of the light below them. Cameras
     leave a part of a light's tint; the logarithm of each channel over luma is bounded smoothly.

@@ -107,9 +107,9 @@ def overcast_sky(
     """The CIE standard overcast sky, L_z (1 + 2 sin h)/3, without colour, over usual ground.
 
     E = 7 pi/9 L_z is the overcast sky's illuminance, .3 + 21 sin(elevation) klx (IESNA RP-21).
-    What ground reflects beyond `USUAL_GROUND` the clouds send back evenly and many times, which
-    makes E/(1 - k) of it and adds the radiance k E/((1 - k) pi), with k the product of both
-    reflectances (Gardiner 1987).
+    Clouds send back evenly, and many times, what the ground reflects beyond `USUAL_GROUND`: the
+    illuminance becomes E/(1 - k), and the radiance k E/((1 - k) pi) is added in all directions,
+    with k = `CLOUD_BASE` (ground - `USUAL_GROUND`) (Gardiner 1987).
     """
     illuminance = 0.3 + 21 * max(math.sin(elevation), 0.0)
     zenith = illuminance / (7 * math.pi / 9)

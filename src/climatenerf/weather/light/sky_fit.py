@@ -43,7 +43,6 @@ def fit_sky(
     radiance: Float[np.ndarray, "n 3"],
     ground: float = 0.0,
     lobe: bool = False,
-    ratio: tuple[float, float] | None = None,
 ) -> SkyModel:
     """Fit base and lobe to the sky that photos show, which clip at white.
 
@@ -60,10 +59,8 @@ def fit_sky(
         radiance: of the fitted sky there.
         ground: log-average luma of level ground that photos show; 0: unknown.
         lobe: whether there is a lobe besides the base.
-        ratio: expected log of zenith over horizon, and its standard deviation; None: `GLOWING_SKY`
-            with a lobe, else `ANY_SKY`.
     """
-    middle, spread = ratio or (GLOWING_SKY if lobe else ANY_SKY)
+    middle, spread = GLOWING_SKY if lobe else ANY_SKY
     rgb = np.minimum(radiance, 1.0)
     brightness = np.maximum(rgb @ LUMA, DARK)
     grid = gathering_directions()
