@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from support.holed_ground import LabelledField
 
+from climatenerf.core.classes import ROAD
 from climatenerf.core.colour import luma
 from climatenerf.field.analytic import AnalyticField, Box, HalfSpace
 from climatenerf.field.spherical_harmonics import harmonics
@@ -141,7 +143,7 @@ def test_the_balance_of_cameras_is_that_of_the_skys_light_alone(gathered):
 def test_white_ground_brightens_a_wall(gathered):
     """Even sky, ground .2 to .87: a wall receives (1 + .87)/(1 + .2) = 1.56 times the light."""
     old = light_of_photos(gathered, even(1.0), no_sun(), None)
-    snow = Surfaces(lambda up: (up > 0.8).float(), 0.87)
+    snow = Surfaces(lambda up, _: (up > 0.8).float(), 0.87)
     new = relit(gathered, old, old, snow)
     x, wall = torch.tensor([[0.3, 0.2, 1.7]]), torch.tensor([[1.0, 0.0, 0.0]])
     ratio = float((new.irradiance(x, wall) / old.irradiance(x, wall))[0, 0])
@@ -164,10 +166,35 @@ def test_white_ground_under_the_overcast_sky():
     )
     gathered = gather(field, torch.tensor([0.0, 0.0, 1.6]), 2.0, 0.0)
     old = light_of_photos(gathered, cie, no_sun(), None)
-    new = relit(gathered, old, old, Surfaces(lambda up: (up > 0.8).float(), 0.85))
+    new = relit(gathered, old, old, Surfaces(lambda up, _: (up > 0.8).float(), 0.85))
     x, wall = torch.tensor([[0.3, 0.2, 1.7]]), torch.tensor([[0.0, 1.0, 0.0]])
     ratio = float((new.irradiance(x, wall) / old.irradiance(x, wall))[0, 0])
     assert ratio == pytest.approx(1.80, rel=0.05)
+
+
+def test_probes_below_the_ground_do_not_count():
+    """Whatever colour its underside has; here it is glaring blue from below."""
+
+    class BlueBelow(LabelledField):
+        def colour(self, x, d, ray=None, *, ids=None, appearance=None):
+            seen = super().colour(x, d, ray, ids=ids, appearance=appearance)
+            below = (d if ray is None else d[ray])[:, 2:] > 0
+            return torch.where(below, seen.new_tensor([0.1, 0.5, 3.0]), seen)
+
+    field = BlueBelow(
+        [Box((-60.0, -60.0, -0.2), (60.0, 60.0, 0.0), (0.2,) * 3)],
+        classes=[ROAD],
+        box=((-60, -60, -2.5), (60, 60, 12)),
+    )
+    gathered = gather(field, torch.tensor([0.0, 0.0, 1.6]), 2.0, 0.0)
+    assert gathered.grid.valid.any()
+    z = gathered.grid.origin[2] + gathered.grid.spacing[2] * torch.arange(gathered.grid.shape[2])
+    layers = gathered.grid.valid.view(gathered.grid.shape[::-1])
+    assert not layers[z < 0].any() and layers[z > 0].all()
+    old = light_of_photos(gathered, even(1.0), no_sun(), None)
+    new = relit(gathered, old, old, Surfaces(lambda up, _: (up > 0.8).float(), 0.87))
+    seen = new.irradiance(torch.tensor([[0.3, 0.2, 0.02]]), UP)[0]
+    assert seen.numpy() == pytest.approx(math.pi, rel=0.03)
 
 
 def test_the_same_light_changes_nothing(gathered):

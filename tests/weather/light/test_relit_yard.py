@@ -355,9 +355,12 @@ def test_half_a_cover_of_snow_lights_a_wall_half_as_much():
     assert 0.4 < float((some - dry) / (most - dry)) < 0.6
 
 
-def test_snow_covers_surfaces_by_their_slope():
-    cosine = torch.tensor([1.0, math.cos(math.radians(45)), 0.3, -1.0])
-    assert entity.snow_cover(Snow(), 0.8, cosine) == pytest.approx([0.8, 0.4, 0, 0], abs=1e-6)
+@pytest.mark.parametrize(("ground", "at_45"), [(False, 0.4), (True, 0.8)])
+def test_snow_covers_surfaces_by_their_slope(ground, at_45):
+    """A roof of 45 degrees keeps half of it, and a grassy bank all."""
+    cosine = torch.tensor([1.0, math.cos(math.radians(45)), 0.2, -1.0])
+    covered = entity.snow_cover(Snow(), 0.8, cosine, torch.full((4,), ground))
+    assert covered == pytest.approx([0.8, at_45, 0, 0], abs=1e-6)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.colour import luma
@@ -48,7 +48,7 @@ from climatenerf.weather.light.sun_map import SunMap, sun_map
 from climatenerf.weather.season.sky import sky_of, under_season
 from climatenerf.weather.smog.medium import sigma_of
 from climatenerf.weather.smog.scattering import sun_transmittance
-from climatenerf.weather.snow.cover import slope_share
+from climatenerf.weather.snow.cover import ground_share, slope_share
 from climatenerf.weather.snow.optics import albedo_of, slab_reflectance
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
@@ -383,9 +383,20 @@ class LightEntity:
         return found
 
 
-def snow_cover(snow: Snow, cover: float, up: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
-    """Fraction of surfaces with normals of z `up` that snow hides; `cover` on level ground."""
-    return cover * to_device(slope_share(to_numpy(up), snow), up.device)
+def snow_cover(
+    snow: Snow, cover: float, up: Float[Tensor, "*n"], ground: Bool[Tensor, "*n"]
+) -> Float[Tensor, "*n"]:
+    """Fraction of surfaces that snow hides; `cover` of level ones.
+
+    Args:
+        snow: its slopes.
+        cover: of level ground.
+        up: z of the surfaces' unit normals.
+        ground: whether they lie on the ground, where steeper slopes keep snow.
+    """
+    cosine = to_numpy(up)
+    share = np.where(to_numpy(ground), ground_share(cosine, snow), slope_share(cosine, snow))
+    return cover * to_device(share.astype(np.float32), up.device)
 
 
 def below_smog(weather: Weather, light: SceneLight) -> SceneLight:

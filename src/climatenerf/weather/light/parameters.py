@@ -45,7 +45,7 @@ SKY = Effect(
     parameters=Sky,
     enabled_by=(),
     prepare="climatenerf.weather.light.entity:prepare",
-    version="3",
+    version="4",
     always=True,
     only_with=(("cover", "kind", ("clear",)), ("exposure", "kind", _NEW), ("ev", "kind", _NEW)),
 )

@@ -12,11 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
+from climatenerf.core.classes import GROUND, SOLID_OF
 from climatenerf.core.device import to_numpy
+from climatenerf.field.capabilities import CLASSES
 from climatenerf.field.compositing import chunks, composited
 from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField
@@ -31,6 +33,7 @@ HEIGHT = (-0.7, 9.8)  # m from the lowest ground
 STEP = 5.0  # marching step of the rays, which blur
 NEAR_MATTER = 0.25  # m; a probe with matter so near in most directions lies inside it
 INSIDE = 0.5  # fraction of such directions
+ABOVE = 0.3  # z of directions in which a probe that meets the ground mostly lies below it
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,9 @@ class GatheredLight:
         radiance: light that surfaces send in the photos, through all samples of a ray.
         x: middle of what a ray meets, world m.
         normal: its normal; 0 where a ray meets nothing.
-        source: for each probe the one whose light it has: the nearest one outside matter.
+        ground: whether it is of a class that lies on the ground.
+        source: for each probe the one whose light it has: the nearest one above the ground and
+            outside matter.
     """
 
     grid: ProbeGrid
@@ -53,6 +58,7 @@ class GatheredLight:
     radiance: Float[Tensor, "p k 3"]
     x: Float[Tensor, "p k 3"]
     normal: Float[Tensor, "p k 3"]
+    ground: Bool[Tensor, "p k"]
     source: Int[Tensor, "p"]
 
     def coefficients(self, arriving: Float[Tensor, "p k 3"]) -> Float[Tensor, "p 9 3"]:
@@ -94,6 +100,8 @@ def gather(
     through = torch.empty(count, device=device)
     radiance, x, normal = (torch.zeros(count, 3, device=device) for _ in range(3))
     distance = torch.full((count,), torch.inf, device=device)
+    ground = torch.zeros(count, dtype=torch.bool, device=device)
+    kinds = torch.as_tensor(SOLID_OF[list(GROUND)], device=device)
     for chunk in chunks(rays_o):
         o, d = rays_o[chunk], rays_d[chunk].contiguous()
         start = torch.zeros(len(o), device=device)
@@ -105,15 +113,20 @@ def gather(
         t = length[hit] / (1 - passed[hit])
         ends = o[hit] + t[:, None] * d[hit]
         x[chunk.start + hit], distance[chunk.start + hit] = ends, t
-        normal[chunk.start + hit] = normals_at(field, ends, d[hit])[0]
+        normal[chunk.start + hit], kind = normals_at(field, ends, d[hit])
+        if CLASSES in field.capabilities:
+            ground[chunk.start + hit] = torch.isin(kind, kinds)
         if progress is not None:
             progress(min(chunk.stop / count, 1.0))
     shape = (nodes.shape[0], RAYS)
     inside = (distance.view(shape) < NEAR_MATTER).float().mean(1) > INSIDE
-    grid = ProbeGrid(low, spacing, (nx, ny, nz), ~inside)
+    # Below the ground a field is arbitrary, and light grows without bound between its undersides.
+    above = directions[:, 2] > ABOVE
+    buried = ground.view(shape)[:, above].float().mean(1) > INSIDE
+    grid = ProbeGrid(low, spacing, (nx, ny, nz), ~(inside | buried))
     return GatheredLight(
         grid, directions, through.view(shape), radiance.view(*shape, 3), x.view(*shape, 3),
-        normal.view(*shape, 3), nearest_valid(grid),
+        normal.view(*shape, 3), ground.view(shape), nearest_valid(grid),
     )  # fmt: skip
 
 

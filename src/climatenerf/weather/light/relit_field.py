@@ -16,7 +16,7 @@ from climatenerf.field.grouping import shared_lookups
 from climatenerf.field.normals import normals_at
 from climatenerf.field.wrapped import RecolouredField
 from climatenerf.weather.light.reference_albedo import ReferenceAlbedo
-from climatenerf.weather.light.scene_light import DARKEST, MOST, SceneLight
+from climatenerf.weather.light.scene_light import DARKEST, MAX_CHANGE, SceneLight
 
 LEAVES = int(SOLID_OF[VEGETATION])
 HORIZON = -0.05  # sine of the elevation above which a ray may have sky behind it
@@ -120,7 +120,7 @@ class RelitField(RecolouredField):
             else:
                 new = new + self.new.direct(x, normal)
             old = old + direct
-        ratio = (new / old).clamp(self.brighter / MOST, self.brighter * MOST)
+        ratio = (new / old).clamp(self.brighter / MAX_CHANGE, self.brighter * MAX_CHANGE)
         if not self.new_sky:
             return ratio, torch.full_like(ratio, math.inf)
         # Normals err. A surface receives as much as level ground, or more.

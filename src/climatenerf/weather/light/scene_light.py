@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from climatenerf.core.colour import luma
@@ -24,7 +24,7 @@ SATURATION = 0.3  # of their colour that is kept in the light that they reflect 
 MAX_TINT = 0.15  # of the logarithm of a channel over luma: red over blue from .74 to 1.35
 OFF_SURFACE = 0.15  # m; where the light of a surface is looked up, clear of its own density
 DARKEST = 1e-4  # irradiance over pi; nothing real is darker, and ratios stay finite
-MOST = 16.0  # factor by which light may change at one place
+MAX_CHANGE = 16.0  # factor by which light may change at one place
 SKY_DIRECTIONS = 4096
 Y_00 = 0.28209479177387814  # the constant spherical harmonic
 
@@ -153,11 +153,12 @@ class Surfaces:
     """How weather changes what surfaces send back.
 
     Attributes:
-        cover: fraction of a surface that snow covers, from its normal's z.
+        cover: fraction of a surface that snow covers, from its normal's z and from whether it is
+            of a class that lies on the ground.
         albedo: of that snow.
     """
 
-    cover: Callable[[Float[Tensor, "*n"]], Float[Tensor, "*n"]]
+    cover: Callable[[Float[Tensor, "*n"], Bool[Tensor, "*n"]], Float[Tensor, "*n"]]
     albedo: Float[Tensor, "3"]
 
 
@@ -185,10 +186,12 @@ def relit(
     usual = float(luma(new.open_irradiance()) / luma(old.open_irradiance()))
     light = replace(new, coefficients=gathered.coefficients(sky + brighter * gathered.radiance))
     opacity = (1 - gathered.through).reshape(-1)[hit, None]
-    cover = None if surfaces is None else surfaces.cover(normal[:, 2])[:, None]
+    cover = None
+    if surfaces is not None:
+        cover = surfaces.cover(normal[:, 2], gathered.ground.reshape(-1)[hit])[:, None]
     for _ in range(BOUNCES):
         now = light.irradiance(x, normal)
-        sent = photographed[hit] * (now / before).clamp(usual / MOST, usual * MOST)
+        sent = photographed[hit] * (now / before).clamp(usual / MAX_CHANGE, usual * MAX_CHANGE)
         if surfaces is not None and cover is not None:
             white = opacity * (surfaces.albedo / math.pi) * now
             sent = (1 - cover) * sent + cover * white
