@@ -12,6 +12,7 @@ from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
 from climatenerf.core.srgb import to_display
 from climatenerf.evaluation import baselines, geometry, weather_scores
+from climatenerf.evaluation.baseline_rendering import painted_snow
 from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.consistency import Frame, bilinear, warp_error
 from climatenerf.evaluation.evaluated_run import depth_spread
@@ -316,6 +317,18 @@ def test_tuning_recovers_the_constants_of_synthetic_truth():
     true = [np.round(255 * painted).astype(np.uint8)]
     white = baselines.tuned_colour([view.linear * (1 - coverage[..., None])], [coverage], true)
     np.testing.assert_allclose(white, colour, atol=0.01)
+
+
+def test_painted_snow_keeps_what_the_mask_leaves_and_finds_the_paint():
+    view, colour = analytic_view(), np.array([0.8, 0.7, 0.6])
+    mask = 0.5 * baselines.snow_coverage(view)
+    truth = to_display(baselines.overlay(view.linear, mask, colour))
+    true = [np.round(255 * truth).astype(np.uint8)]
+    (painted,) = painted_snow([view.linear], [mask], true)
+    assert np.abs(painted.astype(int) - true[0]).max() <= 2
+    free = mask < 1e-6
+    assert free.any()
+    np.testing.assert_array_equal(painted[free], true[0][free])
 
 
 def test_screen_reflection_finds_visible_surfaces_and_the_sky():

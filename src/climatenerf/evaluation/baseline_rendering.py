@@ -89,6 +89,24 @@ def tune(
     return Constants(sigma, water, water_body, snow)
 
 
+def painted_snow(
+    bare: list[Float[np.ndarray, "h w 3"]],
+    masks: list[Float[np.ndarray, "h w"]],
+    true: list[Picture],
+) -> list[Picture]:
+    """White paint where our snow lies, on our own pictures: what its light and shape add.
+
+    Args:
+        bare: linear pictures of the place in the light that snow returns, without the snow.
+        masks: fraction of each pixel that shows our snow.
+        true: display pictures of the same views, to which the colour of the paint is fitted.
+    """
+    rest = [base * (1 - mask[..., None]) for base, mask in zip(bare, masks, strict=True)]
+    colour = baselines.tuned_colour(rest, masks, true)
+    pictures = (to_display(r + m[..., None] * colour) for r, m in zip(rest, masks, strict=True))
+    return [(255 * picture + 0.5).astype(np.uint8) for picture in pictures]
+
+
 def _without(
     views: list[CleanView], coverages: list[Float[np.ndarray, "h w"]]
 ) -> list[Float[np.ndarray, "h w 3"]]:

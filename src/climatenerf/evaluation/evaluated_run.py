@@ -118,10 +118,20 @@ def render_weather(
     run: EvaluatedRun, case: WeatherTruth
 ) -> list[tuple[Float[np.ndarray, "h w 3"], dict[str, np.ndarray]]]:
     """Render the test views in one weather; return linear radiance and layers of each."""
-    cameras = [run.camera(truth) for truth in run.reference.truths]
-    prepared = prepare_weather(run, case.weather, case.time, [c2w for _, c2w in cameras])
-    world = prepared.world(case.time)
-    rendered = [see_frame(world, camera, c2w) for camera, c2w in cameras]
+    return render_world(run, weather_world(run, case))
+
+
+def weather_world(run: EvaluatedRun, case: WeatherTruth) -> World:
+    """Everything that rays can meet in one weather, with detail around the test views."""
+    poses = [run.camera(truth)[1] for truth in run.reference.truths]
+    return prepare_weather(run, case.weather, case.time, poses).world(case.time)
+
+
+def render_world(
+    run: EvaluatedRun, world: World
+) -> list[tuple[Float[np.ndarray, "h w 3"], dict[str, np.ndarray]]]:
+    """Render the test views of a world; return linear radiance and layers of each."""
+    rendered = [see_frame(world, *run.camera(truth)) for truth in run.reference.truths]
     return [(linear.double().numpy(), layers) for linear, layers in rendered]
 
 

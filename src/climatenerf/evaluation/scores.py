@@ -16,7 +16,12 @@ from scipy import ndimage
 from climatenerf.core.samples import MIN_TAU
 from climatenerf.core.srgb import to_display
 from climatenerf.evaluation import baselines, geometry, weather_scores
-from climatenerf.evaluation.baseline_rendering import Constants, render_baseline, tune
+from climatenerf.evaluation.baseline_rendering import (
+    Constants,
+    painted_snow,
+    render_baseline,
+    tune,
+)
 from climatenerf.evaluation.baselines import CleanView
 from climatenerf.evaluation.consistency import Frame, warp_error
 from climatenerf.evaluation.evaluated_run import (
@@ -29,8 +34,9 @@ from climatenerf.evaluation.evaluated_run import (
     display_8bit,
     prepare_weather,
     render_clean,
-    render_weather,
+    render_world,
     transmittance_to,
+    weather_world,
 )
 from climatenerf.evaluation.metrics import psnr, ssim
 from climatenerf.evaluation.reference import Truth, WeatherTruth
@@ -304,7 +310,8 @@ def score_weather(
     """
     truths = run.reference.truths
     cameras = [run.camera(truth) for truth in truths]
-    renders = render_weather(run, case)
+    world = weather_world(run, case)
+    renders = render_world(run, world)
     rendered = [display_8bit(linear) for linear, _ in renders]
     layers = [each for _, each in renders]
     true = [case.picture(truth.name) for truth in truths]
@@ -334,6 +341,11 @@ def score_weather(
         dry = [view.linear for view in views]
         scores.table["walls"][case.name] = weather_scores.wall_scores(ours, dry, true, truths)
         found |= weather_scores.ground_scores(ours, true, truths)
+        bare = [each for each, _ in render_world(run, dataclasses.replace(world, matters=()))]
+        painted = painted_snow(bare, [each["mask_snow"] for each in layers], true)
+        found["psnr_painted"] = picture_scores(painted, true)["psnr"]
+        of_paint = weather_scores.by_view(truths, painted, true)["psnr_no_vegetation"]
+        found["psnr_painted_no_vegetation"] = of_paint
     if SMOG.present(weather.smog) and weather.smog.light == "paper":
         found |= weather_scores.transmittance_scores(
             [each["transmittance"] for each in layers],
