@@ -3,11 +3,12 @@
 python benchmarks/frame_time.py RUN
 python benchmarks/frame_time.py RUN --size 480x270 --path still --repeats 5
 python benchmarks/frame_time.py RUN --sizes 240x135 480x270 960x540 1920x1080
+python benchmarks/frame_time.py RUN --bakes
 
 The flood's level is chosen on a small picture so that water covers 35 to 45 % of the frame; the
 coverage reached is reported. The preparation (light, waves, snowfall) is timed once, separately.
 With --sizes a clean frame of each size is timed, and the exponent of seconds over pixels reported
-(1 is linear).
+(1 is linear). With --bakes the preparation of 10 cm of snow and of 2 m is timed.
 """
 
 import argparse
@@ -23,12 +24,15 @@ import torch
 from climatenerf.cli.render import parse_size
 from climatenerf.core.device import CPU
 from climatenerf.field.checkpoint import load_field
+from climatenerf.field.protocol import observed
 from climatenerf.paths.camera_path import CameraPath, camera_path
 from climatenerf.render.frame import render_frame
 from climatenerf.render.session import RenderSession
 from climatenerf.scene import load_scene
 from climatenerf.weather.flood.parameters import Flood
+from climatenerf.weather.light.parameters import Sky
 from climatenerf.weather.smog.parameters import Smog
+from climatenerf.weather.snow.layer import bake_snow
 from climatenerf.weather.snow.parameters import Snow
 from climatenerf.weather.weather import Weather
 from climatenerf.weather.world import World
@@ -49,7 +53,7 @@ def water_level(field, scene, path: CameraPath, coverage: float = 0.4) -> float:
     return float(min(np.quantile(height, coverage), eye - 0.05)) - scene.ground_z
 
 
-WEATHERS = ("clean", "flood", "flood-waves", "smog", "snow")
+WEATHERS = ("clean", "flood", "flood-waves", "smog", "snow", "snow-overcast")
 
 
 def frames(
@@ -71,6 +75,7 @@ def frames(
         "flood-waves": Weather(flood=replace(WAVES, level=level), seed=seed),
         "smog": Weather(smog=Smog(visibility=100.0)),
         "snow": Weather(snow=Snow(depth=0.1), seed=seed),
+        "snow-overcast": Weather(snow=Snow(depth=0.1), sky=Sky(kind="overcast"), seed=seed),
     }
     rows: dict[str, dict] = {}
     for name, weather in ((name, weathers[name]) for name in names):
@@ -112,6 +117,20 @@ def scaling(run: Path, sizes: list[str], view: str, repeats: int) -> dict[str, A
     return {"run": run.name, "view": view, "frames": rows, "exponent": exponent}
 
 
+def bakes(run: Path, view: str, repeats: int, seed: int) -> dict[str, Any]:
+    """Time the snowfall alone, without light, of 10 cm and of 2 m."""
+    field, scene = observed(load_field(run)), load_scene(run)
+    cameras = camera_path(view, scene, 1, (480, 270)).c2w[:, :3, 3]
+    rows = {}
+    for depth in (0.1, 2.0):
+        snow = Snow(depth=depth)
+        rows[f"{depth:g} m"] = common.measure(
+            lambda snow=snow: bake_snow(field, snow, cameras, np.ones(3), seed=seed), repeats
+        )
+    ratio = rows["2 m"]["median"] / rows["0.1 m"]["median"]
+    return {"run": run.name, "bakes": rows, "deep_over_shallow": ratio}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
@@ -120,7 +139,12 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--sizes", nargs="+")
+    parser.add_argument("--bakes", action="store_true")
     options = parser.parse_args()
+    if options.bakes:
+        found = bakes(options.run, options.path, options.repeats, options.seed)
+        common.report("seconds per snowfall", found, options.seed)
+        return
     if options.sizes:
         found = scaling(options.run, options.sizes, options.path, options.repeats)
         common.report("seconds per frame over its pixels", found)
