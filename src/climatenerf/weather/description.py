@@ -251,8 +251,15 @@ def without_effect(
         section = film.base.sections[effect.name]
         for name, other, values in effect.only_with:
             if f"{effect.name}.{name}" in given and getattr(section, other) not in values:
-                needed = " or ".join(f"--{effect.name}.{other} {value}" for value in values)
-                found[f"{effect.name}.{name}".replace("_", "-")] = needed
+                words = ("none" if value is None else value for value in values)
+                needed = " or ".join(f"--{effect.name}.{other} {word}" for word in words)
+                found[f"{effect.name}.{name}".replace("_", "-")] = needed.replace("_", "-")
+        defaults = effect.defaults()
+        for name, others in effect.only_beside:
+            alone = all(getattr(section, other) == defaults[other] for other in others)
+            if f"{effect.name}.{name}" in given and alone:
+                needed = " or ".join(f"--{effect.name}.{other}" for other in others)
+                found[f"{effect.name}.{name}".replace("_", "-")] = needed.replace("_", "-")
         if not effect.enabled_by or keyframed or effect.present(section):
             continue
         enabling = " or ".join(f"--{effect.name}.{name}" for name in effect.enabled_by)

@@ -79,6 +79,7 @@ class Effect:
         alternatives: Pairs of fields for one thing. A flag for one resets the other, and where both
             default to None only one may be given.
         only_with: Fields that need another field of the effect to have one of some values.
+        only_beside: Fields that need one of other fields to differ from its default.
         needs: Capabilities that the field must have; see `field.protocol`.
         after: Names of effects that are placed before this one, because it reads what they place.
         prepared_from: Parameters ("snow.fall_tilt", "seed") whose change prepares the entity again.
@@ -94,7 +95,8 @@ class Effect:
     layers: tuple[Layer, ...] = ()
     measures: tuple[Measure, ...] = ()
     alternatives: tuple[tuple[str, str], ...] = ()
-    only_with: tuple[tuple[str, str, tuple[str, ...]], ...] = ()
+    only_with: tuple[tuple[str, str, tuple[str | None, ...]], ...] = ()
+    only_beside: tuple[tuple[str, tuple[str, ...]], ...] = ()
     needs: frozenset[str] = frozenset()
     after: tuple[str, ...] = ()
     prepared_from: tuple[str, ...] = ()

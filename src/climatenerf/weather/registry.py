@@ -122,7 +122,14 @@ def _check_parameters(effect: Effect) -> None:
     for name, default in defaults.items():
         if default is dataclasses.MISSING:
             raise UserError(f"{what} gives its parameter {name!r} no default; add one")
-    listed = {"enabled_by": effect.enabled_by, "alternatives": sum(effect.alternatives, ())}
+    listed = {
+        "enabled_by": effect.enabled_by,
+        "alternatives": sum(effect.alternatives, ()),
+        "only_with": tuple(each for name, other, _ in effect.only_with for each in (name, other)),
+        "only_beside": tuple(
+            each for name, others in effect.only_beside for each in (name, *others)
+        ),
+    }
     for attribute, given in listed.items():
         for name in given:
             if name not in names:

@@ -48,6 +48,7 @@ class Kind:
 
 
 LENGTH = Kind("a length", "LENGTH", "0.5 m", "m")
+SHORT_LENGTH = Kind("a length", "LENGTH", "0.5 mm", "mm", 1e-3)
 SPEED = Kind("a speed", "SPEED", "6 m/s", "m/s")
 ANGLE = Kind("an angle", "ANGLE", "35 deg", "deg", math.pi / 180)
 PER_LENGTH = Kind("a number per length", "PER-LENGTH", "0.02 1/m", "1/m")

@@ -119,7 +119,7 @@ def test_the_steep_side_of_a_hedge_carries_no_cushion():
 
 
 @pytest.mark.parametrize(("share", "keeps"), [(0.95, 1.0), (0.7, 0.5), (0.4, 0.0)])
-def test_leaves_far_below_the_highest_tell_of_a_face(share, keeps):
+def test_leaves_far_below_the_highest_lie_at_a_face(share, keeps):
     """Rays that graze a blurred face end on all heights of it, and the mean of these is level."""
     random = np.random.default_rng(4)
     crown = 2.0 + 0.02 * random.normal(size=(200, 200))
@@ -379,12 +379,14 @@ def test_ground_beyond_the_known_terrain_is_white():
     assert snow_seen(*scene, *below, **lost)[0] == pytest.approx(1, abs=0.02)
 
 
-def test_deposits_tell_whether_any_snow_stays():
-    assert snow_on([HalfSpace()], [ROAD]).deposits.any()
+def test_deposits_know_the_area_that_carries_snow():
+    level = snow_on([HalfSpace()], [ROAD]).deposits
+    side = 2 * (GRID.half_side(0) + 3 * GRID.spacing)  # with what balls at the rim need
+    assert level.area() == pytest.approx(side**2, rel=0.02)
     slope = HalfSpace((math.sin(math.radians(75)), 0.0, math.cos(math.radians(75))), 0.0)
     steep = LabelledField([slope], classes=[BUILDING], box=BOX)
     baked = bake_snow(steep, Snow(depth=0.1), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=GRID)
-    assert baked is not None and not baked.deposits.any()
+    assert baked is not None and baked.deposits.area() < 0.1
 
 
 @pytest.mark.parametrize("tilt", [0.0, 45.0])

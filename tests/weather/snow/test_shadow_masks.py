@@ -112,7 +112,7 @@ def test_masks_belong_to_the_papers_shading_and_survive_a_weather_file(tmp_path)
         RenderSession(field, scene, weather_from_table(table))
 
 
-def test_a_missing_folder_is_told_before_photos_are_traced():
+def test_a_missing_folder_is_refused_before_photos_are_traced():
     def trace():
         raise AssertionError("photos are traced")
 

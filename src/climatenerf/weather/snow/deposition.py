@@ -12,11 +12,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int
 from scipy import ndimage
-from torch import Tensor
 
 from climatenerf.core.classes import GROUND, SOLID_OF, VEGETATION
 from climatenerf.core.device import to_device, to_numpy
-from climatenerf.core.srgb import LUMA
 from climatenerf.field.capabilities import CLASSES, NORMALS
 from climatenerf.field.normals import normals_at
 from climatenerf.field.protocol import RadianceField, device_of, ground_height
@@ -60,6 +58,7 @@ SLOPE_BASE, SLOPE_CELLS = 0.4, 8  # m and cells; slopes over a shorter base are 
 ROOF_SMOOTHING, ROOF_PASSES = 0.3, 6  # m and passes; fitted roofs are planes with roughness
 BETWEEN_LEAVES = 0.026  # m of snow that open or steep crowns take before any bridges their leaves
 SHELTER_SPACING, SHELTER_CELLS = 0.15, 3  # m and cells, at least, of what stands in the wind
+CASTING = 0.6  # of the time of a pass, that of its rays
 _CHUNK = 1 << 14  # positions per evaluation
 
 
@@ -79,23 +78,19 @@ def find_deposits(
     snow: Snow,
     grid: SnowGrid,
     light: Light,
-    cameras: Float[np.ndarray, "m 3"],
     seed: int,
     progress: Callable[[float], None] | None = None,
-    appearance: Float[Tensor, "1 e"] | None = None,
 ) -> Deposits:
-    """Find where snow lands and how bright it is there. World frame, m.
+    """Find where snow lands and how it is shaded there. World frame, m.
 
     Args:
         field: the fitted field.
-        snow: fall direction, slope and colour. Its depth only sets the height from which the
-            paper's shadow rays towards the sun start.
+        snow: fall direction and slope. Its depth only sets the height from which the paper's
+            shadow rays towards the sun start.
         grid: extent and spacing of the search.
         light: illumination of the scene.
-        cameras: camera positions, m. Colours of the ground are those seen from the nearest one.
         seed: random seed of the fall directions' spread and of the rays' offsets.
         progress: callback with the finished fraction, 0 to 1.
-        appearance: exposure and lighting of the field's colours; None: the mean of all photos.
 
     Returns:
         The deposits; empty where no surface catches snow.
@@ -114,7 +109,7 @@ def find_deposits(
 
             def pass_progress(fraction: float, done: int = done) -> None:
                 if progress is not None:
-                    progress((done + fraction) / total)
+                    progress((done + CASTING * fraction) / total)
 
             random = np.random.default_rng([seed, k, p])
             rays = cast(field, grid, k, directions[p], random, pass_progress)
@@ -122,12 +117,13 @@ def find_deposits(
             done += 1
             if p == 0 and snow.light == "paper":
                 found = [
-                    replace(each, shade=_shade(field, snow, each, grid.spacing_of(k), light,
-                                               cameras, appearance))
+                    replace(each, shade=_in_sun(field, snow, each, grid.spacing_of(k), light))
                     for each in found
-                ]  # fmt: skip
+                ]
             elif p == 0 and k < SINGLE_PASS:
                 found[0] = _in_contact_shade(field, found[0], grid.spacing_of(k))
+            if progress is not None:
+                progress(done / total)
             catches += found
         cascades.append(tuple(catches))
     return Deposits(grid, tuple(cascades), passes)
@@ -333,19 +329,12 @@ def _in_contact_shade(field: RadianceField, catch: Catch, spacing: float) -> Cat
     return replace(catch, shade=np.clip(shade * SHADE_UNIT, 0, 1))
 
 
-def _shade(
-    field: RadianceField,
-    snow: Snow,
-    catch: Catch,
-    spacing: float,
-    light: Light,
-    cameras: Float[np.ndarray, "m 3"],
-    appearance: Float[Tensor, "1 e"] | None,
+def _in_sun(
+    field: RadianceField, snow: Snow, catch: Catch, spacing: float, light: Light
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the brightness (g + c0)/(1 + c0) (beta_s V_s + V_s0) of snow, 0 to 1.
+    """Return the light beta_s V_s + V_s0 of the paper's snow, 0 to 1.
 
-    g is the ground's luminance relative to a white surface, V_s the visibility of the sun; c0,
-    beta_s and V_s0 are `albedo_offset`, `sun_share` and `shade` of the parameters.
+    V_s is the visibility of the sun; beta_s and V_s0 are `sun_share` and `shade` of the parameters.
     """
     used = catch.weight > 0
     hits = catch.position[used]
@@ -353,20 +342,11 @@ def _shade(
         return catch.shade
     lower, upper = field.bounds
     device = lower.device
-    luma = torch.tensor(LUMA, device=device)
-    white = max(float(np.dot(light.irradiance_over_pi, LUMA)), 1e-6)  # black scene: g would be 0/0
-    positions = torch.tensor(cameras, dtype=torch.float32, device=device)
     sun = light.sun_direction
     lift = (snow.depth or 0.0) + max(0.05, spacing)
     diagonal = float((upper - lower).norm())
-    shades = []
+    parts = []
     for points in to_device(hits, device).split(_CHUNK):
-        nearest = positions[torch.cdist(points, positions).argmin(1)]
-        offset = points - nearest
-        # A camera inside the blurred density of the ground would give a direction of length 0.
-        d = offset / offset.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        grey = (field.colour(points, d, appearance=appearance) @ luma / white).clamp(0, 1)
-        shade = (grey + snow.albedo_offset) / (1 + snow.albedo_offset)
         visible = torch.ones(len(points), device=device)
         if sun is not None and sun[2] > 0:
             above = points + torch.tensor([0.0, 0.0, lift], device=device)
@@ -381,8 +361,7 @@ def _shade(
             photographed = light.sunlit(to_numpy(points).astype(np.float64)).astype(np.float32)
             found = to_device(photographed, device)
             visible = torch.where(found.isnan(), visible, found)
-        shade = shade * (snow.sun_share * visible + snow.shade)
-        shades.append(to_numpy(shade.clamp(0, 1).float()))
+        parts.append(to_numpy((snow.sun_share * visible + snow.shade).clamp(0, 1).float()))
     shade = catch.shade.copy()
-    shade[used] = np.concatenate(shades)
+    shade[used] = np.concatenate(parts)
     return shade

@@ -15,7 +15,7 @@ REACH = 25.0  # m upwind, as far as something shelters
 NEAREST = 0.3  # m upwind; slopes over less are those of a fitted field's roughness
 STEPS = 20  # heights along it
 GAIN = 3.0  # depth over that of the open, per unit of slope
-MOST = 2.5  # times the depth of the open, at the most
+MAX_FACTOR = 2.5  # times the depth of the open, at the most
 SMOOTH = 0.3  # m, standard deviation; drifts have no sharper edge
 
 
@@ -81,5 +81,5 @@ def drifted(
         spacing: of the points, m.
     """
     slope = upwind_slope(position, shelter, wind_direction)
-    factor = np.clip(1 + strength * GAIN * slope, 1 - strength, 1 + strength * (MOST - 1))
+    factor = np.clip(1 + strength * GAIN * slope, 1 - strength, 1 + strength * (MAX_FACTOR - 1))
     return ndimage.gaussian_filter(factor, SMOOTH / spacing)

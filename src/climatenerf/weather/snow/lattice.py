@@ -95,10 +95,14 @@ class Deposits:
     passes: Int[np.ndarray, "cascades"]
     """Number of fall directions per cascade; each covers all cells once."""
 
-    def any(self) -> bool:
-        """Whether snow stays anywhere."""
-        catches = (catch for cascade in self.cascades for catch in cascade)
-        return any(bool(((c.weight > 0) & (c.of_fall + c.of_held > 0)).any()) for c in catches)
+    def area(self) -> float:
+        """Area that carries snow, seen from above, m2: the mean over fall directions."""
+        total = 0.0
+        for k, catches in enumerate(self.cascades):
+            cell = self.grid.spacing_of(k) ** 2 / int(self.passes[k])
+            for each in catches:
+                total += cell * float(each.weight[each.of_fall + each.of_held > 0].sum())
+        return total
 
 
 def choose_grid(

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from climatenerf.core.colour import luma
 from climatenerf.core.device import to_device, to_numpy
 from climatenerf.core.errors import UserError
 from climatenerf.core.samples import Samples
@@ -46,6 +47,8 @@ SAME, OTHER = 1.0, 1.5  # steps of stored heights, up to which two are the same,
 CONTACT_HEIGHT = 0.1  # m over the ground, where contact shade is known
 CONTACT_DECAY = 0.5  # m, over which it falls to 1/e
 BURIED = 0.04  # m below the ground, to which roughness reaches
+BARE = 0.005  # area that carries snow over that around the cameras; less is a scene without ground
+LANDING = 0.8  # of the time of the preparation, until all snow has landed
 OPAQUE, CLEAN_OPAQUE = 0.95, 0.99
 """Reflectance of a slab from which on the ground below is left out, which then has less than a
 hundredth of the light; the second is for snow that is whiter than the first."""
@@ -61,7 +64,8 @@ class BakedSnow:
         snow: its parameters.
         light: light of the scene.
         place_light: light at each place; None: that of the open everywhere.
-        ground: what thin snow lets through, under the same light; None: nothing.
+        ground: what thin snow lets through, under the same light, and what gives the paper's snow
+            its grey; None: nothing, and black.
         appearance: exposure and light of the ground's colours; None: the mean of all photos.
     """
 
@@ -84,11 +88,6 @@ class BakedSnow:
         """The same snow, without what lies on ground below a height (m): snow melts in water."""
         floor = -math.inf if floor_z is None else float(floor_z)
         return replace(self, lattice=self.lattice._replace(floor=floor))
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the lattice, bytes."""
-        return sum(part.nbytes for part in self.lattice if isinstance(part, np.ndarray))
 
     def march(
         self,
@@ -189,16 +188,46 @@ class BakedSnow:
             if relief is not None:
                 normal = tilted(normal, relief, height)
             return self._in_light_of_place(x, normal, height, shade / SHADE_UNIT)
+        return self._in_papers_light(x, normal, height, to_device(rest[:, 1], x.device))
+
+    def _in_papers_light(
+        self,
+        x: Float[Tensor, "n 3"],
+        normal: Float[Tensor, "n 3"],
+        height: Float[Tensor, "n"],
+        lit: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance of snow that is as bright as (g + c0)/(1 + c0) `lit`, with wrap lighting.
+
+        g is the luminance of the ground below over that of a white surface in the open, in the
+        colours of the moment: those of a style, where there is one.
+        """
         sun = self.light.sun_direction
         towards = sun if sun is not None and sun[2] > 0 else (0.0, 0.0, 1.0)
         towards = torch.tensor(towards, dtype=torch.float32, device=x.device)
         facing = normal @ towards
         # Negative only for a wrap below 1, on the side that faces away.
         wrap = ((facing + self.snow.wrap) / (1 + self.snow.wrap)).clamp(min=0)
-        shade = to_device(rest[:, 1], x.device)
         white = self.light.irradiance_over_pi
         white = torch.tensor(white, dtype=torch.float32, device=x.device)
-        return (shade * wrap)[:, None] * white
+        grey = torch.zeros_like(lit)
+        if self.ground is not None:
+            here = white
+            if self.place_light is not None:  # which the snow around brightens
+                here = self.place_light.open_irradiance() / math.pi
+            below = luma(self._ground_below(self.ground, x, height))
+            grey = (below / luma(here).clamp_min(1e-6)).clamp(0, 1)  # 1e-6: a black scene, 0/0
+        offset = self.snow.albedo_offset
+        return ((grey + offset) / (1 + offset) * lit * wrap)[:, None] * white
+
+    def _ground_below(
+        self, field: RadianceField, x: Float[Tensor, "n 3"], height: Float[Tensor, "n"]
+    ) -> Float[Tensor, "n 3"]:
+        """Radiance of what lies the heights (m) below points, seen from straight above."""
+        below, down = x.clone(), torch.zeros_like(x)
+        below[:, 2] -= height
+        down[:, 2] = -1.0
+        return field.colour(below, down, appearance=self.appearance)
 
     def _without_steps(
         self,
@@ -245,10 +274,7 @@ class BakedSnow:
         opaque = OPAQUE if float(deep.max()) < OPAQUE else CLEAN_OPAQUE
         thin = (slab[:, 0] < opaque).nonzero()[:, 0]
         if self.ground is not None and thin.numel():
-            below, down = x[thin].clone(), torch.zeros_like(x[thin])
-            below[:, 2] -= height[thin]
-            down[:, 2] = -1.0
-            seen = self.ground.colour(below, down, appearance=self.appearance)
+            seen = self._ground_below(self.ground, x[thin], height[thin])
             # The ground is shown in the light that now falls on the snow. 1e-6: 0/0 in the dark.
             ground = (seen / white[thin].clamp_min(1e-6)).clamp(0, 1)
             reflectance[thin] = over_ground(slab[thin], deep, ground)
@@ -340,9 +366,17 @@ def bake_snow(
     if grid is None:
         lower, upper = (to_numpy(b).astype(np.float64) for b in field.bounds)
         grid = choose_grid(lower, upper, cameras)
+
+    def landing(fraction: float) -> None:
+        if progress is not None:
+            progress(LANDING * fraction)
+
     with torch.no_grad():
-        deposits = find_deposits(field, snow, grid, light, cameras, seed, progress, appearance)
-    return BakedSnow(grow(deposits, snow.depth), deposits, snow, light)
+        deposits = find_deposits(field, snow, grid, light, seed, landing)
+    lattice = grow(deposits, snow.depth)
+    if progress is not None:
+        progress(1.0)
+    return BakedSnow(lattice, deposits, snow, light, ground=field, appearance=appearance)
 
 
 class SnowEntity:
@@ -375,18 +409,22 @@ class SnowEntity:
             appearance=given.appearance,
             sunlit=self._photographed_shadows(weather.snow),
         )
-        if self._baked is not None and not self._baked.deposits.any():
-            tilted = " or a smaller --snow.fall-tilt" if weather.snow.fall_tilt > 0 else ""
+        if self._baked is not None and _is_bare(self._baked.deposits):
+            others = ", or with a smaller --snow.fall-tilt" if weather.snow.fall_tilt > 0 else ""
+            others += ", or without --snow.slope" if weather.snow.slope is not None else ""
             raise UserError(
                 "no surface of this scene catches snow: all are sheltered, too steep or missing;"
-                f" render without --snow.depth{tilted}"
+                f" render without --snow.depth{others}"
             )
 
     def _photographed_shadows(self, snow: Snow) -> Callable[[np.ndarray], np.ndarray] | None:
         if snow.shadows is None:
             return None
         if self._preparation.photo_rays is None:
-            raise UserError("--snow.shadows needs a field with surfaces; leave it out")
+            raise UserError(
+                "--snow.shadows needs a field with normals or classes, which show where photos end;"
+                " leave it out, or fit with both"
+            )
         photos = self._preparation.photo_rays()
         return ShadowMasks(Path(snow.shadows), photos).sunlight
 
@@ -405,6 +443,7 @@ class SnowEntity:
         look = replace(
             self._grown.snow,
             wrap=asked.wrap,
+            albedo_offset=asked.albedo_offset,
             grain=asked.grain,
             soot=asked.soot,
             albedo=asked.albedo,
@@ -449,6 +488,11 @@ class SnowEntity:
 def prepare(preparation: Preparation) -> SnowEntity:
     """Let snow fall on the scene."""
     return SnowEntity(preparation)
+
+
+def _is_bare(deposits: Deposits) -> bool:
+    """Whether so little carries snow that it may be stray matter on walls."""
+    return deposits.area() < BARE * (2 * deposits.grid.half_side(0)) ** 2
 
 
 def _array(x: Tensor) -> np.ndarray:

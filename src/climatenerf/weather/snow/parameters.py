@@ -6,7 +6,7 @@ from typing import Annotated
 
 from climatenerf.core.layer_table import Layer
 from climatenerf.weather.effect import Effect, Measure
-from climatenerf.weather.units import ANGLE, LENGTH, choice, folder, number, quantity
+from climatenerf.weather.units import ANGLE, LENGTH, SHORT_LENGTH, choice, folder, number, quantity
 
 _TURN = 2 * math.pi
 
@@ -29,15 +29,15 @@ class Snow:
     """Slope that keeps half, as in the paper. none: as roofs (EN 1991) and rough ground do."""
     slope_sharpness: Annotated[float, number(1.0, 1000.0)] = 50.0
     """Steepness a' of the logistic in cos(slope), with a `slope`."""
-    grain: Annotated[float, quantity(LENGTH, 3e-5, 2e-3)] = 1e-4
+    grain: Annotated[float, quantity(SHORT_LENGTH, 3e-5, 2e-3)] = 1e-4
     """Optical radius of the grains. Fresh snow: 0.05 mm; wet: 1 mm; coarser is darker."""
     soot: Annotated[float, number(0.0, 1e5)] = 300.0
     """Soot in nanograms per gram of snow. Arctic: 10; near towns: 100 to 1000."""
     albedo: Annotated[float | None, number(0.0, 1.0, optional=True)] = None
-    """Reflectance of deep snow. none: that of grain and soot."""
+    """Reflectance of deep snow, instead of that of `grain` and `soot`. none: theirs."""
     sparkle: Annotated[float, number(0.0, 1.0)] = 0.3
     """Area of crystal faces that sparkle in a hard sun, over that of the snow. 0: none."""
-    relief: Annotated[float, quantity(LENGTH, 0.0, 0.05)] = 0.003
+    relief: Annotated[float, quantity(SHORT_LENGTH, 0.0, 0.05)] = 0.003
     """Standard deviation of the fine bumps that tilt the surface towards the light. 0: smooth."""
     albedo_offset: Annotated[float, number(0.0, 100.0)] = 4.0
     """c0 of the colour (g + c0)/(1 + c0) for `light` = paper; larger is whiter."""
@@ -50,6 +50,9 @@ class Snow:
     shadows: Annotated[str | None, folder()] = None
     """Masks of the photos, white in shadow, for `light` = paper. none: shadows by geometry."""
 
+
+_PAPER = ("albedo_offset", "wrap", "sun_share", "shade")  # what one kind of light asks for
+_SCENE = ("grain", "soot", "albedo", "sparkle", "relief")
 
 SNOW = Effect(
     name="snow",
@@ -64,11 +67,14 @@ SNOW = Effect(
         Measure("snow_share", "mask_snow"),
         Measure("mean_snow_thickness_m", "snow_thickness", "mask_snow"),
     ),
-    only_with=tuple(
-        (name, "light", ("paper",)) for name in ("albedo_offset", "wrap", "sun_share", "shade")
+    only_with=(
+        *((name, "light", ("paper",)) for name in _PAPER),
+        *((name, "light", ("scene",)) for name in _SCENE),
+        ("soot", "albedo", (None,)),
     ),
-    after=("sky", "flood"),
-    version="4",
+    only_beside=(("slope_sharpness", ("slope",)), ("wind_direction", ("fall_tilt", "drift"))),
+    after=("sky", "flood", "season"),
+    version="5",
     prepared_from=(
         "snow.fall_tilt",
         "snow.wind_direction",
@@ -76,7 +82,6 @@ SNOW = Effect(
         "snow.light",
         "snow.slope",
         "snow.slope_sharpness",
-        "snow.albedo_offset",
         "snow.sun_share",
         "snow.shade",
         "snow.shadows",

@@ -59,9 +59,11 @@ class ShadowMasks:
                 continue
             mask, (rows, columns) = read_rgb(path).max(-1), photo.t.shape
             if abs(mask.shape[1] / mask.shape[0] * rows / columns - 1) > PROPORTIONS:
+                height, width = mask.shape
                 raise UserError(
-                    f"--snow.shadows: {path.name} has other proportions than its photo; masks show"
-                    " what their photos show"
+                    f"--snow.shadows: {path.name} of {width}x{height} pixels has other proportions"
+                    f" than its photo, which is {columns}x{rows} reduced; make masks of the photos'"
+                    " size"
                 )
             known = np.isfinite(photo.t)
             ends.append(photo.x[known])

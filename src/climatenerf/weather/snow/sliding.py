@@ -61,7 +61,7 @@ def slid(
     arrived, drop = _routed(lost, share, filled, order[: int(known.sum())])
     level = share > KEEPS_ALL
     piled = _piled(arrived, drop, smooth, level, spacing)
-    # What finds no more than a ledge to lie on is lost, and builds no tower there.
+    # What would lie on a narrow ledge alone is lost; else it would pile up there to a tower.
     reach = np.maximum(ndimage.gaussian_filter(level.astype(np.float64), PILE / spacing), LEDGE)
     return level * ndimage.gaussian_filter(piled / reach, PILE / spacing)
 
