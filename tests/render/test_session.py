@@ -109,7 +109,7 @@ def test_a_level_above_everything_is_refused_at_any_moment(session_of):
 
 def test_snow_that_lies_nowhere_is_refused_and_a_trace_of_it_is_not(session_of, monkeypatch):
     session_of({"snow": {"depth": "0.01 mm"}}, [0.0])
-    monkeypatch.setattr(lattice_module.Deposits, "area", lambda deposits: 0.0)
+    monkeypatch.setattr(lattice_module.Deposits, "coverage", lambda deposits: 0.0)
     with pytest.raises(UserError, match=r"no surface of this scene catches snow.*--snow.depth$"):
         session_of({"snow": {"depth": "10 cm"}}, [0.0])
     with pytest.raises(UserError, match=r"with a smaller --snow.fall-tilt"):

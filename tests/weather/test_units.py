@@ -62,7 +62,9 @@ def test_invalid_quantities_are_refused(text, kind):
     )
 
 
-@pytest.mark.parametrize("kind", [units.LENGTH, units.SPEED, units.ANGLE, units.DURATION])
+@pytest.mark.parametrize(
+    "kind", [units.LENGTH, units.SHORT_LENGTH, units.SPEED, units.ANGLE, units.DURATION]
+)
 @pytest.mark.parametrize("value", [0.0, 0.1, 1 / 3, -2.0, 1e-9, 12345.678, 1e12, math.radians(37)])
 def test_quantities_round_trip(kind, value):
     text = units.format_quantity(value, kind)

@@ -26,7 +26,8 @@ class ProbeGrid:
         origin: the lowest corner, world m.
         spacing: distances of neighbours along the axes, m.
         shape: number of nodes along x, y and z; 2 at least.
-        valid: nodes outside matter; the others have the light of the nearest of these.
+        valid: nodes outside matter and above the ground; the others have the light of the nearest
+            of these.
     """
 
     origin: Float[Tensor, "3"]

@@ -12,7 +12,7 @@ Sections, names, units and ranges come from the effects. Does not import torch.
 
 import difflib
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -249,17 +249,10 @@ def without_effect(
     for effect in effects:
         keyframed = any(key.startswith(f"{effect.name}.") for key in film.keyframes)
         section = film.base.sections[effect.name]
-        for name, other, values in effect.only_with:
-            if f"{effect.name}.{name}" in given and getattr(section, other) not in values:
-                words = ("none" if value is None else value for value in values)
-                needed = " or ".join(f"--{effect.name}.{other} {word}" for word in words)
-                found[f"{effect.name}.{name}".replace("_", "-")] = needed.replace("_", "-")
-        defaults = effect.defaults()
-        for name, others in effect.only_beside:
-            alone = all(getattr(section, other) == defaults[other] for other in others)
-            if f"{effect.name}.{name}" in given and alone:
-                needed = " or ".join(f"--{effect.name}.{other}" for other in others)
-                found[f"{effect.name}.{name}".replace("_", "-")] = needed.replace("_", "-")
+        for name, needed in _unmet(film, effect):
+            if f"{effect.name}.{name}" in given:
+                flag = _flag(effect, name)
+                found[flag] = f"{found[flag]} and {needed}" if flag in found else needed
         if not effect.enabled_by or keyframed or effect.present(section):
             continue
         enabling = " or ".join(f"--{effect.name}.{name}" for name in effect.enabled_by)
@@ -267,6 +260,28 @@ def without_effect(
             if name.startswith(f"{effect.name}."):
                 found[name.replace("_", "-")] = enabling
     return found
+
+
+def _unmet(film: KeyframedWeather, effect: Effect) -> Iterator[tuple[str, str]]:
+    """Fields that change nothing at any moment, with the flags that they would need."""
+
+    def ever(name: str) -> set[Any]:
+        """All values of a field, at the ends of which a movie passes from one to the next."""
+        frames = film.keyframes.get(f"{effect.name}.{name}", ())
+        return {getattr(film.base.sections[effect.name], name), *(value for _, value in frames)}
+
+    for name, other, values in effect.only_with:
+        if ever(other).isdisjoint(values):
+            words = ("none" if value is None else value for value in values)
+            yield name, " or ".join(f"--{_flag(effect, other)} {word}" for word in words)
+    defaults = effect.defaults()
+    for name, others in effect.only_beside:
+        if all(ever(other) == {defaults[other]} for other in others):
+            yield name, " or ".join(f"--{_flag(effect, other)}" for other in others)
+
+
+def _flag(effect: Effect, name: str) -> str:
+    return f"{effect.name}.{name}".replace("_", "-")
 
 
 def _nearest(name: str, valid: list[str], what: str) -> str:

@@ -197,6 +197,25 @@ def test_probes_below_the_ground_do_not_count():
     assert seen.numpy() == pytest.approx(math.pi, rel=0.03)
 
 
+def test_probes_in_a_cutting_count():
+    """Its sides are ground, too, and most rays upwards end on them."""
+    sides = [
+        Box((low, -60.0, -2.5), (high, 60.0, 7.0), (0.2,) * 3)
+        for low, high in ((-60.0, -1.5), (1.5, 60.0))
+    ]
+    bottom = Box((-60.0, -60.0, -2.5), (60.0, 60.0, 0.0), (0.2,) * 3)
+    field = LabelledField([bottom, *sides], classes=[ROAD] * 3, box=((-60, -60, -2.6), (60, 60, 9)))
+    gathered = gather(field, torch.tensor([0.0, 0.0, 1.6]), 2.0, 0.0)
+    grid = gathered.grid
+    nodes = (grid.origin[a] + grid.spacing[a] * torch.arange(grid.shape[a]) for a in range(3))
+    x, _, z = nodes
+    layers = grid.valid.view(grid.shape[::-1])
+    between = (x.abs() < 1.2).nonzero()[:, 0]
+    low = ((z > 0.5) & (z < 4)).nonzero()[:, 0]
+    assert len(between) and len(low)
+    assert layers[low][:, :, between].all()
+
+
 def test_the_same_light_changes_nothing(gathered):
     old = light_of_photos(gathered, even(1.0), no_sun(), None)
     new = relit(gathered, old, old)

@@ -379,14 +379,14 @@ def test_ground_beyond_the_known_terrain_is_white():
     assert snow_seen(*scene, *below, **lost)[0] == pytest.approx(1, abs=0.02)
 
 
-def test_deposits_know_the_area_that_carries_snow():
+def test_deposits_know_how_much_of_a_scene_carries_snow():
     level = snow_on([HalfSpace()], [ROAD]).deposits
-    side = 2 * (GRID.half_side(0) + 3 * GRID.spacing)  # with what balls at the rim need
-    assert level.area() == pytest.approx(side**2, rel=0.02)
+    beyond = 1 + 3 / GRID.half_cells  # with what balls at the rim need
+    assert level.coverage() == pytest.approx(beyond**2, rel=0.02)
     slope = HalfSpace((math.sin(math.radians(75)), 0.0, math.cos(math.radians(75))), 0.0)
     steep = LabelledField([slope], classes=[BUILDING], box=BOX)
     baked = bake_snow(steep, Snow(depth=0.1), np.array([[0.0, 0.0, 1.6]]), np.ones(3), grid=GRID)
-    assert baked is not None and baked.deposits.area() < 0.1
+    assert baked is not None and baked.deposits.coverage() < 0.01
 
 
 @pytest.mark.parametrize("tilt", [0.0, 45.0])

@@ -136,21 +136,36 @@ def test_snow_is_continuous_where_completed_ground_begins():
         assert np.abs(np.diff(top)).max() < 0.02, "the seam shows no step"
 
 
+@dataclasses.dataclass(frozen=True)
+class HalfSun:
+    """Light of the open, half of it on level ground by a sun."""
+
+    elevation: float | None
+
+    def irradiance(self, x, normal, diffuse=None):
+        if self.elevation is None:
+            return torch.full_like(x, math.pi)
+        sun = torch.tensor([math.cos(self.elevation), 0.0, math.sin(self.elevation)])
+        facing = (normal @ sun / sun[2]).clamp_min(0)[:, None]
+        sky = 1.0 if diffuse is None else diffuse[:, None]
+        return math.pi * (0.5 * sky + 0.5 * facing).expand_as(x)
+
+
 def test_level_snow_is_the_same_for_any_sun():
-    """The light of level ground has the sun's in it already."""
-    x = torch.tensor([[0.3, 0.2, 0.1]])
+    """The light of level ground has the sun's in it already, also that of the bake."""
+    y = torch.linspace(-1, 1, 201)
+    x = torch.stack([0.3 * y, y, torch.full_like(y, 0.1)], -1)
     field = LabelledField([HalfSpace()], classes=[ROAD], box=BOX)
     seen = []
     for elevation in (None, 10.0, 40.0):
-        sun = None
-        if elevation is not None:
-            turn = math.radians(elevation)
-            sun = np.array([math.cos(turn), 0.0, math.sin(turn)])
+        turn = None if elevation is None else math.radians(elevation)
+        sun = None if turn is None else np.array([math.cos(turn), 0.0, math.sin(turn)])
         baked = bake_snow(field, Snow(depth=0.1), CAMERAS, np.ones(3), sun, grid=GRID)
         assert baked is not None
-        seen.append(baked.colour(x).numpy())
-    assert seen[1] == pytest.approx(seen[0], rel=1e-6)
-    assert seen[2] == pytest.approx(seen[0], rel=1e-6)
+        lit = dataclasses.replace(baked, place_light=HalfSun(turn))
+        seen.append([float(baked.colour(x).mean()), float(lit.colour(x).mean())])
+    assert seen[1] == pytest.approx(seen[0], rel=0.02)
+    assert seen[2] == pytest.approx(seen[0], rel=0.02)
 
 
 def test_snow_is_darker_at_a_wall():
@@ -186,18 +201,24 @@ def session(field, tmp_path, depth="10 cm", season="captured", **snow):
 
 
 @pytest.mark.parametrize(
-    ("case", "tilt"),
-    [("only a wall", "0 deg"), ("only a wall", "60 deg"), ("only a steep plane", "0 deg")],
+    ("case", "tilt", "slope"),
+    [
+        ("only a wall", "0 deg", "none"),
+        ("only a wall", "60 deg", "none"),
+        ("only a steep plane", "0 deg", "none"),
+        ("only a steep plane", "0 deg", "20 deg"),
+    ],
 )
-def test_scenes_without_ground_are_refused_in_one_sentence(tmp_path, case, tilt):
+def test_scenes_without_ground_are_refused_in_one_sentence(tmp_path, case, tilt, slope):
     steep = HalfSpace((math.sin(1.4), 0.0, math.cos(1.4)), -2.0)
     wall = Box((-8.0, 2.0, -2.0), (8.0, 2.2, 5.0))
     solids = [wall] if case == "only a wall" else [steep]
     field = AnalyticField(solids, box=((-4.0, -4.0, -1.0), (4.0, 4.0, 3.0)))
     with pytest.raises(UserError, match="no surface of this scene catches snow") as error:
-        session(field, tmp_path, **{"fall-tilt": tilt})
+        session(field, tmp_path, **{"fall-tilt": tilt, "slope": slope})
     assert "\n" not in str(error.value)
     assert ("smaller --snow.fall-tilt" in str(error.value)) == (tilt != "0 deg")
+    assert ("without --snow.slope" in str(error.value)) == (slope != "none")
 
 
 def test_the_papers_grey_is_that_of_the_styled_ground():

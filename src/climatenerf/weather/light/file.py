@@ -24,7 +24,7 @@ from climatenerf.weather.light.solar_position import almanac_sun
 from climatenerf.weather.world import Kept
 
 FILE_NAME = "light.json"
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 6
 """1 knew no sun of the calendar, 2 let the zenith rise beside a lobe, 3 kept faint lobes, 4 took
 noise for two suns, 5 held a lobe to the mean of the ground."""
 NO_REASON = "the photos show too little of it"  # of files that were written without one

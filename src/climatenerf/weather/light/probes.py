@@ -33,7 +33,7 @@ HEIGHT = (-0.7, 9.8)  # m from the lowest ground
 STEP = 5.0  # marching step of the rays, which blur
 NEAR_MATTER = 0.25  # m; a probe with matter so near in most directions lies inside it
 INSIDE = 0.5  # fraction of such directions
-ABOVE = 0.3  # z of directions in which a probe that meets the ground mostly lies below it
+ABOVE = 0.3  # z of directions; a probe from which most of these meet ground lies below it
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def gather(
     inside = (distance.view(shape) < NEAR_MATTER).float().mean(1) > INSIDE
     # Below the ground a field is arbitrary, and light grows without bound between its undersides.
     above = directions[:, 2] > ABOVE
-    buried = ground.view(shape)[:, above].float().mean(1) > INSIDE
+    under = (ground & (normal[:, 2] < 0)).view(shape)  # normals are turned to the probe
+    buried = under[:, above].float().mean(1) > INSIDE
     grid = ProbeGrid(low, spacing, (nx, ny, nz), ~(inside | buried))
     return GatheredLight(
         grid, directions, through.view(shape), radiance.view(*shape, 3), x.view(*shape, 3),

@@ -30,6 +30,7 @@ _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 _BURIAL = SUPPORT + _BLUR
 _BELOW, _ABOVE = 20.0, 40.0  # m; ground up to this far below and above the cameras carries snow
 SHADE_UNIT = 128 / 255  # a value that a byte holds
+TRACE = 0.01  # of the fall, up to which a surface is bare; the paper's slopes keep 1e-14 anywhere
 """`Catch.shade` of snow that receives as much light as its surroundings."""
 _THINNEST = 2e-4  # m; thinner snow is no layer of grains
 
@@ -80,7 +81,7 @@ class Catch:
     """Fraction of the cell that catches snow; 0 outside the raster's part of the scene."""
     shade: Float32[np.ndarray, "h w"]
     """0 to 1; NaN: unknown. In the light of the place: light over that around, by `SHADE_UNIT`. In
-    the paper's light: the brightness of the snow."""
+    the paper's light: beta_s V_s + V_s0."""
     overhangs: bool = False
     """Whether it hangs over lower ground, to which snow falls from its edges."""
 
@@ -95,14 +96,17 @@ class Deposits:
     passes: Int[np.ndarray, "cascades"]
     """Number of fall directions per cascade; each covers all cells once."""
 
-    def area(self) -> float:
-        """Area that carries snow, seen from above, m2: the mean over fall directions."""
-        total = 0.0
+    def coverage(self) -> float:
+        """Fraction of a cascade's square that carries snow, seen from above, of the one with most.
+
+        The mean over fall directions.
+        """
+        found = [0.0]
         for k, catches in enumerate(self.cascades):
-            cell = self.grid.spacing_of(k) ** 2 / int(self.passes[k])
-            for each in catches:
-                total += cell * float(each.weight[each.of_fall + each.of_held > 0].sum())
-        return total
+            cells = (2 * self.grid.half_cells) ** 2 * int(self.passes[k])
+            snowy = (each.weight[each.of_fall + each.of_held > TRACE].sum() for each in catches)
+            found.append(sum(map(float, snowy)) / cells)
+        return max(found)
 
 
 def choose_grid(

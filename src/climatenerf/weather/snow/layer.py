@@ -47,7 +47,7 @@ SAME, OTHER = 1.0, 1.5  # steps of stored heights, up to which two are the same,
 CONTACT_HEIGHT = 0.1  # m over the ground, where contact shade is known
 CONTACT_DECAY = 0.5  # m, over which it falls to 1/e
 BURIED = 0.04  # m below the ground, to which roughness reaches
-BARE = 0.005  # area that carries snow over that around the cameras; less is a scene without ground
+BARE = 0.005  # fraction of a square that carries snow, below which a scene has no ground
 LANDING = 0.8  # of the time of the preparation, until all snow has landed
 OPAQUE, CLEAN_OPAQUE = 0.95, 0.99
 """Reflectance of a slab from which on the ground below is left out, which then has less than a
@@ -357,7 +357,7 @@ def bake_snow(
         sunlit: see `Light.sunlit`.
 
     Returns:
-        The snow; None where the depth asks for none.
+        The snow, over the ground of the field; None where the depth asks for none.
     """
     if snow.depth is None or snow.depth <= 0:
         return None
@@ -492,7 +492,7 @@ def prepare(preparation: Preparation) -> SnowEntity:
 
 def _is_bare(deposits: Deposits) -> bool:
     """Whether so little carries snow that it may be stray matter on walls."""
-    return deposits.area() < BARE * (2 * deposits.grid.half_side(0)) ** 2
+    return deposits.coverage() < BARE
 
 
 def _array(x: Tensor) -> np.ndarray:

@@ -51,8 +51,9 @@ class Snow:
     """Masks of the photos, white in shadow, for `light` = paper. none: shadows by geometry."""
 
 
-_PAPER = ("albedo_offset", "wrap", "sun_share", "shade")  # what one kind of light asks for
-_SCENE = ("grain", "soot", "albedo", "sparkle", "relief")
+# Parameters that only one kind of light reads. With both, the light of the place depends on grain.
+_PAPER = ("albedo_offset", "wrap", "sun_share", "shade")
+_SCENE = ("sparkle", "relief")
 
 SNOW = Effect(
     name="snow",
