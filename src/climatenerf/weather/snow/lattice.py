@@ -30,9 +30,12 @@ _BLUR = 1.5  # half-width of the vertical prefilter in spacings
 _BURIAL = SUPPORT + _BLUR
 _BELOW, _ABOVE = 20.0, 40.0  # m; ground up to this far below and above the cameras carries snow
 SHADE_UNIT = 128 / 255  # a value that a byte holds
-TRACE = 0.01  # of the fall, up to which a surface is bare; the paper's slopes keep 1e-14 anywhere
 """`Catch.shade` of snow that receives as much light as its surroundings."""
+TRACE = 0.01  # of the fall, up to which a surface is bare; the paper's slopes keep 1e-14 anywhere
 _THINNEST = 2e-4  # m; thinner snow is no layer of grains
+UNDERGROUND = 2.25  # spacings below its ground, from which a column is no part of the snow
+THIN, DEEP = 0.04, 0.08  # m of depth between which steps of the ground cease to stay bare
+HIDDEN_WEIGHT = 1.0, 0.02  # of columns underground in mean heights, in thin and in deep snow
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
         corner = np.array([grid.centre[0] - margin, grid.centre[1] - margin, bottom])
         weight = weight / np.float32(deposits.passes[k])
         sums, core = _fill((position - corner) / h, weight, shade, thickness / h, count)
-        table, fill, height, shade = _assemble(sums, core)
+        table, fill, height, shade = _assemble(sums, core, depth)
         index.append(np.where(table >= 0, table + used, -1).astype(np.int32).reshape(-1))
         pool.append((fill, height, shade))
         used += fill.shape[0]
@@ -230,7 +233,7 @@ def _fill(
     shade: Float32[np.ndarray, "n"],
     depth: Float[np.ndarray, "n"],
     bricks: Int[np.ndarray, "3"],
-) -> tuple[Float32[np.ndarray, "b 8 8 8 4"], Int[np.ndarray, "x y z"]]:
+) -> tuple[Float32[np.ndarray, "b 8 8 8 6"], Int[np.ndarray, "x y z"]]:
     """Accumulate the columns at the vertices; lengths in units of the spacing.
 
     Serial, so that the order of the floating-point sums is always the same.
@@ -244,12 +247,13 @@ def _fill(
 
     Returns:
         For each occupied brick, sums at its vertices of: the filled fraction f; f times height
-        above the ground; f of deposits with known brightness; that f times brightness. And the
-        index of the brick at each (x, y, z), -1: none.
+        above the ground; f of deposits with known brightness; that f times brightness; f, and f
+        times height, of columns that are not `UNDERGROUND` there. And the index of the brick at
+        each (x, y, z), -1: none.
     """
     size = (bricks[0] * BRICK, bricks[1] * BRICK, bricks[2] * BRICK)
     core = np.full((bricks[0], bricks[1], bricks[2]), -1, np.int32)
-    sums = np.zeros((0, BRICK, BRICK, BRICK, 4), np.float32)
+    sums = np.zeros((0, BRICK, BRICK, BRICK, 6), np.float32)
     for phase in range(2):  # 0: count the bricks; 1: fill them
         used = 0
         for r in range(position.shape[0]):
@@ -289,17 +293,21 @@ def _fill(
                         ]
                         row[0] += fraction
                         row[1] += fraction * (m - z)
+                        if m > z - UNDERGROUND:
+                            row[4] += fraction
+                            row[5] += fraction * (m - z)
                         if not math.isnan(shade[r]):
                             row[2] += fraction
                             row[3] += fraction * shade[r]
         if phase == 0:
-            sums = np.zeros((used, BRICK, BRICK, BRICK, 4), np.float32)
+            sums = np.zeros((used, BRICK, BRICK, BRICK, 6), np.float32)
     return sums, core
 
 
 def _assemble(
-    sums: Float32[np.ndarray, "b 8 8 8 4"],
+    sums: Float32[np.ndarray, "b 8 8 8 6"],
     core: Int[np.ndarray, "x y z"],
+    depth: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Quantise the vertices and store with each brick the adjacent vertices of its neighbours.
 
@@ -310,7 +318,7 @@ def _assemble(
 
     shaded = float(sums[..., 2].sum(dtype=np.float64))
     default_shade = float(sums[..., 3].sum(dtype=np.float64)) / shaded if shaded > 0 else SHADE_UNIT
-    vertices = _quantise(sums, default_shade)
+    vertices = _quantise(sums, default_shade, depth)
     near = ndimage.binary_dilation(core >= 0, np.ones((3, 3, 3), bool))
     cells = np.argwhere(near)
     fill, height, shade = _gather(cells, core, *vertices)
@@ -321,12 +329,20 @@ def _assemble(
 
 
 def _quantise(
-    sums: Float32[np.ndarray, "b 8 8 8 4"], default_shade: float
+    sums: Float32[np.ndarray, "b 8 8 8 6"], default_shade: float, depth: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return filled fraction, height above the ground and brightness in the units of `Lattice`."""
-    filled, moment, shaded, brightness = (sums[..., c] for c in range(4))
+    """Return filled fraction, height above the ground and brightness in the units of `Lattice`.
+
+    Below a step of the ground a vertex is in the snow of the lower column and under the ground of
+    the higher one. By the mean height of both, deep snow would have holes at the foot of stones,
+    kerbs and tufts: columns underground count less there, the deeper the snow (m).
+    """
+    filled, moment, shaded, brightness, snowy, above = (sums[..., c] for c in range(6))
+    hidden = np.float32(np.interp(depth, (THIN, DEEP), HIDDEN_WEIGHT))
     # The floors avoid 0/0 at empty vertices, whose values have no weight.
-    height = np.clip(moment / np.maximum(filled, 1e-6) / HEIGHT_UNIT, -32000, 32000)
+    weight = np.maximum(snowy + hidden * (filled - snowy), 1e-6)
+    height = (above + hidden * (moment - above)) / weight
+    height = np.clip(height / HEIGHT_UNIT, -32000, 32000)
     mean = brightness / np.maximum(shaded, 1e-6)
     shade = np.where(shaded > 1e-6, mean, np.float32(default_shade))
     return (

@@ -75,7 +75,7 @@ SNOW = Effect(
     ),
     only_beside=(("slope_sharpness", ("slope",)), ("wind_direction", ("fall_tilt", "drift"))),
     after=("sky", "flood", "season"),
-    version="5",
+    version="6",
     prepared_from=(
         "snow.fall_tilt",
         "snow.wind_direction",
