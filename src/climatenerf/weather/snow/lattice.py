@@ -33,7 +33,7 @@ SHADE_UNIT = 128 / 255  # a value that a byte holds
 """`Catch.shade` of snow that receives as much light as its surroundings."""
 TRACE = 0.01  # of the fall, up to which a surface is bare; the paper's slopes keep 1e-14 anywhere
 _THINNEST = 2e-4  # m; thinner snow is no layer of grains
-UNDERGROUND = 2.25  # spacings below its ground, from which a column is no part of the snow
+UNDERGROUND = 2.1  # spacings below its ground, from which a column is no part of the snow
 THIN, DEEP = 0.04, 0.08  # m of depth between which steps of the ground cease to stay bare
 HIDDEN_WEIGHT = 1.0, 0.02  # of columns underground in mean heights, in thin and in deep snow
 
