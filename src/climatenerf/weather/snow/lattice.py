@@ -33,8 +33,8 @@ SHADE_UNIT = 128 / 255  # a value that a byte holds
 """`Catch.shade` of snow that receives as much light as its surroundings."""
 TRACE = 0.01  # of the fall, up to which a surface is bare; the paper's slopes keep 1e-14 anywhere
 _THINNEST = 2e-4  # m; thinner snow is no layer of grains
-UNDERGROUND = 2.1  # spacings below its ground, from which a column is no part of the snow
-THIN, DEEP = 0.04, 0.08  # m of depth between which steps of the ground cease to stay bare
+UNDERGROUND = 2.1  # spacings; a vertex this far below a column's ground is not in its snow
+THIN, DEEP = 0.04, 0.08  # m on level ground; between these, columns underground lose their weight
 HIDDEN_WEIGHT = 1.0, 0.02  # of columns underground in mean heights, in thin and in deep snow
 
 
@@ -335,7 +335,8 @@ def _quantise(
 
     Below a step of the ground a vertex is in the snow of the lower column and under the ground of
     the higher one. By the mean height of both, deep snow would have holes at the foot of stones,
-    kerbs and tufts: columns underground count less there, the deeper the snow (m).
+    kerbs and tufts: columns underground count less, down to `HIDDEN_WEIGHT`, the deeper the
+    snow is. `depth` is that on open level ground, m.
     """
     filled, moment, shaded, brightness, snowy, above = (sums[..., c] for c in range(6))
     hidden = np.float32(np.interp(depth, (THIN, DEEP), HIDDEN_WEIGHT))
