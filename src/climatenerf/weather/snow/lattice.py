@@ -335,8 +335,8 @@ def _quantise(
 
     Below a step of the ground a vertex is in the snow of the lower column and under the ground of
     the higher one. By the mean height of both, deep snow would have holes at the foot of stones,
-    kerbs and tufts: columns underground count less, down to `HIDDEN_WEIGHT`, the deeper the
-    snow is. `depth` is that on open level ground, m.
+    kerbs and tufts: columns underground count less, down to `HIDDEN_WEIGHT`, the deeper the snow
+    is. `depth` is that on open level ground, m.
     """
     filled, moment, shaded, brightness, snowy, above = (sums[..., c] for c in range(6))
     hidden = np.float32(np.interp(depth, (THIN, DEEP), HIDDEN_WEIGHT))
