@@ -28,9 +28,9 @@ GRID = SnowGrid((0.013, 0.027), (-1.0, 4.0), 0.05, 64)
 CAMERAS = np.array([[0.0, 0.0, 1.6]])
 
 
-def snow_on(solids, classes, depth=0.1, **snow):
+def snow_on(solids, classes, depth=0.1, grid=GRID, **snow):
     field = LabelledField(solids, classes=classes, box=BOX)
-    baked = bake_snow(field, Snow(depth=depth, **snow), CAMERAS, np.ones(3), grid=GRID)
+    baked = bake_snow(field, Snow(depth=depth, **snow), CAMERAS, np.ones(3), grid=grid)
     assert baked is not None
     return baked
 
@@ -52,11 +52,26 @@ def dense_within(baked, low, high, n=4000):
     return float((baked.density(low + draw * (high - low)) > 1).float().mean())
 
 
-def test_deep_snow_has_no_holes_at_the_foot_of_a_step():
-    for height in (0.16, 0.2):
-        step = Box((0.5, -8.0, -1.0), (8.0, 8.0, height))
-        baked = snow_on([HalfSpace(), step], [ROAD, ROAD])
-        assert dense_within(baked, (0.44, -1.0, 0.02), (0.49, 1.0, 0.09), 40_000) == 1.0
+def step(height):
+    return [HalfSpace(), Box((0.5, -8.0, -1.0), (8.0, 8.0, height))]
+
+
+@pytest.mark.parametrize("height", [0.12, 0.14, 0.16, 0.2])
+def test_deep_snow_has_no_holes_at_the_foot_of_a_step(height):
+    for right, down in ((0.0, 0.0), (0.02, 0.01), (0.0, 0.03), (0.02, 0.04)):
+        grid = SnowGrid((0.013 + right, 0.027), (-1.0 - down, 4.0), 0.05, 64)
+        baked = snow_on(step(height), [ROAD, ROAD], grid=grid)
+        assert dense_within(baked, (0.44, -1.0, 0.02), (0.49, 1.0, 0.09), 20_000) > 0.98
+
+
+@pytest.mark.parametrize(("depth", "height"), [(0.1, 0.25), (0.15, 0.3)])
+def test_deep_snow_does_not_climb_the_face_of_a_step(depth, height):
+    baked = snow_on(step(height), [ROAD, ROAD], depth)
+    z = torch.arange(0.05, height, 0.002)
+    for y in np.linspace(-1, 1, 20):
+        face = torch.stack([torch.full_like(z, 0.495), torch.full_like(z, float(y)), z], -1)
+        bare = (baked.density(face) < 1).nonzero()[:, 0]
+        assert float(z[bare[0]]) == pytest.approx(depth, abs=0.03)
 
 
 def test_a_fence_stands_in_level_snow_with_a_small_cap():

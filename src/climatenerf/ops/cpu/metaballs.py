@@ -64,7 +64,8 @@ class Lattice(NamedTuple):
     fill: np.ndarray
     """[b, 11, 11, 11] uint8: filled fraction f of a vertex's surroundings, in 1/255."""
     height: np.ndarray
-    """int16: height of the vertex above the ground below it, in HEIGHT_UNIT spacings."""
+    """int16: mean height of the vertex above the ground of the columns around, in HEIGHT_UNIT
+    spacings; in deep snow columns that it lies far below count less."""
     shade: np.ndarray
     """uint8, in 1/255: what `weather.snow.lattice.Catch` calls shade."""
     band: np.ndarray

@@ -33,9 +33,9 @@ SHADE_UNIT = 128 / 255  # a value that a byte holds
 """`Catch.shade` of snow that receives as much light as its surroundings."""
 TRACE = 0.01  # of the fall, up to which a surface is bare; the paper's slopes keep 1e-14 anywhere
 _THINNEST = 2e-4  # m; thinner snow is no layer of grains
-UNDERGROUND = 2.1  # spacings; a vertex this far below a column's ground is not in its snow
-THIN, DEEP = 0.04, 0.08  # m on level ground; between these, columns underground lose their weight
-HIDDEN_WEIGHT = 1.0, 0.02  # of columns underground in mean heights, in thin and in deep snow
+UNDERGROUND = 1.75, 2.5  # spacings that a vertex lies below a column's ground, from 0 to all hidden
+THIN, DEEP = 0.04, 0.08  # m on level ground; between these, hidden columns lose their weight
+HIDDEN_WEIGHT = 1.0, 0.2  # of hidden columns in mean heights, in thin and in deep snow
 
 
 @dataclass(frozen=True)
@@ -170,8 +170,9 @@ def grow(deposits: Deposits, depth: float) -> Lattice:
         margin = half + BRICK * h
         corner = np.array([grid.centre[0] - margin, grid.centre[1] - margin, bottom])
         weight = weight / np.float32(deposits.passes[k])
-        sums, core = _fill((position - corner) / h, weight, shade, thickness / h, count)
-        table, fill, height, shade = _assemble(sums, core, depth)
+        hidden = float(np.interp(depth, (THIN, DEEP), HIDDEN_WEIGHT))
+        sums, core = _fill((position - corner) / h, weight, shade, thickness / h, count, hidden)
+        table, fill, height, shade = _assemble(sums, core)
         index.append(np.where(table >= 0, table + used, -1).astype(np.int32).reshape(-1))
         pool.append((fill, height, shade))
         used += fill.shape[0]
@@ -233,10 +234,15 @@ def _fill(
     shade: Float32[np.ndarray, "n"],
     depth: Float[np.ndarray, "n"],
     bricks: Int[np.ndarray, "3"],
-) -> tuple[Float32[np.ndarray, "b 8 8 8 6"], Int[np.ndarray, "x y z"]]:
+    hidden: float,
+) -> tuple[Float32[np.ndarray, "b 8 8 8 5"], Int[np.ndarray, "x y z"]]:
     """Accumulate the columns at the vertices; lengths in units of the spacing.
 
     Serial, so that the order of the floating-point sums is always the same.
+
+    Below a step of the ground a vertex is in the snow of the lower column and under the ground of
+    the higher one. By the mean height of both, deep snow would have holes at the foot of stones,
+    kerbs and tufts, so what is far underground (`UNDERGROUND`) counts less.
 
     Args:
         position: deposits relative to the lattice's corner.
@@ -244,16 +250,16 @@ def _fill(
         shade: brightness per deposit; NaN: unknown.
         depth: thickness of the snow per deposit.
         bricks: number of bricks along each axis.
+        hidden: weight of columns that are far underground in mean heights, 1 or less.
 
     Returns:
-        For each occupied brick, sums at its vertices of: the filled fraction f; f times height
-        above the ground; f of deposits with known brightness; that f times brightness; f, and f
-        times height, of columns that are not `UNDERGROUND` there. And the index of the brick at
-        each (x, y, z), -1: none.
+        For each occupied brick, sums at its vertices of: the filled fraction f; weighted f times
+        height above the ground; f of deposits with known brightness; that f times brightness;
+        weighted f. And the index of the brick at each (x, y, z), -1: none.
     """
     size = (bricks[0] * BRICK, bricks[1] * BRICK, bricks[2] * BRICK)
     core = np.full((bricks[0], bricks[1], bricks[2]), -1, np.int32)
-    sums = np.zeros((0, BRICK, BRICK, BRICK, 6), np.float32)
+    sums = np.zeros((0, BRICK, BRICK, BRICK, 5), np.float32)
     for phase in range(2):  # 0: count the bricks; 1: fill them
         used = 0
         for r in range(position.shape[0]):
@@ -292,22 +298,21 @@ def _fill(
                             m % BRICK,
                         ]
                         row[0] += fraction
-                        row[1] += fraction * (m - z)
-                        if m > z - UNDERGROUND:
-                            row[4] += fraction
-                            row[5] += fraction * (m - z)
+                        below = (z - m - UNDERGROUND[0]) / (UNDERGROUND[1] - UNDERGROUND[0])
+                        counted = fraction * (1 - (1 - hidden) * min(max(below, 0.0), 1.0))
+                        row[1] += counted * (m - z)
+                        row[4] += counted
                         if not math.isnan(shade[r]):
                             row[2] += fraction
                             row[3] += fraction * shade[r]
         if phase == 0:
-            sums = np.zeros((used, BRICK, BRICK, BRICK, 6), np.float32)
+            sums = np.zeros((used, BRICK, BRICK, BRICK, 5), np.float32)
     return sums, core
 
 
 def _assemble(
-    sums: Float32[np.ndarray, "b 8 8 8 6"],
+    sums: Float32[np.ndarray, "b 8 8 8 5"],
     core: Int[np.ndarray, "x y z"],
-    depth: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Quantise the vertices and store with each brick the adjacent vertices of its neighbours.
 
@@ -318,7 +323,7 @@ def _assemble(
 
     shaded = float(sums[..., 2].sum(dtype=np.float64))
     default_shade = float(sums[..., 3].sum(dtype=np.float64)) / shaded if shaded > 0 else SHADE_UNIT
-    vertices = _quantise(sums, default_shade, depth)
+    vertices = _quantise(sums, default_shade)
     near = ndimage.binary_dilation(core >= 0, np.ones((3, 3, 3), bool))
     cells = np.argwhere(near)
     fill, height, shade = _gather(cells, core, *vertices)
@@ -329,21 +334,12 @@ def _assemble(
 
 
 def _quantise(
-    sums: Float32[np.ndarray, "b 8 8 8 6"], default_shade: float, depth: float
+    sums: Float32[np.ndarray, "b 8 8 8 5"], default_shade: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return filled fraction, height above the ground and brightness in the units of `Lattice`.
-
-    Below a step of the ground a vertex is in the snow of the lower column and under the ground of
-    the higher one. By the mean height of both, deep snow would have holes at the foot of stones,
-    kerbs and tufts: columns underground count less, down to `HIDDEN_WEIGHT`, the deeper the snow
-    is. `depth` is that on open level ground, m.
-    """
-    filled, moment, shaded, brightness, snowy, above = (sums[..., c] for c in range(6))
-    hidden = np.float32(np.interp(depth, (THIN, DEEP), HIDDEN_WEIGHT))
+    """Return filled fraction, height above the ground and brightness in the units of `Lattice`."""
+    filled, moment, shaded, brightness, counted = (sums[..., c] for c in range(5))
     # The floors avoid 0/0 at empty vertices, whose values have no weight.
-    weight = np.maximum(snowy + hidden * (filled - snowy), 1e-6)
-    height = (above + hidden * (moment - above)) / weight
-    height = np.clip(height / HEIGHT_UNIT, -32000, 32000)
+    height = np.clip(moment / np.maximum(counted, 1e-6) / HEIGHT_UNIT, -32000, 32000)
     mean = brightness / np.maximum(shaded, 1e-6)
     shade = np.where(shaded > 1e-6, mean, np.float32(default_shade))
     return (
